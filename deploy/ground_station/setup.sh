@@ -1,0 +1,56 @@
+#!/bin/sh
+# Installs what the ground station needs: system packages from apt-packages.txt (root only for
+# these), then the locked Python environment in .venv. Runs again in a second when nothing changed.
+set -eu
+cd "$(dirname "$0")/../.."
+here=deploy/ground_station
+say() { printf 'setup: %s\n' "$*"; }
+die() { printf 'setup: %s\n' "$*" >&2; exit 2; }
+
+# One setup at a time in this checkout, so that `make demo` and `make test` may start together.
+mkdir -p out
+if [ "${BLIMP_SETUP_LOCKED:-}" != 1 ] && command -v flock >/dev/null; then
+  exec env BLIMP_SETUP_LOCKED=1 flock out/.setup.lock sh "$here/setup.sh"
+fi
+
+wanted=$(sed -e 's/#.*//' -e '/^[[:space:]]*$/d' "$here/apt-packages.txt" | tr '\n' ' ')
+stamp=$(cat "$here/apt-packages.txt" requirements.lock pyproject.toml | sha256sum | cut -d' ' -f1)
+missing=
+for package in $wanted; do
+  [ "$(dpkg-query -W -f='${db:Status-Status}' "$package" 2>/dev/null || true)" = installed ] \
+    || missing="$missing $package"
+done
+if [ -n "$missing" ]; then
+  command -v apt-get >/dev/null || die "needs these packages, and there is no apt-get here:$missing"
+  say "installing system packages:$missing"
+  if [ "$(id -u)" = 0 ]; then as_root=
+  elif command -v sudo >/dev/null; then as_root=sudo
+  else die "run once as root: apt-get install$missing"; fi
+  # The output is kept for when something fails; DPkg::Lock waits for another installation.
+  if ! { $as_root apt-get -o DPkg::Lock::Timeout=300 update \
+      && $as_root env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 \
+           install -y --no-install-recommends $missing; } >out/apt.log 2>&1 </dev/null; then
+    tail -n 5 out/apt.log >&2
+    die "apt-get failed; the whole output is in out/apt.log"
+  fi
+fi
+
+if [ "$(cat .venv/.stamp 2>/dev/null || true)" = "$stamp" ]; then exit 0; fi
+
+python=
+for candidate in ${PYTHON:-python3 python3.11 python3.12 python3.13}; do
+  if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+    python=$candidate; break
+  fi
+done
+[ -n "$python" ] || die "Python 3.11 or newer is needed; found $(python3 --version 2>&1)"
+
+say "Python environment in .venv from requirements.lock, with $($python --version)"
+rm -f .venv/.stamp
+"$python" -m venv .venv || die "'$python -m venv .venv' failed: is there space, and a complete Python?"
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-input --require-hashes \
+  -r requirements.lock
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-input --no-deps \
+  --no-build-isolation -e .
+echo "$stamp" >.venv/.stamp
+say "done"

@@ -1,0 +1,1 @@
+"""Key points with descriptors, by any extractor."""

@@ -1,0 +1,1 @@
+"""Camera model, poses, trajectories, alignment: pure functions on arrays."""

@@ -1,0 +1,137 @@
+"""Trajectories: poses with times, and TUM text files of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import GeometryError
+from ground_station.geometry import poses
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """`wTc` at N times: `time_ns` (N,) int64, `position_m` (N, 3), `quaternion_xyzw` (N, 4)."""
+
+    time_ns: npt.NDArray[np.int64]
+    position_m: Array
+    quaternion_xyzw: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.time_ns)
+        if self.position_m.shape != (n, 3) or self.quaternion_xyzw.shape != (n, 4):
+            raise GeometryError("trajectory: times, positions and quaternions differ in number")
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @classmethod
+    def from_poses(cls, time_ns: npt.ArrayLike, wTc: npt.ArrayLike) -> Trajectory:
+        """From times (N,), nanoseconds, and poses (N, 4, 4)."""
+        T = np.asarray(wTc, dtype=np.float64).reshape(-1, 4, 4)
+        quaternions = poses.to_quaternion(T) if len(T) else np.empty((0, 4))
+        return cls(np.asarray(time_ns, dtype=np.int64), T[:, :3, 3].copy(), quaternions)
+
+    @property
+    def wTc(self) -> Array:
+        """All poses, (N, 4, 4)."""
+        return poses.from_quaternion(self.position_m, self.quaternion_xyzw)
+
+    def nearest(self, time_ns: int) -> int:
+        """The index of the pose nearest in time; raises `GeometryError` when there is none."""
+        if not len(self):
+            raise GeometryError("trajectory: it has no poses")
+        return int(np.argmin(np.abs(self.time_ns - time_ns)))
+
+    def at(self, time_ns: int) -> Array:
+        """The pose at a time between two others by constant twist; held constant past the ends."""
+        if not len(self):
+            raise GeometryError("trajectory: it has no poses")
+        right = int(np.searchsorted(self.time_ns, time_ns))
+        if right == 0 or right == len(self):
+            i = min(right, len(self) - 1)
+            return poses.from_quaternion(self.position_m[i], self.quaternion_xyzw[i])
+        pair = poses.from_quaternion(
+            self.position_m[right - 1 : right + 1], self.quaternion_xyzw[right - 1 : right + 1]
+        )
+        t0, t1 = int(self.time_ns[right - 1]), int(self.time_ns[right])
+        return poses.interpolate(pair[0], pair[1], (time_ns - t0) / (t1 - t0))
+
+
+def seconds_to_ns(text: str) -> int:
+    """Decimal seconds as text to whole nanoseconds, without passing through a binary fraction.
+
+    Raises ValueError when the text is not a plain or exponential decimal number.
+    """
+    sign = -1 if text.startswith("-") else 1
+    digits = text.lstrip("+-")
+    if "e" in digits.lower() or not digits.replace(".", "", 1).isdigit():
+        return round(float(text) * 1e9)
+    whole, _, fraction = digits.partition(".")
+    return sign * (int(whole or 0) * 1_000_000_000 + int((fraction + "0" * 9)[:9]))
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Reads `timestamp tx ty tz qx qy qz qw` lines (seconds, metres), sorted by time.
+
+    Quaternions are normalised. Raises `GeometryError` naming the line that is not eight finite
+    numbers, has a zero quaternion, or repeats a time.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise GeometryError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise GeometryError(f"{path}: not a text file") from None
+    rows: list[tuple[int, list[float]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            time_ns, values = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
+        except (ValueError, OverflowError):
+            raise GeometryError(f"{path}, line {number}: not a number in {line!r:.80}") from None
+        if len(values) != 7 or not np.all(np.isfinite(values)):
+            raise GeometryError(f"{path}, line {number}: eight finite numbers are needed")
+        if np.linalg.norm(values[3:]) < 1e-6:
+            raise GeometryError(f"{path}, line {number}: the quaternion is zero")
+        rows.append((time_ns, values))
+    if not rows:
+        raise GeometryError(f"{path}: it holds no poses")
+    rows.sort(key=lambda row: row[0])
+    times = np.array([row[0] for row in rows], dtype=np.int64)
+    repeated = np.flatnonzero(np.diff(times) == 0)
+    if len(repeated):
+        raise GeometryError(f"{path}: the time {times[repeated[0]] / 1e9:.9f} s is there twice")
+    values = np.array([row[1] for row in rows])
+    quaternions = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    return Trajectory(times, values[:, :3].copy(), quaternions)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Writes a TUM text file, beside and renamed."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("w", encoding="ascii") as file:
+            file.write("# timestamp tx ty tz qx qy qz qw\n")
+            for time_ns, p, q in zip(
+                trajectory.time_ns.tolist(),
+                trajectory.position_m,
+                trajectory.quaternion_xyzw,
+                strict=True,
+            ):
+                sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
+                numbers = " ".join(f"{value:.9f}" for value in (*p, *q))
+                file.write(f"{sign}{s}.{ns:09d} {numbers}\n")
+        os.replace(part, path)
+    except OSError as error:
+        raise GeometryError(f"{path}: {error.strerror or error}") from None

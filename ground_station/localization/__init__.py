@@ -1,0 +1,1 @@
+"""From a frame and a map to a pose."""

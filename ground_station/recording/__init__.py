@@ -1,0 +1,1 @@
+"""Frames from recordings, video files and image folders, and recordings of flights."""

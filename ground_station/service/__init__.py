@@ -1,0 +1,1 @@
+"""Programs that run for long: the live session, replay and demo."""

@@ -1,0 +1,1 @@
+"""Flights with exact ground truth, simulated."""

@@ -1,0 +1,1 @@
+"""The RTP receiver and the clock between payload and ground."""

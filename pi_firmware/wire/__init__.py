@@ -1,0 +1,1 @@
+"""All that payload and ground station must agree on: keys, messages, layouts, ports, recordings."""

@@ -1,0 +1,125 @@
+"""Typed configuration from one commented TOML file: unknown keys and bad values refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pi_firmware.wire.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def key(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[Any] | None = None,
+) -> Any:
+    """A dataclass field that is one configuration key.
+
+    `low` and `high` bound numbers (inclusive), `choices` lists the only values allowed, `unit` and
+    `doc` are what the shipped file says in its comment.
+    """
+    meta = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices}
+    if isinstance(default, list | dict):
+        return dataclasses.field(default_factory=lambda: type(default)(default), metadata=meta)
+    return dataclasses.field(default=default, metadata=meta)
+
+
+def table(cls: type[T]) -> T:
+    """A dataclass field that is a sub-table of the file, described by the dataclass `cls`."""
+    return typing.cast(T, dataclasses.field(default_factory=cls))
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Reads a TOML file as nested dictionaries; raises `ConfigError` with one line."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
+def load(path: str | Path, cls: type[T]) -> T:
+    """Reads a TOML file into the dataclass `cls`; raises `ConfigError` with one line."""
+    return from_mapping(read(path), cls, where=str(path))
+
+
+def from_mapping(document: Mapping[str, Any], cls: type[T], *, where: str = "config") -> T:
+    """Builds the dataclass `cls` from nested mappings, checking every key and value."""
+    return _build(document, cls, where, "")
+
+
+def _build(document: Mapping[str, Any], cls: type[T], where: str, prefix: str) -> T:
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls))}
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(document) - set(fields))
+    if unknown:
+        known = ", ".join(sorted(fields))
+        raise ConfigError(f"{where}: unknown key '{prefix}{unknown[0]}' (known here: {known})")
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        full = prefix + name
+        if name not in document:
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+                raise ConfigError(f"{where}: the key '{full}' is missing")
+            continue
+        value, kind = document[name], hints[name]
+        if dataclasses.is_dataclass(kind):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{where}: '{full}' must be a table")
+            values[name] = _build(value, typing.cast(type, kind), where, full + ".")
+        else:
+            values[name] = _check(value, kind, field.metadata, f"{where}: '{full}'")
+    try:
+        return cls(**values)
+    except ValueError as error:  # a dataclass's own cross-check in __post_init__
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
+    origin = typing.get_origin(kind)
+    if origin in (types.UnionType, typing.Union):
+        kinds = [k for k in typing.get_args(kind) if k is not type(None)]
+        kind = kinds[0]
+        origin = typing.get_origin(kind)
+    if origin is list or kind is list:
+        if not isinstance(value, list):
+            raise ConfigError(f"{what} must be a list, not {value!r}")
+        (item,) = typing.get_args(kind) or (Any,)
+        return [_check(v, item, meta, f"{what}[{i}]") for i, v in enumerate(value)]
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if kind is not Any and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+        raise ConfigError(f"{what} must be {_kind_name(kind)}, not {value!r}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{what} must be a finite number, not {value!r}")
+    choices = meta.get("choices")
+    if choices is not None and value not in choices:
+        allowed = ", ".join(map(repr, choices))
+        raise ConfigError(f"{what} is {value!r}; allowed: {allowed}")
+    low, high, unit = meta.get("low"), meta.get("high"), meta.get("unit", "")
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        too_low, too_high = low is not None and value < low, high is not None and value > high
+        if too_low or too_high:
+            span = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
+            raise ConfigError(f"{what} is {value}; allowed: {span}{' ' + unit if unit else ''}")
+    return value
+
+
+def _kind_name(kind: Any) -> str:
+    names = {float: "a number", int: "a whole number", str: "a string", bool: "true or false"}
+    return names.get(kind, str(kind))

@@ -1,0 +1,21 @@
+"""The exception family: every error a person can cause is a `BlimpError` with a one-line text."""
+
+
+class BlimpError(Exception):
+    """Base of all errors of the payload and of what both sides share.
+
+    The text is one line that names the value and the limit; programs print it on standard error
+    and exit with status 2.
+    """
+
+
+class ConfigError(BlimpError):
+    """A key that is unknown, missing, or has a value outside its range."""
+
+
+class RecordingError(BlimpError):
+    """A recording that cannot be read or written."""
+
+
+class StreamError(BlimpError):
+    """A video stream that cannot be produced, received or decoded."""

@@ -1,0 +1,312 @@
+"""MCAP recordings that open in Foxglove and Rerun: video, calibration, poses, and JSON channels.
+
+Chunked with CRCs, so that a recording cut by a lost battery is readable up to its last whole chunk.
+Times are integer nanoseconds; a message's log time is its capture time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError, Message
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, Footer, Header, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from pi_firmware.wire.errors import RecordingError
+
+VIDEO_TOPIC = "/camera/video"
+CALIBRATION_TOPIC = "/camera/calibration"
+TRUTH_TOPIC = "/truth/pose"
+ESTIMATE_TOPIC = "/estimate/pose"
+FRAME_INFO_TOPIC = "/camera/frame"
+"""JSON, one a frame: `sequence`, `exposure_s`, `gain`."""
+
+
+@dataclass(frozen=True)
+class VideoSample:
+    """One access unit of H.264 (Annex B), captured at `time_ns`."""
+
+    time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class PoseSample:
+    """`wTc` at `time_ns`: position in metres, quaternion x, y, z, w."""
+
+    time_ns: int
+    position_m: tuple[float, float, float]
+    quaternion_xyzw: tuple[float, float, float, float]
+
+
+def _descriptor_set(message: type[Message]) -> bytes:
+    """The FileDescriptorSet that MCAP wants as a protobuf schema, dependencies first."""
+    collected: dict[str, FileDescriptor] = {}
+
+    def visit(file: FileDescriptor) -> None:
+        for dependency in file.dependencies:
+            visit(dependency)
+        collected.setdefault(file.name, file)
+
+    visit(message.DESCRIPTOR.file)
+    result = FileDescriptorSet()
+    for file in collected.values():
+        file.CopyToProto(result.file.add())
+    return result.SerializeToString()
+
+
+class RecordingWriter:
+    """Writes one recording; a context manager. Channels are registered at their first message.
+
+    `chunk_bytes` bounds what a power cut can cost; `open_file` is for a caller that owns the file.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        chunk_bytes: int = 256 * 1024,
+        profile: str = "",
+        open_file: Callable[[Path], IO[bytes]] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        try:
+            self._file = (open_file or (lambda p: p.open("wb")))(self.path)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: {error.strerror or error}") from None
+        # H.264 does not compress further; JSON and poses are small beside it.
+        self._writer = Writer(self._file, chunk_size=chunk_bytes, compression=CompressionType.NONE)
+        self._writer.start(profile=profile, library="blimp")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+        self._closed = False
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Writes index and footer; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self._writer.finish()
+            self._file.close()
+
+    def write_video(
+        self, time_ns: int, data: bytes, *, topic: str = VIDEO_TOPIC, frame_id: str = "camera"
+    ) -> None:
+        """Adds one H.264 access unit in Annex B form."""
+        message = CompressedVideo(frame_id=frame_id, data=data, format="h264")
+        message.timestamp.FromNanoseconds(time_ns)
+        self._write_protobuf(topic, time_ns, message)
+
+    def write_calibration(
+        self,
+        time_ns: int,
+        *,
+        width_px: int,
+        height_px: int,
+        matrix: Sequence[float],
+        distortion: Sequence[float],
+        topic: str = CALIBRATION_TOPIC,
+        frame_id: str = "camera",
+    ) -> None:
+        """Adds the camera: `matrix` is K row by row (9), `distortion` k1, k2, p1, p2, k3."""
+        k = [float(value) for value in matrix]
+        message = CameraCalibration(
+            frame_id=frame_id,
+            width=width_px,
+            height=height_px,
+            distortion_model="plumb_bob",
+            D=[float(value) for value in distortion],
+            K=k,
+            R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
+            P=[k[0], k[1], k[2], 0, k[3], k[4], k[5], 0, k[6], k[7], k[8], 0],
+        )
+        message.timestamp.FromNanoseconds(time_ns)
+        self._write_protobuf(topic, time_ns, message)
+
+    def write_pose(
+        self,
+        time_ns: int,
+        position_m: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+        *,
+        topic: str,
+        frame_id: str = "world",
+    ) -> None:
+        """Adds `wTc`: position in metres, quaternion x, y, z, w."""
+        message = PoseInFrame(frame_id=frame_id)
+        message.timestamp.FromNanoseconds(time_ns)
+        position, orientation = message.pose.position, message.pose.orientation
+        position.x, position.y, position.z = map(float, position_m)
+        orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion_xyzw)
+        self._write_protobuf(topic, time_ns, message)
+
+    def write_json(
+        self,
+        topic: str,
+        time_ns: int,
+        message: Mapping[str, Any],
+        *,
+        schema_name: str,
+        schema: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Adds a JSON object; `schema` is its JSON schema (any object when not given)."""
+        if topic not in self._channels:
+            text = json.dumps(schema or {"type": "object"}).encode()
+            schema_id = self._schema(schema_name, "jsonschema", text)
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
+        payload = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+        self._add(topic, time_ns, payload)
+
+    def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Adds a named table of strings about the recording: seed, scene, program version."""
+        self._writer.add_metadata(name, dict(values))
+
+    def _write_protobuf(self, topic: str, time_ns: int, message: Message) -> None:
+        if topic not in self._channels:
+            name = message.DESCRIPTOR.full_name
+            schema_id = self._schema(name, "protobuf", _descriptor_set(type(message)))
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
+        self._add(topic, time_ns, message.SerializeToString())
+
+    def _schema(self, name: str, encoding: str, data: bytes) -> int:
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, encoding, data)
+        return self._schemas[name]
+
+    def _add(self, topic: str, time_ns: int, payload: bytes) -> None:
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        self._writer.add_message(
+            self._channels[topic],
+            log_time=time_ns,
+            publish_time=time_ns,
+            data=payload,
+            sequence=sequence & 0xFFFFFFFF,
+        )
+
+
+class RecordingReader:
+    """Reads a recording in file order, whole or cut.
+
+    After an iteration has ended, `cut` says whether the file stops before its footer or has a
+    damaged tail, and `cut_reason` why, in words.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.cut = False
+        self.cut_reason = ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        try:
+            with self.path.open("rb") as file:
+                magic = file.read(8)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: {error.strerror or error}") from None
+        if magic != b"\x89MCAP0\r\n":
+            raise RecordingError(f"{self.path}: not an MCAP recording")
+
+    def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Channel, McapMessage]]:
+        """All messages of `topics` (all topics when None), in file order, up to a cut."""
+        channels: dict[int, Channel] = {}
+        complete = False
+        with self.path.open("rb") as file:
+            records = StreamReader(file, validate_crcs=True).records
+            while True:
+                try:
+                    record = next(records)
+                except StopIteration:
+                    break
+                except (McapError, EOFError, ValueError, MemoryError, OverflowError) as error:
+                    self.cut_reason = f"damaged at byte {file.tell()}: {type(error).__name__}"
+                    break
+                if isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Metadata):
+                    self.metadata[record.name] = dict(record.metadata)
+                elif isinstance(record, McapMessage):
+                    channel = channels.get(record.channel_id)
+                    if channel is not None and (topics is None or channel.topic in topics):
+                        yield channel, record
+                elif isinstance(record, Footer):
+                    complete = True
+                elif isinstance(record, Chunk | Header | Schema):
+                    continue
+        self.cut = not complete
+        if self.cut and not self.cut_reason:
+            self.cut_reason = "the file ends before its footer"
+
+    def topics(self) -> dict[str, int]:
+        """Every topic with its number of messages, counted by reading through the file."""
+        counts: dict[str, int] = {}
+        for channel, _ in self.messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+        return counts
+
+    def video(self, topic: str = VIDEO_TOPIC) -> Iterator[VideoSample]:
+        """The access units of `topic` in file order."""
+        for _, record in self.messages({topic}):
+            message = self._parse(CompressedVideo, record)
+            if message.format != "h264":
+                raise RecordingError(f"{self.path}: video is '{message.format}'; only h264 is read")
+            yield VideoSample(message.timestamp.ToNanoseconds(), message.data)
+
+    def calibration(self, topic: str = CALIBRATION_TOPIC) -> CameraCalibration | None:
+        """The first calibration in the recording, or None."""
+        for _, record in self.messages({topic}):
+            return self._parse(CameraCalibration, record)
+        return None
+
+    def poses(self, topic: str) -> list[PoseSample]:
+        """All poses of `topic`."""
+        result = []
+        for _, record in self.messages({topic}):
+            message = self._parse(PoseInFrame, record)
+            p, q = message.pose.position, message.pose.orientation
+            result.append(
+                PoseSample(
+                    message.timestamp.ToNanoseconds(), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+                )
+            )
+        return result
+
+    def json(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The JSON objects of `topic` with their log times; raises on text that is not an object."""
+        for _, record in self.messages({topic}):
+            try:
+                value = json.loads(record.data)
+            except ValueError:
+                value = None
+            if not isinstance(value, dict):
+                raise RecordingError(f"{self.path}: a message on {topic} is not a JSON object")
+            yield record.log_time, value
+
+    def _parse(self, kind: type[Message], record: McapMessage) -> Any:
+        try:
+            return kind.FromString(record.data)
+        except DecodeError:
+            name = kind.DESCRIPTOR.full_name
+            raise RecordingError(f"{self.path}: a message is not a {name}") from None
