@@ -7,6 +7,7 @@ Times are integer nanoseconds; a message's log time is its capture time.
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -240,7 +241,7 @@ class RecordingReader:
                     record = next(records)
                 except StopIteration:
                     break
-                except (McapError, EOFError, ValueError, MemoryError, OverflowError) as error:
+                except (McapError, struct.error, EOFError, ValueError, MemoryError) as error:
                     self.cut_reason = f"damaged at byte {file.tell()}: {type(error).__name__}"
                     break
                 if isinstance(record, Channel):
