@@ -36,7 +36,9 @@ class Camera:
     p1: float = config.key(0.0, "tangential distortion", low=-100, high=100)
     p2: float = config.key(0.0, "tangential distortion", low=-100, high=100)
     k3: float = config.key(0.0, "radial distortion", low=-100, high=100)
-    readout_s: float = config.key(0.0, "rolling-shutter readout, 0: global", unit="s", low=0, high=1)
+    readout_s: float = config.key(
+        0.0, "rolling-shutter readout, 0: global", unit="s", low=0, high=1
+    )
     model: str = config.key("opencv5", "lens model", choices=["opencv5"])
 
     def __post_init__(self) -> None:

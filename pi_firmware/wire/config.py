@@ -74,7 +74,10 @@ def _build(document: Mapping[str, Any], cls: type[T], where: str, prefix: str) -
     for name, field in fields.items():
         full = prefix + name
         if name not in document:
-            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            if (
+                field.default is dataclasses.MISSING
+                and field.default_factory is dataclasses.MISSING
+            ):
                 raise ConfigError(f"{where}: the key '{full}' is missing")
             continue
         value, kind = document[name], hints[name]
@@ -103,7 +106,9 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
         return [_check(v, item, meta, f"{what}[{i}]") for i, v in enumerate(value)]
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if kind is not Any and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+    if kind is not Any and (
+        not isinstance(value, kind) or (kind is int and isinstance(value, bool))
+    ):
         raise ConfigError(f"{what} must be {_kind_name(kind)}, not {value!r}")
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{what} must be a finite number, not {value!r}")

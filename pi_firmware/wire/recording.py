@@ -288,9 +288,7 @@ class RecordingReader:
             message = self._parse(PoseInFrame, record)
             p, q = message.pose.position, message.pose.orientation
             result.append(
-                PoseSample(
-                    message.timestamp.ToNanoseconds(), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
-                )
+                PoseSample(message.timestamp.ToNanoseconds(), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
             )
         return result
 

@@ -1,0 +1,75 @@
+"""The one interface of all extractors: an image in, key points with unit descriptors out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import GroundStationError
+
+
+class FeatureError(GroundStationError):
+    """An unknown extractor, or an image that it cannot take."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """N key points of one image.
+
+    `keypoints_px` (N, 2) float32, distorted pixels, centre of the top-left pixel is (0, 0);
+    `scores` (N,) float32, higher is better; `descriptors` (N, D) float32, unit L2 norm.
+    """
+
+    keypoints_px: npt.NDArray[np.float32]
+    scores: npt.NDArray[np.float32]
+    descriptors: npt.NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.keypoints_px)
+
+
+class Extractor(Protocol):
+    """Key points and descriptors of an image. `name` and `sha256` are what a map remembers."""
+
+    name: str
+    sha256: str
+    dimension: int
+
+    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+        """Features of a grey image (H, W) uint8."""
+        ...
+
+
+def check_image(image: npt.NDArray[np.uint8]) -> None:
+    """Raises `FeatureError` unless the image is (H, W) uint8 and at least 16 pixels each way."""
+    if image.ndim != 2 or image.dtype != np.uint8 or min(image.shape) < 16:
+        raise FeatureError(
+            f"features: a grey uint8 image of at least 16x16 is needed, not "
+            f"{'x'.join(map(str, image.shape))} {image.dtype}"
+        )
+
+
+def create(name: str, max_features: int = 1500) -> Extractor:
+    """The extractor of that name, keeping at most `max_features` key points an image."""
+    if name not in _EXTRACTORS:
+        known = ", ".join(sorted(_EXTRACTORS))
+        raise FeatureError(f"features: there is no extractor '{name}' (known: {known})")
+    return _EXTRACTORS[name](max_features)
+
+
+def names() -> list[str]:
+    """The names that `create` knows."""
+    return sorted(_EXTRACTORS)
+
+
+def _rootsift(max_features: int) -> Extractor:
+    from ground_station.features.rootsift import RootSift
+
+    return RootSift(max_features)
+
+
+_EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": _rootsift}

@@ -1,0 +1,49 @@
+"""RootSIFT: SIFT with the Hellinger kernel. Arandjelović and Zisserman, CVPR 2012."""
+
+from __future__ import annotations
+
+import hashlib
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.extractor import Features, check_image
+
+_CONTRAST_THRESHOLD = 0.02
+"""Half of OpenCV's: indoor walls are faint, and the strongest `max_features` are kept anyway."""
+
+
+class RootSift:
+    """OpenCV's SIFT, descriptors L1-normalised and square-rooted; dimension 128."""
+
+    name = "rootsift"
+    dimension = 128
+
+    def __init__(self, max_features: int = 1500) -> None:
+        self.max_features = max_features
+        # The model of a method without weights is its definition; a map made with another one
+        # must be refused.
+        self.sha256 = hashlib.sha256(b"rootsift/1 opencv-sift 128 hellinger").hexdigest()
+        self._sift = cv2.SIFT.create(
+            nfeatures=max_features, contrastThreshold=_CONTRAST_THRESHOLD, edgeThreshold=10
+        )
+
+    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+        """Features of a grey image (H, W) uint8, strongest first."""
+        check_image(image)
+        keypoints, descriptors = self._sift.detectAndCompute(image, None)
+        if not keypoints or descriptors is None:
+            empty = np.empty((0, 2), np.float32)
+            return Features(empty, np.empty(0, np.float32), np.empty((0, 128), np.float32))
+        positions = cv2.KeyPoint.convert(keypoints)
+        scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
+        # OpenCV may return a few more than asked for when responses tie.
+        order = np.argsort(-scores, kind="stable")[: self.max_features]
+        return Features(positions[order], scores[order], hellinger(descriptors[order]))
+
+
+def hellinger(sift: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """SIFT histograms (N, 128) to RootSIFT (N, 128), unit L2 norm (section 3 of the paper)."""
+    total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-12)
+    return np.sqrt(sift / total).astype(np.float32)

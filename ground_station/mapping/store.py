@@ -1,0 +1,280 @@
+"""A map on disk: `maps/NAME/`, and in memory: `Map`. Nothing here executes what it loads."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import tomli_w
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from ground_station.errors import MapError
+from ground_station.geometry.camera import Camera
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
+
+FORMAT = 1
+"""Raised when a reader of the older layout would misread a newer map."""
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+
+
+@dataclass
+class Landmarks:
+    """M points of the building, in world coordinates and metres once registered.
+
+    `id` (M,) is the COLMAP model's point3D id; `position_m` (M, 3); `covariance_m2` (M, 3, 3) of
+    the position; `descriptor` (M, D), the renormalised mean of its observations' descriptors;
+    `spread` (M,), their RMS distance from that mean; `view_direction` (M, 3), the unit mean
+    direction from the point to the cameras that saw it; `view_cos` (M,), the cosine of the angle
+    that holds them all; `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,).
+    """
+
+    id: npt.NDArray[np.int64]
+    position_m: F64
+    covariance_m2: F32
+    descriptor: F32
+    spread: F32
+    view_direction: F32
+    view_cos: F32
+    distance_m: F32
+    observations: I32
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+@dataclass
+class Keyframes:
+    """K frames of the map: poses and which landmark each of their features observed.
+
+    `wTc` (K, 4, 4); `names`, K strings; `offset` (K + 1,): the observations of keyframe k are rows
+    offset[k]:offset[k + 1] of `landmark` (O,), an index into the landmarks, and `pixel_px` (O, 2),
+    distorted pixels.
+    """
+
+    names: list[str]
+    wTc: F64
+    offset: npt.NDArray[np.int64]
+    landmark: I32
+    pixel_px: F32
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass
+class MapInfo:
+    """What `map.toml` says. `built` and `registration` are tables of plain values."""
+
+    features: str
+    features_sha256: str
+    dimension: int
+    camera: Camera
+    name: str = "map"
+    frame: str = "sfm"
+    """`sfm` (arbitrary scale and origin) until registered, then `world`."""
+    units: str = "arbitrary"
+    """`arbitrary` until registered, then `m`."""
+    format: int = FORMAT
+    built: dict[str, Any] = field(default_factory=dict)
+    registration: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def registered(self) -> bool:
+        """Whether positions are metres in the world frame."""
+        return self.frame == "world"
+
+
+@dataclass
+class Map:
+    """A map in memory; `folder` is where it was read from or goes to."""
+
+    info: MapInfo
+    landmarks: Landmarks
+    keyframes: Keyframes
+    folder: Path | None = None
+
+
+def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
+    """Writes `map.toml`, `landmarks.safetensors` and `keyframes.safetensors` into a folder.
+
+    Each is written beside and renamed; `map.toml` comes last, so a folder without it is no map.
+    """
+    lm, kf = map_.landmarks, map_.keyframes
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "id": lm.id,
+        "position_m": lm.position_m,
+        "covariance_m2": lm.covariance_m2,
+        "spread": lm.spread,
+        "view_direction": lm.view_direction,
+        "view_cos": lm.view_cos,
+        "distance_m": lm.distance_m,
+        "observations": lm.observations,
+    }
+    if quantise:
+        # One byte a number, each row scaled to its own maximum: rows are unit vectors, so the
+        # scale is found again by normalising.
+        top = np.maximum(np.abs(lm.descriptor).max(axis=1, keepdims=True, initial=0), 1e-12)
+        if (lm.descriptor < 0).any():
+            arrays["descriptor_i8"] = np.round(lm.descriptor * 127 / top).astype(np.int8)
+        else:
+            arrays["descriptor_u8"] = np.round(lm.descriptor * 255 / top).astype(np.uint8)
+    else:
+        arrays["descriptor"] = lm.descriptor
+    _save(folder / "landmarks.safetensors", arrays, {"format": str(FORMAT)})
+    _save(
+        folder / "keyframes.safetensors",
+        {"wTc": kf.wTc, "offset": kf.offset, "landmark": kf.landmark, "pixel_px": kf.pixel_px},
+        {"format": str(FORMAT), "names": "\n".join(kf.names)},
+    )
+    info = map_.info
+    document = {
+        "format": info.format,
+        "name": info.name,
+        "frame": info.frame,
+        "units": info.units,
+        "features": {
+            "name": info.features,
+            "sha256": info.features_sha256,
+            "dimension": info.dimension,
+        },
+        "camera": info.camera.as_dict(),
+        "built": info.built,
+        "registration": info.registration,
+    }
+    path = folder / "map.toml"
+    part = folder / "map.toml.part"
+    part.write_bytes(tomli_w.dumps(document).encode())
+    os.replace(part, path)
+
+
+def _save(path: Path, arrays: dict[str, npt.NDArray[Any]], metadata: dict[str, str]) -> None:
+    part = path.with_name(path.name + ".part")
+    save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, part, metadata)
+    os.replace(part, path)
+
+
+def load_info(folder: str | Path) -> MapInfo:
+    """Reads `map.toml`; raises `MapError` with one line."""
+    folder = Path(folder)
+    path = folder / "map.toml"
+    if not folder.is_dir():
+        raise MapError(f"{folder}: there is no such map")
+    try:
+        document = config.read(path)
+        features, camera = document.get("features"), document.get("camera")
+        if not isinstance(features, dict) or not isinstance(camera, dict):
+            raise MapError(f"{path}: the tables 'features' and 'camera' are needed")
+        if document.get("format") != FORMAT:
+            raise MapError(f"{path}: format {document.get('format')}; this program reads {FORMAT}")
+        return MapInfo(
+            features=str(features.get("name")),
+            features_sha256=str(features.get("sha256")),
+            dimension=int(features.get("dimension", 0)),
+            camera=config.from_mapping(camera, Camera, where=f"{path}, camera"),
+            name=str(document.get("name", folder.name)),
+            frame=str(document.get("frame", "sfm")),
+            units=str(document.get("units", "arbitrary")),
+            built=dict(document.get("built", {})),
+            registration=dict(document.get("registration", {})),
+        )
+    except (ConfigError, ValueError, TypeError) as error:
+        raise MapError(str(error)) from None
+
+
+_LANDMARKS = {
+    "id": ("int64", 1),
+    "position_m": ("float64", 2),
+    "covariance_m2": ("float32", 3),
+    "spread": ("float32", 1),
+    "view_direction": ("float32", 2),
+    "view_cos": ("float32", 1),
+    "distance_m": ("float32", 2),
+    "observations": ("int32", 1),
+}
+_KEYFRAMES = {
+    "wTc": ("float64", 3),
+    "offset": ("int64", 1),
+    "landmark": ("int32", 1),
+    "pixel_px": ("float32", 2),
+}
+
+
+def load(folder: str | Path) -> Map:
+    """Reads a whole map; raises `MapError` naming the file and what is wrong with it."""
+    folder = Path(folder)
+    info = load_info(folder)
+    path = folder / "landmarks.safetensors"
+    arrays, _ = _read(path, _LANDMARKS)
+    m = len(arrays["id"])
+    if any(len(value) != m for value in arrays.values()):
+        raise MapError(f"{path}: its arrays differ in length")
+    descriptor = _descriptor(path, arrays)
+    if descriptor.shape != (m, info.dimension):
+        raise MapError(f"{path}: descriptors are {descriptor.shape}, not ({m}, {info.dimension})")
+    if not np.isfinite(arrays["position_m"]).all():
+        raise MapError(f"{path}: a landmark's position is not finite")
+    landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
+    path = folder / "keyframes.safetensors"
+    arrays, metadata = _read(path, _KEYFRAMES)
+    names = metadata.get("names", "").split("\n") if metadata.get("names") else []
+    keyframes = Keyframes(names=names, **{name: arrays[name] for name in _KEYFRAMES})
+    k, o = len(names), len(keyframes.landmark)
+    offset = keyframes.offset
+    if (
+        keyframes.wTc.shape != (k, 4, 4)
+        or offset.shape != (k + 1,)
+        or keyframes.pixel_px.shape != (o, 2)
+        or (np.diff(offset) < 0).any()
+        or offset[0] != 0
+        or offset[-1] != o
+        or (o and (keyframes.landmark.min() < 0 or keyframes.landmark.max() >= m))
+    ):
+        raise MapError(f"{path}: its arrays do not fit each other")
+    return Map(info, landmarks, keyframes, folder)
+
+
+def _descriptor(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> F32:
+    for name in ("descriptor", "descriptor_u8", "descriptor_i8"):
+        if name in arrays:
+            values = np.asarray(arrays[name], np.float32)
+            norm = np.linalg.norm(values, axis=1, keepdims=True) if values.ndim == 2 else None
+            if norm is None or not np.isfinite(norm).all():
+                break
+            return np.asarray(values / np.maximum(norm, 1e-12), np.float32)
+    raise MapError(f"{path}: it holds no usable descriptors")
+
+
+def _read(
+    path: Path, wanted: dict[str, tuple[str, int]]
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
+    try:
+        with safe_open(path, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise MapError(f"{path}: {reason}") from None
+    for name, (dtype, ndim) in wanted.items():
+        if name not in arrays:
+            raise MapError(f"{path}: the array '{name}' is missing")
+        if str(arrays[name].dtype) != dtype or arrays[name].ndim != ndim:
+            raise MapError(f"{path}: '{name}' must be {dtype} with {ndim} axes")
+    return arrays, metadata
+
+
+def check_features(info: MapInfo, name: str, sha256: str) -> None:
+    """Raises `MapError` naming both when a map was built with other features."""
+    if (info.features, info.features_sha256) != (name, sha256):
+        raise MapError(
+            f"the map '{info.name}' was built with '{info.features}' "
+            f"({info.features_sha256[:12]}), the localizer uses '{name}' ({sha256[:12]})"
+        )
