@@ -1,0 +1,88 @@
+"""Least-squares alignment of two point sets by a rigid motion or a similarity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import GeometryError
+
+Array = npt.NDArray[np.float64]
+
+MIN_POINTS = 3
+RANK_TOLERANCE = 1e-12
+"""Second over first singular value of the covariance: a millionth of the extent, squared."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """target = scale · rotation · source + translation: (3, 3), (3,) in target units, a number."""
+
+    rotation: Array
+    translation: Array
+    scale: float
+
+    def apply(self, points: npt.ArrayLike) -> Array:
+        """Points (N, 3) of the source frame in the target frame."""
+        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
+
+    def apply_poses(self, wTc: npt.ArrayLike) -> Array:
+        """Poses (N, 4, 4) of the source frame in the target frame; rotations stay rotations."""
+        source = np.asarray(wTc, dtype=np.float64)
+        result = source.copy()
+        result[..., :3, :3] = self.rotation @ source[..., :3, :3]
+        result[..., :3, 3] = self.apply(source[..., :3, 3])
+        return result
+
+
+def align(
+    source: npt.ArrayLike,
+    target: npt.ArrayLike,
+    with_scale: bool,
+    weights: npt.ArrayLike | None = None,
+) -> Alignment:
+    """The motion (similarity `with_scale`) that takes source (N, 3) nearest to target (N, 3).
+
+    Minimises Σ wᵢ ‖yᵢ − (c R xᵢ + t)‖² over proper rotations; `weights` (N,), not negative, count
+    equally when not given. Umeyama, "Least-squares estimation of transformation parameters between
+    two point patterns", IEEE PAMI 13(4), 1991; equation numbers are the paper's.
+
+    Raises `GeometryError` for fewer than 3 points, numbers that are not finite, and points on one
+    line or in one place, about which a rotation is not determined.
+    """
+    x, y = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if x.ndim != 2 or x.shape[1] != 3 or x.shape != y.shape:
+        raise GeometryError(f"alignment: needs two (N, 3) arrays, not {x.shape} and {y.shape}")
+    w = _normalized(weights, len(x))
+    used = int(np.count_nonzero(w))
+    if used < MIN_POINTS:
+        raise GeometryError(f"alignment: {used} points; at least {MIN_POINTS} are needed")
+    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
+        raise GeometryError("alignment: a coordinate is not a finite number")
+
+    mean_x, mean_y = w @ x, w @ y  # eq. 34, 35
+    dx, dy = x - mean_x, y - mean_y
+    variance_x = float(w @ np.sum(dx * dx, axis=1))  # eq. 36
+    covariance = (dy * w[:, None]).T @ dx  # eq. 38
+    U, D, Vt = np.linalg.svd(covariance)
+    if not D[1] > RANK_TOLERANCE * D[0]:
+        raise GeometryError("alignment: the points lie on one line or in one place")
+    S = np.ones(3)  # eq. 39, and 43 where the points lie in one plane
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+        S[2] = -1.0
+    rotation = (U * S) @ Vt  # eq. 40
+    scale = float(D @ S) / variance_x if with_scale else 1.0  # eq. 42
+    translation = mean_y - scale * rotation @ mean_x  # eq. 41
+    return Alignment(rotation, translation, scale)
+
+
+def _normalized(weights: npt.ArrayLike | None, n: int) -> Array:
+    """Weights (n,) that sum to 1."""
+    if weights is None:
+        return np.full(n, 1.0 / n) if n else np.empty(0)
+    w = np.asarray(weights, dtype=np.float64)
+    if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or not np.any(w > 0):
+        raise GeometryError(f"alignment: weights must be {n} finite numbers >= 0, not all zero")
+    return w / w.sum()
