@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -55,12 +54,13 @@ class Landmarks:
 class Keyframes:
     """K frames of the map: poses and which landmark each of their features observed.
 
-    `wTc` (K, 4, 4); `names`, K strings; `offset` (K + 1,): the observations of keyframe k are rows
-    offset[k]:offset[k + 1] of `landmark` (O,), an index into the landmarks, and `pixel_px` (O, 2),
-    distorted pixels.
+    `names`, K strings; `time_ns` (K,), capture times; `wTc` (K, 4, 4); `offset` (K + 1,): the
+    observations of keyframe k are rows offset[k]:offset[k + 1] of `landmark` (O,), an index into
+    the landmarks, and `pixel_px` (O, 2), distorted pixels.
     """
 
     names: list[str]
+    time_ns: npt.NDArray[np.int64]
     wTc: F64
     offset: npt.NDArray[np.int64]
     landmark: I32
@@ -103,22 +103,34 @@ class Map:
     folder: Path | None = None
 
 
+# dtype and shape after the first axis
+_Layout = dict[str, tuple[str, tuple[int, ...]]]
+_LANDMARKS: _Layout = {
+    "id": ("int64", ()),
+    "position_m": ("float64", (3,)),
+    "covariance_m2": ("float32", (3, 3)),
+    "spread": ("float32", ()),
+    "view_direction": ("float32", (3,)),
+    "view_cos": ("float32", ()),
+    "distance_m": ("float32", (2,)),
+    "observations": ("int32", ()),
+}
+_KEYFRAMES: _Layout = {
+    "time_ns": ("int64", ()),
+    "wTc": ("float64", (4, 4)),
+    "offset": ("int64", ()),
+    "landmark": ("int32", ()),
+    "pixel_px": ("float32", (2,)),
+}
+
+
 def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     """Writes `map.toml`, `landmarks.safetensors` and `keyframes.safetensors` into a folder.
 
     Each is written beside and renamed; `map.toml` comes last, so a folder without it is no map.
     """
     lm, kf = map_.landmarks, map_.keyframes
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "id": lm.id,
-        "position_m": lm.position_m,
-        "covariance_m2": lm.covariance_m2,
-        "spread": lm.spread,
-        "view_direction": lm.view_direction,
-        "view_cos": lm.view_cos,
-        "distance_m": lm.distance_m,
-        "observations": lm.observations,
-    }
+    arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
     if quantise:
         # One byte a number, each row scaled to its own maximum: rows are unit vectors, so the
         # scale is found again by normalising.
@@ -132,7 +144,7 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     _save(folder / "landmarks.safetensors", arrays, {"format": str(FORMAT)})
     _save(
         folder / "keyframes.safetensors",
-        {"wTc": kf.wTc, "offset": kf.offset, "landmark": kf.landmark, "pixel_px": kf.pixel_px},
+        {name: getattr(kf, name) for name in _KEYFRAMES},
         {"format": str(FORMAT), "names": "\n".join(kf.names)},
     )
     info = map_.info
@@ -153,13 +165,13 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     path = folder / "map.toml"
     part = folder / "map.toml.part"
     part.write_bytes(tomli_w.dumps(document).encode())
-    os.replace(part, path)
+    part.replace(path)
 
 
 def _save(path: Path, arrays: dict[str, npt.NDArray[Any]], metadata: dict[str, str]) -> None:
     part = path.with_name(path.name + ".part")
     save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, part, metadata)
-    os.replace(part, path)
+    part.replace(path)
 
 
 def load_info(folder: str | Path) -> MapInfo:
@@ -190,24 +202,6 @@ def load_info(folder: str | Path) -> MapInfo:
         raise MapError(str(error)) from None
 
 
-_LANDMARKS = {
-    "id": ("int64", 1),
-    "position_m": ("float64", 2),
-    "covariance_m2": ("float32", 3),
-    "spread": ("float32", 1),
-    "view_direction": ("float32", 2),
-    "view_cos": ("float32", 1),
-    "distance_m": ("float32", 2),
-    "observations": ("int32", 1),
-}
-_KEYFRAMES = {
-    "wTc": ("float64", 3),
-    "offset": ("int64", 1),
-    "landmark": ("int32", 1),
-    "pixel_px": ("float32", 2),
-}
-
-
 def load(folder: str | Path) -> Map:
     """Reads a whole map; raises `MapError` naming the file and what is wrong with it."""
     folder = Path(folder)
@@ -220,8 +214,6 @@ def load(folder: str | Path) -> Map:
     descriptor = _descriptor(path, arrays)
     if descriptor.shape != (m, info.dimension):
         raise MapError(f"{path}: descriptors are {descriptor.shape}, not ({m}, {info.dimension})")
-    if not np.isfinite(arrays["position_m"]).all():
-        raise MapError(f"{path}: a landmark's position is not finite")
     landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
     path = folder / "keyframes.safetensors"
     arrays, metadata = _read(path, _KEYFRAMES)
@@ -230,9 +222,10 @@ def load(folder: str | Path) -> Map:
     k, o = len(names), len(keyframes.landmark)
     offset = keyframes.offset
     if (
-        keyframes.wTc.shape != (k, 4, 4)
-        or offset.shape != (k + 1,)
-        or keyframes.pixel_px.shape != (o, 2)
+        len(keyframes.wTc) != k
+        or len(keyframes.time_ns) != k
+        or len(offset) != k + 1
+        or len(keyframes.pixel_px) != o
         or (np.diff(offset) < 0).any()
         or offset[0] != 0
         or offset[-1] != o
@@ -253,9 +246,7 @@ def _descriptor(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> F32:
     raise MapError(f"{path}: it holds no usable descriptors")
 
 
-def _read(
-    path: Path, wanted: dict[str, tuple[str, int]]
-) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
+def _read(path: Path, wanted: _Layout) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
     try:
         with safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -263,11 +254,17 @@ def _read(
     except (SafetensorError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{path}: {reason}") from None
-    for name, (dtype, ndim) in wanted.items():
+    for name, (dtype, shape) in wanted.items():
         if name not in arrays:
             raise MapError(f"{path}: the array '{name}' is missing")
-        if str(arrays[name].dtype) != dtype or arrays[name].ndim != ndim:
-            raise MapError(f"{path}: '{name}' must be {dtype} with {ndim} axes")
+        array = arrays[name]
+        if str(array.dtype) != dtype or array.ndim == 0 or array.shape[1:] != shape:
+            rows = ", ".join(["N", *map(str, shape)])
+            raise MapError(
+                f"{path}: '{name}' must be {dtype} ({rows}), not {array.dtype} {array.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise MapError(f"{path}: '{name}' holds a value that is not finite")
     return arrays, metadata
 
 
