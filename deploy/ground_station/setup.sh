@@ -48,9 +48,9 @@ done
 say "Python environment in .venv from requirements.lock, with $($python --version)"
 rm -f .venv/.stamp
 "$python" -m venv .venv || die "'$python -m venv .venv' failed: is there space, and a complete Python?"
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-input --require-hashes \
+.venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes \
   -r requirements.lock
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-input --no-deps \
+.venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-deps \
   --no-build-isolation -e .
 echo "$stamp" >.venv/.stamp
 say "done"

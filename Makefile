@@ -1,0 +1,30 @@
+# Thin names over the programs; `make help` lists them.
+.DEFAULT_GOAL := help
+BLIMP := .venv/bin/blimp
+
+.PHONY: help setup demo test check lock sample
+
+help:  ## Show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' Makefile
+
+setup:  ## Install system packages (root or sudo for these only) and the locked Python environment
+	@sh deploy/ground_station/setup.sh
+
+demo: setup  ## Map the sample atrium, stream the sample flight, localize it live: out/demo/report.html
+	@$(BLIMP) replay --demo --out out/demo
+
+test: setup  ## Run the tests of every room
+	@.venv/bin/python -m pytest -q tests
+
+check: setup  ## Lint, formatting and types
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+
+sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed seeds (about 20 minutes)
+	@$(BLIMP) simulate --sample maps/atrium
+
+lock:  ## Resolve requirements.lock anew from pyproject.toml
+	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv
+	@out/lock/bin/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url \
+	  --no-header --no-annotate --python-version 3.11 --extra dev pyproject.toml -o requirements.lock

@@ -1,0 +1,62 @@
+"""The `blimp` command: one parser over the rooms; heavy modules are imported when a command runs."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from ground_station import __version__
+from pi_firmware.wire.errors import BlimpError
+
+_COMMANDS = (
+    # name, room's command module, help
+    ("simulate", "ground_station.simulator.command", "fly a simulated blimp and record it"),
+    ("map", "ground_station.mapping.command", "build, register and inspect maps"),
+    ("localize", "ground_station.localization.command", "find the camera in a map, frame by frame"),
+    ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
+    ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
+)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line, built without importing anything heavy."""
+    result = argparse.ArgumentParser(
+        prog="blimp",
+        description="Localization for indoor blimps: simulate, map, localize, evaluate.",
+        epilog="Example: blimp evaluate estimate.txt truth.txt --align se3",
+    )
+    result.add_argument("--version", action="version", version=f"blimp {__version__}")
+    commands = result.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, module, help_text in _COMMANDS:
+        sub = commands.add_parser(
+            name,
+            help=help_text,
+            description=help_text[0].upper() + help_text[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        importlib.import_module(module).add_arguments(sub)
+        sub.set_defaults(module=module)
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; the exit status is 0, 1 (a bound was missed) or 2 (bad input)."""
+    args = parser().parse_args(arguments)
+    try:
+        return int(importlib.import_module(args.module).run(args))
+    except BlimpError as error:
+        print(f"blimp {args.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"blimp {args.command}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `blimp … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
