@@ -84,9 +84,10 @@ class Camera:
         if len(uv) == 0:
             return np.empty((0, 2))
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-        return cv2.undistortPointsIter(
-            uv, self.matrix, self.distortion, None, None, criteria
-        ).reshape(-1, 2)
+        xy = cv2.undistortPointsIter(
+            uv, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria
+        )
+        return np.asarray(xy, np.float64).reshape(-1, 2)
 
     def undistort_to_pinhole(self, pixels: npt.ArrayLike) -> Array:
         """Distorted pixels (N, 2) to the pixels a camera with the same K and no lens would see."""

@@ -87,6 +87,6 @@ def rotation_angle(aRb: npt.ArrayLike) -> Array:
 
 
 def interpolate(wTa: npt.ArrayLike, wTb: npt.ArrayLike, fraction: float) -> Array:
-    """The pose at `fraction` of the constant-twist motion from a (0) to b (1); extrapolates, too."""
+    """The pose at `fraction` of the constant-twist motion from a (0) to b (1), also beyond."""
     wTa = np.asarray(wTa)
     return wTa @ exp(fraction * log(inverse(wTa) @ np.asarray(wTb)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,9 +110,9 @@ def read_tum(path: str | Path) -> Trajectory:
     repeated = np.flatnonzero(np.diff(times) == 0)
     if len(repeated):
         raise GeometryError(f"{path}: the time {times[repeated[0]] / 1e9:.9f} s is there twice")
-    values = np.array([row[1] for row in rows])
-    quaternions = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
-    return Trajectory(times, values[:, :3].copy(), quaternions)
+    table = np.array([row[1] for row in rows])
+    quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+    return Trajectory(times, table[:, :3].copy(), quaternions)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
@@ -132,6 +131,6 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
                 sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
                 numbers = " ".join(f"{value:.9f}" for value in (*p, *q))
                 file.write(f"{sign}{s}.{ns:09d} {numbers}\n")
-        os.replace(part, path)
+        part.replace(path)
     except OSError as error:
         raise GeometryError(f"{path}: {error.strerror or error}") from None

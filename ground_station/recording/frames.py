@@ -22,6 +22,35 @@ class Frame:
     image: npt.NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class FrameRange:
+    """Every `step`-th frame from `start` up to but without `stop` (None: to the end)."""
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+    def __contains__(self, index: int) -> bool:
+        below = self.stop is None or index < self.stop
+        return below and index >= self.start and (index - self.start) % self.step == 0
+
+    def __str__(self) -> str:
+        stop = "" if self.stop is None else self.stop
+        return f"{self.start}:{stop}" + (f":{self.step}" if self.step != 1 else "")
+
+    def is_past(self, index: int) -> bool:
+        """Whether neither this frame nor any later one is wanted."""
+        return self.stop is not None and index >= self.stop
+
+    def count(self, available: int) -> int:
+        """How many of `available` frames are wanted."""
+        stop = available if self.stop is None else min(available, self.stop)
+        return len(range(self.start, stop, self.step))
+
+
+ALL_FRAMES = FrameRange()
+
+
 class FrameSource(Protocol):
     """A folder of images, a video file or a recording. Iterating opens it anew from its start.
 

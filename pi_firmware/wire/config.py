@@ -38,7 +38,7 @@ def key(
 
 def table(cls: type[T]) -> T:
     """A dataclass field that is a sub-table of the file, described by the dataclass `cls`."""
-    return typing.cast(T, dataclasses.field(default_factory=cls))
+    return dataclasses.field(default_factory=cls)
 
 
 def read(path: str | Path) -> dict[str, Any]:

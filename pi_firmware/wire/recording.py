@@ -6,8 +6,8 @@ Times are integer nanoseconds; a message's log time is its capture time.
 
 from __future__ import annotations
 
+import io
 import json
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +20,14 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, Header, Metadata, Schema
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.mcap_records import CUT, MAGIC, PARSE_ERRORS, Damage, records
 
 VIDEO_TOPIC = "/camera/video"
 CALIBRATION_TOPIC = "/camera/calibration"
@@ -57,7 +58,7 @@ def _descriptor_set(message: type[Message]) -> bytes:
     """The FileDescriptorSet that MCAP wants as a protobuf schema, dependencies first."""
     collected: dict[str, FileDescriptor] = {}
 
-    def visit(file: FileDescriptor) -> None:
+    def visit(file: Any) -> None:
         for dependency in file.dependencies:
             visit(dependency)
         collected.setdefault(file.name, file)
@@ -213,8 +214,8 @@ class RecordingWriter:
 class RecordingReader:
     """Reads a recording in file order, whole or cut.
 
-    After an iteration has ended, `cut` says whether the file stops before its footer or has a
-    damaged tail, and `cut_reason` why, in words.
+    After an iteration has come to its end, `cut` says whether the file stops before its footer or
+    is damaged, and `cut_reason` where and why, in words. What was read before that is whole.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -227,38 +228,57 @@ class RecordingReader:
                 magic = file.read(8)
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from None
-        if magic != b"\x89MCAP0\r\n":
+        if magic != MAGIC:
             raise RecordingError(f"{self.path}: not an MCAP recording")
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Channel, McapMessage]]:
         """All messages of `topics` (all topics when None), in file order, up to a cut."""
         channels: dict[int, Channel] = {}
-        complete = False
+        reason = CUT
         with self.path.open("rb") as file:
-            records = StreamReader(file, validate_crcs=True).records
-            while True:
-                try:
-                    record = next(records)
-                except StopIteration:
-                    break
-                except (McapError, struct.error, EOFError, ValueError, MemoryError) as error:
-                    self.cut_reason = f"damaged at byte {file.tell()}: {type(error).__name__}"
-                    break
-                if isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Metadata):
-                    self.metadata[record.name] = dict(record.metadata)
-                elif isinstance(record, McapMessage):
-                    channel = channels.get(record.channel_id)
-                    if channel is not None and (topics is None or channel.topic in topics):
-                        yield channel, record
-                elif isinstance(record, Footer):
-                    complete = True
-                elif isinstance(record, Chunk | Header | Schema):
-                    continue
-        self.cut = not complete
-        if self.cut and not self.cut_reason:
-            self.cut_reason = "the file ends before its footer"
+            try:
+                for record in records(file):
+                    if isinstance(record, Channel):
+                        channels[record.id] = record
+                    elif isinstance(record, Metadata):
+                        self.metadata[record.name] = dict(record.metadata)
+                    elif isinstance(record, McapMessage):
+                        channel = channels.get(record.channel_id)
+                        if channel is not None and (topics is None or channel.topic in topics):
+                            yield channel, record
+                    else:
+                        reason = ""
+            except Damage as damage:
+                reason = str(damage)
+        self.cut, self.cut_reason = bool(reason), reason
+
+    def message_count(self, topic: str) -> int | None:
+        """The number of messages on `topic` by the recording's index, None when it has none."""
+        summary = self._summary()
+        if summary is None or summary.statistics is None:
+            return None
+        counts = summary.statistics.channel_message_counts
+        return sum(counts.get(c.id, 0) for c in summary.channels.values() if c.topic == topic)
+
+    def metadata_table(self, name: str) -> dict[str, str]:
+        """The metadata table of that name, wherever it stands in the file; empty when it is not."""
+        summary = self._summary()
+        if name not in self.metadata and (
+            summary is None or any(index.name == name for index in summary.metadata_indexes)
+        ):
+            for _ in self.messages(set()):
+                pass
+        return self.metadata.get(name, {})
+
+    def _summary(self) -> Summary | None:
+        """The index at the end of the file; None when it is cut off or damaged."""
+        with self.path.open("rb") as file:
+            try:
+                size = file.seek(0, io.SEEK_END)
+                file.seek(0)
+                return SeekingReader(file, record_size_limit=size).get_summary()
+            except (*PARSE_ERRORS, OSError):
+                return None
 
     def topics(self) -> dict[str, int]:
         """Every topic with its number of messages, counted by reading through the file."""
@@ -293,7 +313,7 @@ class RecordingReader:
         return result
 
     def json(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The JSON objects of `topic` with their log times; raises on text that is not an object."""
+        """The JSON objects of `topic` with their log times; raises when one is not an object."""
         for _, record in self.messages({topic}):
             try:
                 value = json.loads(record.data)

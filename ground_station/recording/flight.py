@@ -1,0 +1,141 @@
+"""A flight recording (MCAP) as a source of frames, and the trajectories inside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+
+from ground_station.errors import InputError
+from ground_station.geometry.camera import Camera
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
+from ground_station.recording.h264 import PPS, SPS, Decoder, grey, nal_types
+from ground_station.recording.video import check_given, frame_name
+from pi_firmware.wire import config
+from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
+
+CAMERA_TABLE = "camera"
+"""The recording's metadata table that may hold `readout_s`, which no Foxglove message has."""
+
+
+class FlightRecording:
+    """The video of a recording; every frame keeps its access unit's capture time exactly.
+
+    `camera` is the recording's calibration, with the readout time of its metadata when there.
+    Frame k is the k-th access unit in the file, also where others before it cannot be decoded.
+    """
+
+    def __init__(self, path: Path, frame_range: FrameRange = ALL_FRAMES) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self._range = frame_range
+        self._reader = RecordingReader(path)
+        self.camera: Camera | None = camera_of(self._reader)
+
+    def count(self) -> int | None:
+        total = self._reader.message_count(VIDEO_TOPIC)
+        return None if total is None else self._range.count(total)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.notes.clear()
+        reader, decoder = RecordingReader(self.path), Decoder()
+        given = 0
+        for number, time_ns, picture in self._pictures(reader, decoder):
+            if number in self._range:
+                given += 1
+                yield self._frame(number, time_ns, grey(picture))
+        if reader.cut:
+            self.notes.append(f"{self.path}: cut ({reader.cut_reason}); {given} frames read")
+        if decoder.damaged:
+            self.notes.append(f"{self.path}: {decoder.damaged} damaged frames left out")
+        if reader.cut and not given:
+            raise InputError(f"{self.path}: cut ({reader.cut_reason}); no whole frame before that")
+        check_given(self.path, given, self._range)
+
+    def _pictures(
+        self, reader: RecordingReader, decoder: Decoder
+    ) -> Iterator[tuple[int, int, av.VideoFrame]]:
+        """Every picture up to the range's end with its access unit's number and capture time."""
+        times_ns: dict[int, int] = {}
+        types: set[int] = set()
+        for k, sample in enumerate(reader.video()):
+            if self._range.is_past(k):
+                break
+            if not {SPS, PPS} <= types:
+                types |= nal_types(sample.data)
+            times_ns[k] = sample.time_ns
+            for number, picture in decoder.decode(sample.data, k):
+                yield number, times_ns.pop(number), picture
+        for number, picture in decoder.flush():
+            yield number, times_ns.pop(number), picture
+        if types and not {SPS, PPS} <= types:
+            raise InputError(f"{self.path}: its video carries no H.264 parameter sets (SPS/PPS)")
+
+    def _frame(self, number: int, time_ns: int, image: np.ndarray) -> Frame:
+        height, width = image.shape
+        if self.camera and (width, height) != (self.camera.width_px, self.camera.height_px):
+            raise InputError(
+                f"{self.path}: its video has {width}x{height} px, its calibration "
+                f"{self.camera.width_px}x{self.camera.height_px} px"
+            )
+        return Frame(number, frame_name(number), time_ns, image)
+
+
+def camera_of(reader: RecordingReader) -> Camera | None:
+    """The camera of a recording, None when it has none or one not calibrated (ROS: fx of 0).
+
+    Raises `CameraError` or `ConfigError` for values out of range.
+    """
+    message = reader.calibration()
+    if message is None or not message.K or message.K[0] == 0:
+        return None
+    d = list(message.D)
+    if message.distortion_model not in ("plumb_bob", "") or len(message.K) != 9 or len(d) > 5:
+        raise InputError(
+            f"{reader.path}: the lens model '{message.distortion_model}' with {len(d)} parameters; "
+            "only plumb_bob with up to 5 is read"
+        )
+    d += [0.0] * (5 - len(d))
+    text = reader.metadata_table(CAMERA_TABLE).get("readout_s", "0")
+    try:
+        readout_s = float(text)
+    except ValueError:
+        raise InputError(f"{reader.path}: readout_s is {text!r}, not a number") from None
+    K = list(message.K)
+    values = {
+        "width_px": message.width,
+        "height_px": message.height,
+        **{"fx_px": K[0], "fy_px": K[4], "cx_px": K[2], "cy_px": K[5]},
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True)),
+        "readout_s": readout_s,
+    }
+    return config.from_mapping(values, Camera, where=f"{reader.path}: calibration")
+
+
+def trajectory_of(
+    path: str | Path, topic: str = TRUTH_TOPIC, notes: list[str] | None = None
+) -> Trajectory:
+    """The poses on `topic` of a recording, sorted by time; a cut is said in `notes`.
+
+    Raises `InputError` when there are none, a number is not finite, or a time is there twice.
+    """
+    reader = RecordingReader(path)
+    samples = reader.poses(topic)
+    if not samples:
+        raise InputError(f"{path}: no poses on {topic}")
+    if reader.cut and notes is not None:
+        notes.append(f"{path}: cut ({reader.cut_reason}); {len(samples)} poses read")
+    samples.sort(key=lambda sample: sample.time_ns)
+    times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    positions = np.array([sample.position_m for sample in samples])
+    quaternions = np.array([sample.quaternion_xyzw for sample in samples])
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    if not (np.all(np.isfinite(positions)) and np.all(np.isfinite(norms)) and np.all(norms > 1e-6)):
+        raise InputError(f"{path}: a pose on {topic} is not finite or has a zero quaternion")
+    twice = np.flatnonzero(np.diff(times) == 0)
+    if len(twice):
+        raise InputError(f"{path}: {topic} has two poses at {times[twice[0]] / 1e9:.9f} s")
+    return Trajectory(times, positions, quaternions / norms)
