@@ -1,0 +1,259 @@
+"""The border to COLMAP: its database, its structure from motion, its models on disk.
+
+The only module that imports pycolmap, and the only one that knows that COLMAP's pixels count from
+the corner of the top-left pixel: half a pixel more than ours. Key points go in undistorted, so the
+camera in there is a plain pinhole, whatever the lens.
+"""
+
+from __future__ import annotations
+
+# pycolmap's wheel exports zlib symbols that corrupt PNG writing unless zlib and OpenCV come first.
+import zlib  # noqa: F401  # isort: skip
+import cv2  # noqa: F401  # isort: skip
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from ground_station.errors import MapError
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.matching import TwoView
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+HALF_PIXEL = 0.5
+_CAMERA_ID = 1
+
+Reconstruction = pycolmap.Reconstruction
+
+
+@dataclass(frozen=True)
+class Model:
+    """A COLMAP model as arrays, in our conventions.
+
+    `names`, K image names and `image_id` (K,) their ids, in order of id; `wTc` (K, 4, 4);
+    `point_id` (M,), `position` (M, 3). Observation o is key point `feature[o]` of image `image[o]`
+    (an index into `names`), a sight of point `point[o]` (an index into `point_id`), at
+    `pixel_px[o]` (O, 2), undistorted pixels. `pinhole` is fx, fy, cx, cy in our pixels.
+    """
+
+    names: list[str]
+    image_id: I64
+    wTc: F64
+    point_id: I64
+    position: F64
+    image: I64
+    feature: I64
+    point: I64
+    pixel_px: F64
+    pinhole: F64
+
+
+def _quiet() -> None:
+    # Progress and errors are ours to tell; COLMAP's own log goes to standard error by default.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+
+
+def _pinhole(camera: Camera) -> pycolmap.Camera:
+    return pycolmap.Camera(
+        camera_id=_CAMERA_ID,
+        model="PINHOLE",
+        width=camera.width_px,
+        height=camera.height_px,
+        params=[
+            camera.fx_px,
+            camera.fy_px,
+            camera.cx_px + HALF_PIXEL,
+            camera.cy_px + HALF_PIXEL,
+        ],
+        has_prior_focal_length=True,
+    )
+
+
+def write_database(
+    path: Path,
+    camera: Camera,
+    names: Sequence[str],
+    keypoints_px: Sequence[F64],
+    pairs: Mapping[tuple[int, int], TwoView],
+) -> None:
+    """Writes a COLMAP database: one pinhole camera, images with id = index + 1, verified pairs.
+
+    `keypoints_px[i]` (N, 2) are image i's undistorted pixels; `pairs[i, j]` with i < j.
+    """
+    _quiet()
+    with pycolmap.Database.open(path) as database:
+        pinhole = _pinhole(camera)
+        database.write_camera(pinhole, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(pinhole.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        for i, (name, pixels) in enumerate(zip(names, keypoints_px, strict=True)):
+            image = pycolmap.Image(name=name, camera_id=_CAMERA_ID, image_id=i + 1)
+            frame = pycolmap.Frame(frame_id=i + 1, rig_id=1)
+            frame.add_data_id(image.data_id)
+            database.write_image(image, use_image_id=True)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(i + 1, (pixels + HALF_PIXEL).astype(np.float32))
+        K = pinhole.calibration_matrix()
+        K_inv = np.linalg.inv(K)
+        shift = np.array([[1.0, 0.0, HALF_PIXEL], [0.0, 1.0, HALF_PIXEL], [0.0, 0.0, 1.0]])
+        kinds = pycolmap.TwoViewGeometryConfiguration
+        for (i, j), view in pairs.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = kinds.PLANAR_OR_PANORAMIC if view.degenerate else kinds.CALIBRATED
+            geometry.inlier_matches = view.matches.astype(np.uint32)
+            geometry.E = view.essential
+            geometry.F = K_inv.T @ view.essential @ K_inv
+            if view.homography is not None:
+                geometry.H = shift @ view.homography @ np.linalg.inv(shift)
+            database.write_matches(i + 1, j + 1, view.matches.astype(np.uint32))
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
+
+
+def incremental(
+    database: Path,
+    out: Path,
+    *,
+    seed: int,
+    threads: int,
+    images: int,
+    refine_camera: bool,
+    min_tri_angle_deg: float,
+    on_image: Callable[[], None],
+) -> list[Reconstruction]:
+    """COLMAP's incremental structure from motion; the models, the largest first.
+
+    Schönberger and Frahm, CVPR 2016. `on_image` is called for each image registered. `threads` 0
+    takes one a core. Raises `MapError` when no model comes of it.
+    """
+    _quiet()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = threads or -1
+    options.extract_colors = False
+    options.min_model_size = min(10, max(2, images // 2))
+    options.max_num_models = 5
+    options.ba_refine_focal_length = refine_camera
+    options.ba_refine_principal_point = False
+    options.ba_refine_extra_params = False
+    # Constant intrinsics let the global adjustment run more rarely without drift.
+    options.ba_global_frames_ratio = 1.3
+    options.ba_global_points_ratio = 1.3
+    options.ba_global_max_refinements = 3
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.abs_pose_max_error = 6.0
+    options.mapper.filter_min_tri_angle = min_tri_angle_deg
+    options.triangulation.min_angle = min_tri_angle_deg
+    out.mkdir(parents=True, exist_ok=True)
+    models = pycolmap.incremental_mapping(
+        database,
+        out,  # where images would be; without colours none is opened
+        out,
+        options,
+        initial_image_pair_callback=on_image,
+        next_image_callback=on_image,
+    )
+    if not models:
+        raise MapError(
+            "structure from motion found no pair of images to start from: the camera must move "
+            "sideways between images that see the same things"
+        )
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def adjust(model: Reconstruction, *, loss_px: float, refine_camera: bool, threads: int = 0) -> None:
+    """Bundle adjustment of all poses and points with a Cauchy loss of scale `loss_px`."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = refine_camera
+    options.refine_principal_point = False
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.num_threads = threads or -1
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-6
+    pycolmap.bundle_adjustment(model, options)
+
+
+def to_arrays(model: Reconstruction) -> Model:
+    """A model as arrays; pixels lose COLMAP's half pixel here."""
+    ids = sorted(model.reg_image_ids())
+    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    position = np.array([model.points3D[int(i)].xyz for i in point_ids]).reshape(-1, 3)
+    wTc = np.tile(np.eye(4), (len(ids), 1, 1))
+    names, images, features, seen, pixels = [], [], [], [], []
+    for k, image_id in enumerate(ids):
+        image = model.images[image_id]
+        names.append(image.name)
+        wTc[k, :3] = image.cam_from_world().inverse().matrix()
+        index = np.asarray(image.get_observation_point2D_idxs(), dtype=np.int64)
+        points = [image.points2D[int(i)] for i in index]
+        images.append(np.full(len(index), k))
+        features.append(index)
+        seen.append(np.array([point.point3D_id for point in points], dtype=np.int64))
+        pixels.append(np.array([point.xy for point in points]).reshape(-1, 2) - HALF_PIXEL)
+    camera = model.cameras[_CAMERA_ID]
+    return Model(
+        names=names,
+        image_id=np.array(ids, dtype=np.int64),
+        wTc=wTc,
+        point_id=point_ids,
+        position=position,
+        image=np.concatenate(images).astype(np.int64),
+        feature=np.concatenate(features).astype(np.int64),
+        point=np.searchsorted(point_ids, np.concatenate(seen)),
+        pixel_px=np.concatenate(pixels),
+        pinhole=np.asarray(camera.params) - [0.0, 0.0, HALF_PIXEL, HALF_PIXEL],
+    )
+
+
+def drop_images(model: Reconstruction, image_ids: Sequence[int]) -> None:
+    """Takes images out of a model, with their sights."""
+    for image_id in image_ids:
+        model.deregister_frame(model.images[int(image_id)].frame_id)
+
+
+def drop_observations(
+    model: Reconstruction, image_ids: Sequence[int], features: Sequence[int]
+) -> None:
+    """Takes sights out of a model; a point that keeps only one goes, too."""
+    for image_id, feature in zip(image_ids, features, strict=True):
+        if model.images[int(image_id)].points2D[int(feature)].has_point3D():
+            model.delete_observation(int(image_id), int(feature))
+
+
+def drop_points(model: Reconstruction, point_ids: Sequence[int]) -> None:
+    """Takes points out of a model."""
+    for point_id in point_ids:
+        model.delete_point3D(int(point_id))
+
+
+def transform(model: Reconstruction, scale: float, rotation: F64, translation: F64) -> None:
+    """Moves a model by x ↦ scale · rotation · x + translation; (3, 3), (3,)."""
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation))
+
+
+def write(model: Reconstruction, folder: Path) -> None:
+    """Writes the binary files of a model into a folder."""
+    _quiet()
+    folder.mkdir(parents=True, exist_ok=True)
+    model.update_point_3d_errors()
+    model.write(folder)
+
+
+def read(folder: Path) -> Reconstruction:
+    """Reads a model; raises `MapError` with one line."""
+    _quiet()
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError, IndexError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise MapError(f"{folder}: not a COLMAP model: {reason}") from None

@@ -1,0 +1,110 @@
+"""Landmarks from a model: filters, mean descriptors, viewing cones, covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.mapping.colmap import Model
+from ground_station.mapping.store import Landmarks
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+
+
+def residuals_px(model: Model) -> F64:
+    """Reprojection residuals of all observations (O, 2), undistorted pixels; inf when behind."""
+    X = _in_camera(model)
+    fx, fy, cx, cy = model.pinhole
+    with np.errstate(divide="ignore", invalid="ignore"):
+        projected = X[:, :2] / X[:, 2:] * [fx, fy] + [cx, cy]
+    return np.where(X[:, 2:] > 0, model.pixel_px - projected, np.inf)
+
+
+def _in_camera(model: Model) -> F64:
+    T = model.wTc[model.image]
+    # cRw (X − t) for each observation
+    return np.einsum("oji,oj->oi", T[:, :3, :3], model.position[model.point] - T[:, :3, 3])
+
+
+def largest_angles_deg(model: Model) -> F64:
+    """Each point's largest angle between two of its sights (M,), degrees.
+
+    Twice the angle of the sight farthest from the mean direction bounds it from above and is equal
+    for two sights; all pairs are compared only where that bound does not already decide.
+    """
+    rays = model.wTc[model.image, :3, 3] - model.position[model.point]
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    order = np.argsort(model.point, kind="stable")
+    starts = np.searchsorted(model.point[order], np.arange(len(model.position) + 1))
+    angles = np.zeros(len(model.position))
+    for m in range(len(angles)):
+        sights = rays[order[starts[m] : starts[m + 1]]]
+        if len(sights) > 1:
+            angles[m] = np.degrees(np.arccos(np.clip((sights @ sights.T).min(), -1.0, 1.0)))
+    return angles
+
+
+def sigma_px(model: Model) -> float:
+    """The standard deviation of a pixel coordinate, from the residuals.
+
+    Residual sum of squares over the degrees of freedom that poses and points leave.
+    """
+    r = residuals_px(model)
+    freedom = 2 * len(r) - 3 * len(model.position) - 6 * len(model.names) + 7
+    return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
+
+
+def covariances(model: Model, sigma: float) -> F64:
+    """Position covariances of the points (M, 3, 3) in the model's units squared.
+
+    (Σ Jᵀ J / σ²)⁻¹ over a point's observations, J the derivative of the pixel by the position; the
+    poses count as known, so this is the landmark's own part of the uncertainty only.
+    """
+    X = _in_camera(model)
+    fx, fy = model.pinhole[:2]
+    z = np.maximum(X[:, 2], 1e-9)
+    J = np.zeros((len(X), 2, 3))
+    J[:, 0, 0], J[:, 0, 2] = fx / z, -fx * X[:, 0] / z**2
+    J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * X[:, 1] / z**2
+    J = J @ np.swapaxes(model.wTc[model.image, :3, :3], 1, 2)
+    information = np.zeros((len(model.position), 3, 3))
+    np.add.at(information, model.point, np.einsum("oki,okj->oij", J, J) / sigma**2)
+    return np.linalg.inv(information)
+
+
+def make_landmarks(model: Model, descriptors: F32) -> Landmarks:
+    """Landmarks of a filtered model; `descriptors` (O, D), one for each observation.
+
+    A landmark's descriptor is the mean of its observations' descriptors, renormalised.
+    """
+    count = len(model.position)
+    n = np.bincount(model.point, minlength=count)
+    weight = 1.0 / np.maximum(n, 1)
+    mean = np.zeros((count, descriptors.shape[1]))
+    np.add.at(mean, model.point, descriptors)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    square = np.sum((descriptors - mean[model.point]) ** 2, axis=1)
+    spread = np.sqrt(np.bincount(model.point, square, count) * weight)
+    rays = model.wTc[model.image, :3, 3] - model.position[model.point]
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= np.maximum(distance[:, None], 1e-12)
+    direction = np.zeros((count, 3))
+    np.add.at(direction, model.point, rays)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    view_cos = np.ones(count)
+    np.minimum.at(view_cos, model.point, np.sum(rays * direction[model.point], axis=1))
+    near, far = np.full(count, np.inf), np.zeros(count)
+    np.minimum.at(near, model.point, distance)
+    np.maximum.at(far, model.point, distance)
+    return Landmarks(
+        id=model.point_id,
+        position_m=model.position,
+        covariance_m2=covariances(model, sigma_px(model)).astype(np.float32),
+        descriptor=mean.astype(np.float32),
+        spread=spread.astype(np.float32),
+        view_direction=direction.astype(np.float32),
+        view_cos=view_cos.astype(np.float32),
+        distance_m=np.stack([near, far], axis=1).astype(np.float32),
+        observations=n.astype(np.int32),
+    )

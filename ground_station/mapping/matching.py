@@ -1,0 +1,109 @@
+"""Matches between two images and their verification by two-view geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+
+_MIN_SAMPLE = 8
+"""Fewer matches than this support any essential matrix."""
+_CONFIDENCE = 0.9999
+_MAX_ITERATIONS = 2000
+
+
+def mutual_matches(first: F32, second: F32, ratio: float) -> I32:
+    """Mutual nearest neighbours that pass the ratio test both ways, as index pairs (K, 2).
+
+    `first` (N, D) and `second` (M, D) are unit descriptors; `ratio` bounds the nearest distance
+    over the second nearest (Lowe, IJCV 2004, section 7.1), in the first image's list and in the
+    second's.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.empty((0, 2), np.int32)
+    # Of unit vectors ‖a − b‖² = 2 − 2 a·b, so one matrix product gives all distances.
+    similarity = first @ second.T
+    rows = np.arange(len(first))
+    best = similarity.argmax(axis=1)
+    value = similarity[rows, best]
+    column_best = similarity.max(axis=0)
+    similarity[rows, best] = -2.0
+    runner_up = similarity.max(axis=1)
+    square = np.float32(ratio * ratio)
+    good = (value >= column_best[best]) & (1 - value < square * (1 - runner_up))
+    i = np.flatnonzero(good)
+    if not len(i):
+        return np.empty((0, 2), np.int32)
+    j, value = best[i], value[i]
+    # The best of column j is row i itself, blanked above; another row whose best was j, too, was
+    # blanked with it, so it is compared on its own.
+    others = np.full(len(second), -2.0, np.float32)
+    losers = np.flatnonzero(~good)
+    np.maximum.at(others, best[losers], (first[losers] * second[best[losers]]).sum(axis=1))
+    column_runner_up = np.maximum(similarity[:, j].max(axis=0), others[j])
+    keep = 1 - value < square * (1 - column_runner_up)
+    return np.stack([i[keep], j[keep]], axis=1).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """The verified geometry of a pair.
+
+    `matches` (K, 2), the inliers' key points; `essential` (3, 3) with x₂ᵀ E x₁ = 0 for coordinates
+    on the plane z = 1; `homography` (3, 3) of undistorted pixels or None; `degenerate`: the scene
+    is a plane or the camera only turned, so the pair gives no baseline.
+    """
+
+    matches: I32
+    essential: F64
+    homography: F64 | None
+    degenerate: bool
+
+
+def verify(
+    first_px: F64,
+    second_px: F64,
+    matches: I32,
+    camera_matrix: F64,
+    *,
+    error_px: float,
+    planar_ratio: float,
+) -> TwoView | None:
+    """The two-view geometry that most matches agree with, or None when there is none.
+
+    `first_px` (N, 2) and `second_px` (M, 2) are undistorted pixels, `matches` (K, 2) indices into
+    them, `camera_matrix` (3, 3). MAGSAC++ (Barath et al., CVPR 2020) finds the essential matrix; a
+    homography that explains at least `planar_ratio` of its inliers makes the pair degenerate, and
+    then the homography's inliers are the ones to trust, because a free baseline lets anything on
+    its epipolar lines pass.
+    """
+    if len(matches) < _MIN_SAMPLE:
+        return None
+    p, q = first_px[matches[:, 0]], second_px[matches[:, 1]]
+    try:
+        E, mask = cv2.findEssentialMat(
+            p, q, camera_matrix, cv2.USAC_MAGSAC, _CONFIDENCE, error_px, _MAX_ITERATIONS
+        )
+        if E is None or E.shape != (3, 3) or mask is None:
+            return None
+        H, planar = cv2.findHomography(
+            p, q, cv2.USAC_MAGSAC, 2 * error_px, None, _MAX_ITERATIONS, _CONFIDENCE
+        )
+    except cv2.error:  # the solver found no model in a degenerate sample
+        return None
+    inliers = mask.ravel() != 0
+    degenerate = False
+    if H is not None and planar is not None:
+        on_plane = planar.ravel() != 0
+        degenerate = bool(on_plane.sum() >= planar_ratio * inliers.sum())
+        if degenerate:
+            inliers = on_plane
+    if inliers.sum() < _MIN_SAMPLE:
+        return None
+    return TwoView(matches[inliers], E, H, degenerate)

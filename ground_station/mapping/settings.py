@@ -1,0 +1,85 @@
+"""The settings of map building; the shipped `mapping.toml` documents every key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pi_firmware.wire import config
+
+SHIPPED = Path(__file__).with_name("mapping.toml")
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Which images are compared, and which matches count."""
+
+    exhaustive_max: int = config.key(
+        160, "up to so many images, every pair is compared", unit="images", low=2, high=2000
+    )
+    neighbours: int = config.key(
+        12, "above that: each image with so many that follow it", unit="images", low=1, high=1000
+    )
+    similar: int = config.key(
+        20, "above that: and with so many that look like it", unit="images", low=0, high=1000
+    )
+    ratio: float = config.key(
+        0.8, "a match's distance over its runner-up's, both ways", low=0.1, high=1.0
+    )
+    error_px: float = config.key(
+        1.5, "distance from the epipolar line", unit="px", low=0.1, high=20.0
+    )
+    planar_ratio: float = config.key(
+        0.9, "share explained by a homography that makes a pair degenerate", low=0.1, high=1.0
+    )
+    min_inliers: int = config.key(
+        20, "verified matches of a neighbouring pair", unit="matches", low=8, high=1000
+    )
+    min_inliers_far: int = config.key(
+        30, "verified matches of a pair far apart in time", unit="matches", low=8, high=1000
+    )
+    min_inlier_ratio: float = config.key(
+        0.4, "verified matches over all, of a pair far apart in time", low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """Structure from motion and what is kept of it."""
+
+    refine_camera: bool = config.key(False, "refine the focal lengths, too")
+    min_tri_angle_deg: float = config.key(
+        1.5, "a landmark's largest angle between two sights", unit="deg", low=0.0, high=45.0
+    )
+    min_track: int = config.key(
+        3, "images that must have seen a landmark", unit="images", low=2, high=100
+    )
+    max_error_px: float = config.key(
+        2.5, "reprojection error of an observation", unit="px", low=0.1, high=20.0
+    )
+    loss_px: float = config.key(
+        1.0, "scale of the final adjustment's Cauchy loss", unit="px", low=0.1, high=100.0
+    )
+    max_jump: float = config.key(
+        8.0, "a frame's offset from its neighbours' line over the usual one", low=2.0, high=1000.0
+    )
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How `blimp map build` works."""
+
+    features: str = config.key("rootsift", "feature extractor")
+    max_features: int = config.key(
+        1500, "features of an image, the strongest", unit="features", low=50, high=20000
+    )
+    seed: int = config.key(0, "of every random choice", low=0, high=2**31 - 1)
+    threads: int = config.key(0, "worker threads, 0: one a core", unit="threads", low=0, high=256)
+    quantise: bool = config.key(True, "keep descriptors as one byte a number")
+    match: MatchSettings = config.table(MatchSettings)
+    sfm: SfmSettings = config.table(SfmSettings)
+
+
+def load_settings(path: str | Path | None = None) -> MappingSettings:
+    """Reads a settings file, the shipped one by default; raises `ConfigError` with one line."""
+    return config.load(path or SHIPPED, MappingSettings)
