@@ -19,3 +19,11 @@ class RecordingError(BlimpError):
 
 class StreamError(BlimpError):
     """A video stream that cannot be produced, received or decoded."""
+
+
+class TelemetryError(BlimpError):
+    """A telemetry session, key or message that is not as agreed."""
+
+
+class SourceError(BlimpError):
+    """A camera or gauge that cannot be opened, named by its URI."""

@@ -1,0 +1,150 @@
+"""The payload's configuration; `payload.toml` beside this file is its commented form."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import typing
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pi_firmware.wire import video
+from pi_firmware.wire.config import from_mapping, key, read, table
+from pi_firmware.wire.errors import ConfigError, TelemetryError
+from pi_firmware.wire.keys import check_payload_id
+from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
+
+ENCODERS = ("x264enc", "v4l2h264enc")
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Where frames come from."""
+
+    uri: str = key("test:", "source: replay:FLIGHT.mcap, test:")
+    width_px: int = key(640, "picture width", unit="px", low=64, high=1920)
+    height_px: int = key(480, "picture height", unit="px", low=64, high=1088)
+    rate_hz: float = key(30.0, "frames captured a second", unit="Hz", low=1, high=120)
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px"):
+            if getattr(self, name) % 2:
+                raise ValueError(f"'camera.{name}' is {getattr(self, name)}; it must be even")
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Which frames are worth sending."""
+
+    enabled: bool = key(True, "false sends every frame, measured all the same")
+    min_entropy_bits: float = key(
+        5.0, "frames with less entropy in their luma are not sent", unit="bit", low=0, high=8
+    )
+    hysteresis_bits: float = key(
+        0.2, "a gated stretch ends this much above the threshold", unit="bit", low=0, high=2
+    )
+    heartbeat_s: float = key(
+        1.0, "while all is gated, one frame is sent this often; 0: none", unit="s", low=0, high=60
+    )
+
+
+@dataclass(frozen=True)
+class EncoderSettings:
+    """How frames become H.264."""
+
+    name: str = key("x264enc", "GStreamer's encoder element", choices=ENCODERS)
+    bitrate_kbps: int = key(2000, "target bit rate", unit="kbit/s", low=100, high=20_000)
+    gop_frames: int = key(15, "frames from IDR to IDR, at most 1 s", unit="frames", low=1, high=120)
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Where the video goes."""
+
+    host: str = key("127.0.0.1", "the ground station's address")
+    port: int = key(video.PORT, "its UDP port", low=1, high=65535)
+    ssrc: int = key(0, "RTP stream id; 0 draws one at random", low=0, high=0xFFFFFFFF)
+    mtu_bytes: int = key(1400, "largest RTP packet", unit="bytes", low=200, high=8900)
+
+
+@dataclass(frozen=True)
+class BatterySettings:
+    """The gauge."""
+
+    uri: str = key("fake:", "gauge: fake:")
+    period_s: float = key(1.0, "time between readings", unit="s", low=0.1, high=60)
+
+
+@dataclass(frozen=True)
+class TelemetrySettings:
+    """Zenoh."""
+
+    enabled: bool = key(True, "false sends no telemetry")
+    connect: list[str] = key([LOCAL_ENDPOINT], "endpoints to connect to, tcp/HOST:PORT")
+    listen: list[str] = key([], "endpoints to listen on, tcp/HOST:PORT; port 0: any free one")
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.connect, *self.listen):
+            try:
+                check_endpoint(endpoint)
+            except TelemetryError as error:
+                raise ValueError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All of `payload.toml`."""
+
+    payload_id: str = key("blimp-1", "this payload's name in telemetry")
+    camera: CameraSettings = table(CameraSettings)
+    gate: GateSettings = table(GateSettings)
+    encoder: EncoderSettings = table(EncoderSettings)
+    link: LinkSettings = table(LinkSettings)
+    battery: BatterySettings = table(BatterySettings)
+    telemetry: TelemetrySettings = table(TelemetrySettings)
+
+    def __post_init__(self) -> None:
+        try:
+            check_payload_id(self.payload_id)
+        except TelemetryError as error:
+            raise ValueError(str(error)) from None
+
+
+def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
+    """The settings from a file (the defaults without one) with `key.sub=value` on top of it.
+
+    Raises `ConfigError` with one line.
+    """
+    document = {} if path is None else read(path)
+    for override in overrides:
+        _apply(document, override)
+    return from_mapping(document, Settings, where=str(path or "defaults"))
+
+
+def _apply(document: dict[str, Any], override: str) -> None:
+    name, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {override!r}: expected key=value, as camera.rate_hz=5")
+    *tables, last = name.strip().split(".")
+    for part in tables:
+        document = document.setdefault(part, {})
+        if not isinstance(document, dict):
+            raise ConfigError(f"--set {override!r}: '{part}' is not a table")
+    document[last] = text if _is_text([*tables, last]) else _toml_value(text, override)
+
+
+def _is_text(path: list[str]) -> bool:
+    """Whether the key holds a string, which `--set` then takes as it is, without quotes."""
+    kind: Any = Settings
+    for part in path:
+        kind = typing.get_type_hints(kind).get(part) if dataclasses.is_dataclass(kind) else None
+    return kind is str
+
+
+def _toml_value(text: str, override: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        raise ConfigError(f"--set {override!r}: {text!r} is not a TOML value") from None

@@ -1,0 +1,180 @@
+"""`replay:FLIGHT.mcap`, a recorded flight in real time, as if the camera saw it now."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from pi_firmware import gstreamer
+from pi_firmware.settings import CameraSettings
+from pi_firmware.sources.base import Stamp
+from pi_firmware.sources.decoding import Picture, RecordingDecoder
+from pi_firmware.uri import Uri
+from pi_firmware.wire.errors import BlimpError, RecordingError
+
+_OPTIONS = ("rate_hz", "start_s", "duration_s", "speed", "loop")
+
+
+class RateGrid:
+    """Which frames of a recording a camera with a lower rate would have taken.
+
+    The slower camera's instants lie on a grid from the first frame on; each instant gets the frame
+    nearest to it, so that jitter in the recorded times does not shift the choice.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = 1e9 / rate_hz
+        self._first_ns: int | None = None
+        self._previous_ns = 0
+        self._taken = 0
+
+    def takes(self, time_ns: int) -> bool:
+        """Whether the frame captured at `time_ns` is taken; times must rise."""
+        if self._first_ns is None:
+            self._first_ns = self._previous_ns = time_ns
+            return True
+        half_interval_ns = (time_ns - self._previous_ns) / 2
+        self._previous_ns = time_ns
+        instant = int((time_ns - self._first_ns + half_interval_ns) / self._period_ns)
+        if instant <= self._taken:
+            return False
+        self._taken = instant
+        return True
+
+
+class ReplaySource:
+    """Decodes ahead, waits for each frame's recorded instant, then hands it to the pipeline.
+
+    `time_ns` of a frame is the recording's own, so that it meets the recorded ground truth exactly;
+    `clock_ns` is the payload's clock when the frame was handed over. In a loop, recorded times go
+    on rising by the length of a round.
+    """
+
+    def __init__(self, uri: Uri, camera: CameraSettings) -> None:
+        uri.only(*_OPTIONS)
+        if not uri.path:
+            raise uri.fail("expected replay:FLIGHT.mcap")
+        self.rate_hz = uri.number("rate_hz", camera.rate_hz, 1, 120)
+        self.cut_reason = ""
+        self.error: BlimpError | None = None
+        self._path = Path(uri.path)
+        self._start_ns = int(1e9 * uri.number("start_s", 0.0, 0.0, 1e6))
+        self._duration_ns = int(1e9 * uri.number("duration_s", 1e6, 0.01, 1e6))
+        self._speed = uri.number("speed", 1.0, 0.1, 10.0)
+        self._loop = uri.choice("loop", "0", ("0", "1")) == "1"
+        self._decoder: RecordingDecoder | None = None
+        self._stamps: dict[int, Stamp] = {}
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
+        self._pictures = self._taken_pictures()
+        try:
+            # The first picture tells its size before anything is sent.
+            self._first = next(self._pictures, None)
+            if self._first is None:
+                raise RecordingError(
+                    f"{self._path}: no frames after start_s={self._start_ns / 1e9}"
+                )
+            self._caps = self._checked_caps(camera)
+        except BaseException:
+            self.close()
+            raise
+
+    def elements(self) -> str:
+        return (
+            "appsrc name=source is-live=true format=time block=true max-bytes=0 max-buffers=4 "
+            f'caps="{self._caps}"'
+        )
+
+    def attach(self, pipeline: Any) -> None:
+        self._pipeline = pipeline
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stamp(self, running_ns: int) -> Stamp:
+        return self._stamps.pop(running_ns)
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def close(self) -> None:
+        self._stopping.set()
+        if self._decoder is not None:
+            self._decoder.close()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        source = self._pipeline.get_by_name("source")
+        gst = gstreamer.load()
+        try:
+            assert self._first is not None
+            start_ns = self._running_ns()
+            first_ns = self._first.time_ns
+            for picture in self._with_first():
+                due_ns = start_ns + int((picture.time_ns - first_ns) / self._speed)
+                if self._stopping.wait(max(0, due_ns - self._running_ns()) / 1e9):
+                    break
+                self._stamps[due_ns] = Stamp(
+                    picture.time_ns, time.time_ns(), picture.exposure_s, picture.gain
+                )
+                buffer = picture.buffer.copy()
+                buffer.pts, buffer.dts = due_ns, gst.CLOCK_TIME_NONE
+                if source.emit("push-buffer", buffer) != gst.FlowReturn.OK:
+                    break
+        except BlimpError as error:
+            self.error = error
+        finally:
+            source.emit("end-of-stream")
+
+    def _running_ns(self) -> int:
+        return int(self._pipeline.get_clock().get_time() - self._pipeline.get_base_time())
+
+    def _with_first(self) -> Iterator[Picture]:
+        assert self._first is not None
+        yield self._first
+        yield from self._pictures
+
+    def _taken_pictures(self) -> Iterator[Picture]:
+        """The pictures that the camera takes, round after round, with rising times."""
+        grid = RateGrid(self.rate_hz)
+        shift_ns = 0
+        while True:
+            self._decoder = RecordingDecoder(self._path)
+            first_ns = previous_ns = last_ns = None
+            for picture in self._decoder.pictures():
+                if first_ns is None:
+                    first_ns = picture.time_ns
+                since_ns = picture.time_ns - first_ns - self._start_ns
+                if since_ns >= self._duration_ns:
+                    break
+                previous_ns, last_ns = last_ns, picture.time_ns
+                shifted_ns = picture.time_ns + shift_ns
+                if since_ns >= 0 and grid.takes(shifted_ns):
+                    yield Picture(shifted_ns, picture.buffer, picture.exposure_s, picture.gain)
+            self.cut_reason = self._decoder.cut_reason
+            self._decoder.close()
+            if not self._loop or first_ns is None or last_ns is None or previous_ns is None:
+                return
+            round_start_ns = first_ns + self._start_ns
+            shift_ns += last_ns - round_start_ns + (last_ns - previous_ns)
+
+    def _checked_caps(self, camera: CameraSettings) -> str:
+        assert self._decoder is not None
+        caps = self._decoder.caps
+        structure = caps.get_structure(0)
+        width, height = structure.get_value("width"), structure.get_value("height")
+        if (width, height) != (camera.width_px, camera.height_px):
+            raise RecordingError(
+                f"{self._path}: its pictures are {width}x{height}, camera.width_px x height_px is "
+                f"{camera.width_px}x{camera.height_px}"
+            )
+        rate = Fraction(self.rate_hz).limit_denominator(1001)
+        text = f"video/x-raw,format=I420,width={width},height={height}"
+        if structure.has_field("colorimetry"):
+            text += f",colorimetry={structure.get_value('colorimetry')}"
+        return f"{text},framerate={rate.numerator}/{rate.denominator}"

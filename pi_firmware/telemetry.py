@@ -1,0 +1,60 @@
+"""The payload's telemetry: publishes messages and holds the liveliness token."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pi_firmware.settings import TelemetrySettings
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.telemetry import Session, open_session
+
+
+class Telemetry:
+    """Publishes under one payload's keys; does nothing when disabled. Safe from any thread."""
+
+    def __init__(self, payload_id: str, settings: TelemetrySettings) -> None:
+        self._session: Session | None = None
+        self._publishers: dict[str, Any] = {}
+        self._alive: Any = None
+        if not settings.enabled:
+            return
+        import zenoh
+
+        self._session = open_session(listen=settings.listen, connect=settings.connect)
+        session = self._session.zenoh
+        for kind in (keys.BATTERY, keys.GATE, keys.EVENT):
+            # Events are rare and must arrive; of the others a newer one follows at once.
+            control = zenoh.CongestionControl
+            self._publishers[kind] = session.declare_publisher(
+                keys.key(payload_id, kind),
+                congestion_control=control.BLOCK if kind == keys.EVENT else control.DROP,
+            )
+        self._alive = session.liveliness().declare_token(keys.key(payload_id, keys.ALIVE))
+
+    @property
+    def listening(self) -> tuple[str, ...]:
+        """Endpoints that this session listens on."""
+        return self._session.listening if self._session else ()
+
+    def battery(self, message: messages.Battery) -> None:
+        """Publishes a gauge's reading."""
+        self._put(keys.BATTERY, message)
+
+    def gate(self, message: messages.Gate) -> None:
+        """Publishes the gate's decision on one frame."""
+        self._put(keys.GATE, message)
+
+    def event(self, message: messages.Event) -> None:
+        """Publishes an event."""
+        self._put(keys.EVENT, message)
+
+    def close(self) -> None:
+        """Withdraws the liveliness token and closes the session."""
+        if self._session is not None:
+            self._alive.undeclare()
+            self._session.close()
+            self._session = None
+
+    def _put(self, kind: str, message: messages.Message) -> None:
+        if self._session is not None:
+            self._publishers[kind].put(messages.encode(message))

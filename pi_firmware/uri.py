@@ -1,0 +1,69 @@
+"""Device URIs, `scheme:path?option=value&…`: one string in the config chooses a device."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from urllib.parse import parse_qsl
+
+from pi_firmware.wire.errors import SourceError
+
+
+@dataclass(frozen=True)
+class Uri:
+    """A parsed device URI; `what` is the config key that holds it, for error lines."""
+
+    text: str
+    what: str
+    scheme: str
+    path: str
+    options: dict[str, str]
+
+    def fail(self, reason: str) -> SourceError:
+        """The error to raise about this URI."""
+        return SourceError(f"{self.what} '{self.text}': {reason}")
+
+    def only(self, *names: str) -> None:
+        """Raises `SourceError` for an option that the device does not have."""
+        for name in self.options:
+            if name not in names:
+                known = ", ".join(names) or "none"
+                raise self.fail(f"unknown option '{name}' (known: {known})")
+
+    def number(self, name: str, default: float, low: float, high: float) -> float:
+        """A numeric option within its range."""
+        text = self.options.get(name)
+        if text is None:
+            return default
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise self.fail(f"{name} is {text!r}; allowed: {low:g} to {high:g}")
+        return value
+
+    def choice(self, name: str, default: str, allowed: tuple[str, ...]) -> str:
+        """An option with a fixed set of values."""
+        value = self.options.get(name, default)
+        if value not in allowed:
+            raise self.fail(f"{name} is {value!r}; allowed: {', '.join(allowed)}")
+        return value
+
+
+def parse(text: str, what: str) -> Uri:
+    """Splits a device URI; raises `SourceError` with one line."""
+    scheme, colon, rest = text.partition(":")
+    if not colon or not scheme:
+        raise SourceError(f"{what} '{text}': expected scheme:path?option=value")
+    path, _, query = rest.partition("?")
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError:
+        raise SourceError(f"{what} '{text}': the options are not name=value&…") from None
+    options: dict[str, str] = {}
+    for name, value in pairs:
+        if name in options:
+            raise SourceError(f"{what} '{text}': option '{name}' is given twice")
+        options[name] = value
+    return Uri(text, what, scheme, path, options)

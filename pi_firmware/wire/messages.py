@@ -1,0 +1,142 @@
+"""Telemetry messages: small JSON objects with `schema` and `time_ns`.
+
+`schema` is `blimp.<kind>/<major>.<minor>`. A reader takes its own major version with any minor one:
+it ignores fields it does not know and gives the default to those an older writer did not send.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+from pi_firmware.wire.errors import TelemetryError
+
+M = TypeVar("M", bound="Message")
+
+
+@dataclass(frozen=True)
+class Message:
+    """Base of all messages; `time_ns` is the payload's clock when it was made."""
+
+    SCHEMA: ClassVar[str] = ""
+    MAJOR: ClassVar[int] = 1
+    MINOR: ClassVar[int] = 0
+
+    time_ns: int
+
+
+@dataclass(frozen=True)
+class Battery(Message):
+    """ROS `sensor_msgs/BatteryState`: its names, units and codes; None is ROS's unmeasured NaN."""
+
+    SCHEMA: ClassVar[str] = "blimp.battery"
+
+    voltage: float  # V
+    percentage: float | None = None  # 0 to 1
+    current: float | None = None  # A, negative when discharging
+    charge: float | None = None  # Ah
+    capacity: float | None = None  # Ah, last full
+    design_capacity: float | None = None  # Ah
+    temperature: float | None = None  # degrees Celsius
+    power_supply_status: int = 0  # 1 charging, 2 discharging, 3 not charging, 4 full
+    power_supply_health: int = 0  # 1 good
+    power_supply_technology: int = 0  # 3 LiPo
+    present: bool = True
+
+
+@dataclass(frozen=True)
+class Gate(Message):
+    """The gate's decision on one captured frame, and the counters after it.
+
+    `captured` = `gated` + frames handed to the encoder; `sent` of those have left it so far, which
+    is all of them at the end. Heartbeats are frames sent although the gate would have dropped them.
+    """
+
+    SCHEMA: ClassVar[str] = "blimp.gate"
+
+    capture_ns: int
+    sequence: int
+    passed: bool
+    heartbeat: bool
+    entropy_bits: float
+    sharpness: float
+    captured: int
+    gated: int
+    heartbeats: int
+    sent: int
+    ssrc: int
+
+
+@dataclass(frozen=True)
+class Event(Message):
+    """Something that happened once: `name` for programs, `text` for people."""
+
+    SCHEMA: ClassVar[str] = "blimp.event"
+
+    name: str
+    text: str
+    values: dict[str, int] = field(default_factory=dict)
+
+
+EVENT_STARTED = "started"
+EVENT_SOURCE_CUT = "source-cut"
+EVENT_END_OF_STREAM = "end-of-stream"
+EVENT_STOPPED = "stopped"
+EVENT_FAILED = "failed"
+
+
+def encode(message: Message) -> bytes:
+    """The message as JSON text; raises `TelemetryError` on a number that is not finite."""
+    document = {"schema": f"{message.SCHEMA}/{message.MAJOR}.{message.MINOR}"}
+    document.update({f.name: getattr(message, f.name) for f in dataclasses.fields(message)})
+    try:
+        return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    except ValueError:
+        raise TelemetryError(f"{message.SCHEMA}: a number is not finite: {message}") from None
+
+
+def decode(kind: type[M], data: bytes) -> M:
+    """Reads a message of one kind; raises `TelemetryError` with one line on anything else."""
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError):
+        raise TelemetryError(f"{kind.SCHEMA}: not JSON text") from None
+    if not isinstance(document, dict):
+        raise TelemetryError(f"{kind.SCHEMA}: not a JSON object")
+    name, _, version = str(document.get("schema", "")).partition("/")
+    if name != kind.SCHEMA or version.split(".")[0] != str(kind.MAJOR):
+        found = str(document.get("schema"))[:60]
+        raise TelemetryError(f"{kind.SCHEMA}/{kind.MAJOR}: the message's schema is {found!r}")
+    hints = typing.get_type_hints(kind)
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):
+        if item.name in document:
+            what = f"{kind.SCHEMA}: '{item.name}'"
+            values[item.name] = _value(document[item.name], hints[item.name], what)
+        elif item.default is item.default_factory is dataclasses.MISSING:
+            raise TelemetryError(f"{kind.SCHEMA}: '{item.name}' is missing")
+    return kind(**values)
+
+
+def _value(value: Any, kind: Any, what: str) -> Any:
+    if isinstance(kind, types.UnionType):
+        if value is None:
+            return None
+        kind = typing.get_args(kind)[0]
+    if typing.get_origin(kind) is dict:
+        if not isinstance(value, dict):
+            raise TelemetryError(f"{what} must be an object, not {str(value)[:60]!r}")
+        item = typing.get_args(kind)[1]
+        return {str(k): _value(v, item, f"{what}.{k}") for k, v in value.items()}
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value) if abs(value) < 2**1000 else math.inf
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise TelemetryError(f"{what} must be {kind.__name__}, not {str(value)[:60]!r}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise TelemetryError(f"{what} must be finite, not {value}")
+    return value

@@ -1,0 +1,13 @@
+"""What sender and receiver of the video agree on (RFC 3550, RFC 6184)."""
+
+PORT = 5600
+"""UDP port of the RTP stream."""
+
+PAYLOAD_TYPE = 96
+"""RTP payload type of H.264."""
+
+CLOCK_RATE_HZ = 90_000
+"""RTP clock of H.264 (RFC 6184, 8.2.1)."""
+
+MAX_IDR_INTERVAL_NS = 1_000_000_000
+"""Two IDR pictures are at most this far apart, so that a receiver recovers from a loss."""
