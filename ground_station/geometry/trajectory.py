@@ -80,7 +80,8 @@ def read_tum(path: str | Path) -> Trajectory:
     """Reads `timestamp tx ty tz qx qy qz qw` lines (seconds, metres), sorted by time.
 
     Quaternions are normalised. Raises `GeometryError` naming the line that is not eight finite
-    numbers, has a zero quaternion, or repeats a time.
+    numbers or has a zero quaternion. Two poses of one time are kept in the order of the file, as
+    evo does: motion-capture files have them.
     """
     path = Path(path)
     try:
@@ -107,9 +108,6 @@ def read_tum(path: str | Path) -> Trajectory:
         raise GeometryError(f"{path}: it holds no poses")
     rows.sort(key=lambda row: row[0])
     times = np.array([row[0] for row in rows], dtype=np.int64)
-    repeated = np.flatnonzero(np.diff(times) == 0)
-    if len(repeated):
-        raise GeometryError(f"{path}: the time {times[repeated[0]] / 1e9:.9f} s is there twice")
     table = np.array([row[1] for row in rows])
     quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
     return Trajectory(times, table[:, :3].copy(), quaternions)

@@ -120,7 +120,7 @@ def trajectory_of(
 ) -> Trajectory:
     """The poses on `topic` of a recording, sorted by time; a cut is said in `notes`.
 
-    Raises `InputError` when there are none, a number is not finite, or a time is there twice.
+    Raises `InputError` when there are none or a number is not finite.
     """
     reader = RecordingReader(path)
     samples = reader.poses(topic)
@@ -135,7 +135,4 @@ def trajectory_of(
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     if not (np.all(np.isfinite(positions)) and np.all(np.isfinite(norms)) and np.all(norms > 1e-6)):
         raise InputError(f"{path}: a pose on {topic} is not finite or has a zero quaternion")
-    twice = np.flatnonzero(np.diff(times) == 0)
-    if len(twice):
-        raise InputError(f"{path}: {topic} has two poses at {times[twice[0]] / 1e9:.9f} s")
     return Trajectory(times, positions, quaternions / norms)

@@ -1,0 +1,51 @@
+"""A floor plan in ROS map_server's form: a picture, its resolution, and where its corner lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from ground_station.errors import InputError
+from ground_station.recording.folder import read_grey
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """`image` (H, W) uint8, row 0 at the top; its lower left corner lies at `origin` in the world.
+
+    `origin` is x, y (metres) and yaw (rad, counter-clockwise); `resolution_m` is one pixel's side.
+    """
+
+    image: npt.NDArray[np.uint8]
+    resolution_m: float
+    origin: tuple[float, float, float]
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height in metres."""
+        height, width = self.image.shape
+        return width * self.resolution_m, height * self.resolution_m
+
+
+def load_floorplan(path: str | Path) -> FloorPlan:
+    """Reads `floorplan.yaml` and its picture; raises `InputError` with one line."""
+    path = Path(path)
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise InputError(f"{path}: not valid YAML") from None
+    try:
+        name, resolution_m = str(document["image"]), float(document["resolution"])
+        x, y, yaw = (float(value) for value in document["origin"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: needs image, resolution and origin [x, y, yaw]") from None
+    if not all(map(math.isfinite, (resolution_m, x, y, yaw))) or not 1e-4 <= resolution_m <= 10:
+        raise InputError(f"{path}: resolution is {resolution_m}; allowed: 0.0001 to 10 m a pixel")
+    return FloorPlan(read_grey(path.parent / name), resolution_m, (x, y, yaw))

@@ -1,0 +1,256 @@
+"""Pictures of an evaluation: the path over the floor plan, errors and latency over time.
+
+Figures are plain objects (no global state), in a light and a dark dress. Colours are of Okabe and
+Ito's palette, which people of every colour vision can tell apart; lines differ in style, too.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.transforms import Affine2D
+
+from ground_station.errors import GroundStationError
+from ground_station.evaluation.ate import Evaluation
+from ground_station.evaluation.floorplan import FloorPlan
+from ground_station.geometry.alignment import Alignment
+from ground_station.geometry.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+GAP_S = 1.0
+"""A pause longer than this breaks a line: nothing was estimated there."""
+
+_DPI = 160
+
+
+@dataclass(frozen=True)
+class Dress:
+    """The colours of a picture."""
+
+    paper: str
+    ink: str
+    grid: str
+    truth: str
+    estimate: str
+    second: str
+    limit: str
+
+
+LIGHT = Dress("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", "#8a5a00")
+DARK = Dress("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
+
+
+def trajectory_plot(
+    truth: Trajectory | None,
+    estimate: Trajectory | None,
+    floorplan: FloorPlan | None = None,
+    dress: Dress = LIGHT,
+) -> Figure:
+    """The path seen from above, x to the right and y up, metres."""
+    figure, (axes,) = _figure(1, (8.0, 5.6), dress)
+    if floorplan is not None:
+        _draw_floorplan(axes, floorplan, dress)
+    if truth is not None and len(truth):
+        x, y = _broken(truth)
+        axes.plot(x, y, color=dress.truth, linewidth=2.6, alpha=0.55, label="true path")
+    if estimate is not None and len(estimate):
+        x, y = _broken(estimate)
+        axes.plot(x, y, color=dress.estimate, linewidth=1.1, label="estimated path")
+        axes.plot(
+            *estimate.position_m[0, :2], "o", color=dress.estimate, markersize=6, label="first pose"
+        )
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    _legend(axes, dress)
+    return figure
+
+
+def error_plot(
+    time_s: npt.ArrayLike,
+    position_m: npt.ArrayLike,
+    rotation_deg: npt.ArrayLike,
+    *,
+    position_limit_m: float | None = None,
+    rotation_limit_deg: float | None = None,
+    dress: Dress = LIGHT,
+) -> Figure:
+    """Position error (cm) over rotation error (°), both over time (s); limits are RMSE bounds."""
+    figure, (upper, lower) = _figure(2, (8.0, 4.4), dress)
+    limit_cm = None if position_limit_m is None else position_limit_m * 100
+    rows = (
+        (upper, np.asarray(position_m) * 100, limit_cm, "position error, cm", dress.estimate),
+        (lower, np.asarray(rotation_deg), rotation_limit_deg, "rotation error, °", dress.second),
+    )
+    for axes, values, limit, label, colour in rows:
+        axes.plot(*_broken_series(time_s, values), color=colour, linewidth=1.1)
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0)
+        if limit is not None:
+            _limit(axes, limit, "RMSE bound", dress)
+    lower.set_xlabel("time, s")
+    return figure
+
+
+def latency_plot(
+    time_s: npt.ArrayLike,
+    latency_ms: npt.ArrayLike,
+    *,
+    median_ms: float | None = None,
+    p99_ms: float | None = None,
+    dress: Dress = LIGHT,
+) -> Figure:
+    """Capture-to-pose latency of each frame (ms) over time (s)."""
+    figure, (axes,) = _figure(1, (8.0, 3.0), dress)
+    axes.plot(time_s, latency_ms, ".", color=dress.estimate, markersize=4)
+    axes.set_xlabel("time, s")
+    axes.set_ylabel("latency, ms")
+    axes.set_ylim(0, 1.15 * max(float(np.max(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
+    for value, name in ((median_ms, "median"), (p99_ms, "99th percentile")):
+        if value is not None:
+            _limit(axes, value, f"{name} {value:.0f} ms", dress)
+    return figure
+
+
+def evaluation(result: Evaluation, align: str = "none") -> Figure:
+    """Path, position error and rotation error of one alignment on one sheet."""
+    errors = result.errors[align]
+    figure = Figure(figsize=(8.0, 9.6), layout="constrained", facecolor=LIGHT.paper)
+    FigureCanvasAgg(figure)
+    path, upper, lower = figure.subplots(3, 1, height_ratios=[3, 1, 1])
+    aligned = _aligned(result.estimate, errors.alignment)
+    seconds = (result.estimate.time_ns - result.estimate.time_ns[0]) / 1e9
+    path.plot(*_broken(result.truth), color=LIGHT.truth, linewidth=2.6, alpha=0.55, label="truth")
+    path.plot(
+        *_broken(aligned), color=LIGHT.estimate, linewidth=1.1, label=f"estimate, aligned: {align}"
+    )
+    path.set_aspect("equal", adjustable="datalim")
+    path.set_xlabel("x, m")
+    path.set_ylabel("y, m")
+    upper.plot(*_broken_series(seconds, errors.position_m * 100), color=LIGHT.estimate, lw=1.1)
+    upper.set_ylabel("position, cm")
+    lower.plot(*_broken_series(seconds, errors.rotation_deg), color=LIGHT.second, lw=1.1)
+    lower.set_ylabel("rotation, °")
+    lower.set_xlabel("time, s")
+    for axes in (path, upper, lower):
+        _style(axes, LIGHT)
+    upper.set_ylim(bottom=0)
+    lower.set_ylim(bottom=0)
+    _legend(path, LIGHT)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as PNG bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    return buffer.getvalue()
+
+
+def write_png(figure: Figure, path: str | Path) -> None:
+    """Writes the figure as a PNG file, beside and renamed."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(png(figure))
+        part.replace(path)
+    except OSError as error:
+        raise GroundStationError(f"{path}: {error.strerror or error}") from None
+
+
+def _figure(rows: int, size_inches: tuple[float, float], dress: Dress) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
+    FigureCanvasAgg(figure)
+    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    for one in axes:
+        _style(one, dress)
+    return figure, axes
+
+
+def _style(axes: Axes, dress: Dress) -> None:
+    axes.set_facecolor(dress.paper)
+    axes.grid(True, color=dress.grid, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=dress.ink, length=3)
+    axes.xaxis.label.set_color(dress.ink)
+    axes.yaxis.label.set_color(dress.ink)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(dress.ink)
+
+
+def _legend(axes: Axes, dress: Dress) -> None:
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc="upper right",
+            facecolor=dress.paper,
+            edgecolor=dress.grid,
+            labelcolor=dress.ink,
+            fontsize=9,
+            framealpha=0.9,
+        )
+
+
+def _limit(axes: Axes, value: float, text: str, dress: Dress) -> None:
+    axes.axhline(value, color=dress.limit, linestyle="--", linewidth=1.0)
+    axes.annotate(
+        text,
+        (1.0, value),
+        xycoords=axes.get_yaxis_transform(),
+        xytext=(-4, 3),
+        textcoords="offset points",
+        ha="right",
+        color=dress.limit,
+        fontsize=8.5,
+    )
+
+
+def _draw_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
+    width_m, height_m = plan.size_m
+    x, y, yaw = plan.origin
+    to_world = Affine2D().rotate(yaw).translate(x, y)
+    # Walls in a soft tone of the ink, free space in the paper's colour: the path stays in front.
+    ink = np.array([int(dress.ink[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.uint8)
+    rgba: Any = np.empty((*plan.image.shape, 4), dtype=np.uint8)
+    rgba[..., :3] = ink
+    rgba[..., 3] = (255 - plan.image) // 2
+    axes.imshow(
+        rgba,
+        extent=(0, width_m, 0, height_m),
+        origin="upper",
+        transform=to_world + axes.transData,
+        interpolation="antialiased",
+        zorder=0,
+    )
+    corners = to_world.transform([[0, 0], [width_m, 0], [width_m, height_m], [0, height_m]])
+    margin = 0.02 * max(width_m, height_m)
+    axes.set_xlim(corners[:, 0].min() - margin, corners[:, 0].max() + margin)
+    axes.set_ylim(corners[:, 1].min() - margin, corners[:, 1].max() + margin)
+
+
+def _aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
+    return Trajectory(
+        trajectory.time_ns, alignment.apply(trajectory.position_m), trajectory.quaternion_xyzw
+    )
+
+
+def _broken(trajectory: Trajectory) -> tuple[Array, Array]:
+    """x and y with a NaN in every pause, which the line then leaves out."""
+    x, y = trajectory.position_m[:, 0], trajectory.position_m[:, 1]
+    gaps = np.flatnonzero(np.diff(trajectory.time_ns) > GAP_S * 1e9) + 1
+    return np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
+
+
+def _broken_series(time_s: npt.ArrayLike, values: npt.ArrayLike) -> tuple[Array, Array]:
+    t, v = np.asarray(time_s, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    gaps = np.flatnonzero(np.diff(t) > GAP_S) + 1
+    return np.insert(t, gaps, np.nan), np.insert(v, gaps, np.nan)
