@@ -1,1 +1,1 @@
-"""The RTP receiver and the clock between payload and ground."""
+"""The ground station's ends of the payload's streams: video over RTP, telemetry over Zenoh."""

@@ -10,6 +10,7 @@ NAL_IDR = 5
 NAL_SEI = 6
 NAL_SPS = 7
 NAL_PPS = 8
+NAL_AUD = 9
 
 NO_PARAMETER_SETS = "the stream carries no parameter sets (SPS and PPS), so nothing decodes it"
 

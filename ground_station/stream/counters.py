@@ -1,0 +1,29 @@
+"""What the receiver counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Counters:
+    """What came in and what became of it.
+
+    Datagrams are `packets` of the stream, of `other_streams`, or `garbage`. Every access unit of
+    which anything arrived is one of `decoded`, `withheld` (damaged, or after a loss and before the
+    next IDR), `failed` (the decoder refused it) or `unstamped` (without capture time). Of the
+    decoded ones `dropped` left the full queue before anyone took them.
+    """
+
+    packets: int = 0
+    packets_lost: int = 0
+    packets_late: int = 0
+    garbage: int = 0
+    other_streams: int = 0
+    malformed: int = 0
+    access_units: int = 0
+    decoded: int = 0
+    withheld: int = 0
+    failed: int = 0
+    unstamped: int = 0
+    dropped: int = 0

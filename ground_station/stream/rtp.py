@@ -1,0 +1,215 @@
+"""RTP packets back into H.264 access units (RFC 3550, RFC 6184), with every gap noticed."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ground_station.stream.counters import Counters
+from pi_firmware.wire import video
+from pi_firmware.wire.annexb import NAL_AUD, NAL_SPS, START_CODE
+
+_HEADER_BYTES = 12
+_STAP_A, _FU_A = 24, 28
+_FU_START, _FU_END = 0x80, 0x40
+MAX_JUMP = 3000
+"""A sequence number further ahead than this is a new stream, not a loss (RFC 3550, A.1)."""
+MAX_ACCESS_UNIT_BYTES = 4 << 20
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One RTP packet of H.264; `arrival_ns` is on the receiver's monotonic clock."""
+
+    sequence: int
+    timestamp: int
+    ssrc: int
+    marker: bool
+    payload: bytes
+    arrival_ns: int
+
+
+def parse(datagram: bytes, arrival_ns: int) -> Packet | None:
+    """The packet in a datagram; None when it is not RTP version 2 with the video's payload type."""
+    if len(datagram) < _HEADER_BYTES:
+        return None
+    first, second, sequence, timestamp, ssrc = struct.unpack_from(">BBHII", datagram)
+    if first >> 6 != 2 or second & 0x7F != video.PAYLOAD_TYPE:
+        return None
+    start = _HEADER_BYTES + 4 * (first & 0x0F)
+    if first & 0x10:  # header extension
+        if len(datagram) < start + 4:
+            return None
+        start += 4 + 4 * int(struct.unpack_from(">H", datagram, start + 2)[0])
+    end = len(datagram)
+    if first & 0x20:  # padding; its last byte counts it
+        end -= datagram[-1]
+    if start >= end:
+        return None
+    return Packet(sequence, timestamp, ssrc, bool(second & 0x80), datagram[start:end], arrival_ns)
+
+
+class Reorderer:
+    """Puts packets of one stream in order and decides when a missing one is lost.
+
+    A packet is waited for until `depth` later ones are here, or `wait_ns` have passed.
+    """
+
+    def __init__(self, counters: Counters, *, depth: int = 32, wait_ns: int = 30_000_000) -> None:
+        self._counters = counters
+        self._depth = depth
+        self._wait_ns = wait_ns
+        self._expected: int | None = None
+        self._held: dict[int, Packet] = {}
+        self._jumped: Packet | None = None
+
+    def push(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
+        """Packets that can go on, each with whether packets before it are missing."""
+        if self._expected is None:
+            self._expected = packet.sequence
+        ahead = (packet.sequence - self._expected) & 0xFFFF
+        if MAX_JUMP < ahead < 0x10000 - MAX_JUMP:
+            yield from self._restart(packet)
+        elif ahead > MAX_JUMP or packet.sequence in self._held:
+            self._counters.packets_late += 1  # given up on, or here already
+        else:
+            self._held[packet.sequence] = packet
+            yield from self._release(all_held=len(self._held) > self._depth)
+
+    def _restart(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
+        """The sender began anew if two packets in a row are far off; one alone is a stray."""
+        before, self._jumped = self._jumped, packet
+        if before is None or (before.sequence + 1) & 0xFFFF != packet.sequence:
+            return
+        yield from self._release(all_held=True)
+        self._jumped = None
+        self._expected = (packet.sequence + 1) & 0xFFFF
+        yield before, True
+        yield packet, False
+
+    def expire(self, now_ns: int) -> Iterator[tuple[Packet, bool]]:
+        """Packets that go on because what is missing before them has not come in time."""
+        if self._held:
+            oldest_ns = min(packet.arrival_ns for packet in self._held.values())
+            if now_ns - oldest_ns >= self._wait_ns:
+                yield from self._release(all_held=True)
+
+    def _release(self, *, all_held: bool) -> Iterator[tuple[Packet, bool]]:
+        while self._held:
+            assert self._expected is not None
+            gap = False
+            if self._expected not in self._held:
+                if not all_held:
+                    return
+                expected = self._expected
+                nearest = min((number - expected) & 0xFFFF for number in self._held)
+                self._counters.packets_lost += nearest
+                self._expected = (expected + nearest) & 0xFFFF
+                gap = True
+            packet = self._held.pop(self._expected)
+            self._expected = (self._expected + 1) & 0xFFFF
+            yield packet, gap
+
+
+@dataclass(frozen=True)
+class AccessUnit:
+    """One access unit in Annex B form, with the arrival of its last packet.
+
+    `complete`: all of its packets are here. `follows_gap`: packets between the one before and this
+    one are missing, so that what it refers to may be.
+    """
+
+    data: bytes
+    complete: bool
+    follows_gap: bool
+    arrival_ns: int
+
+
+class Depacketizer:
+    """Packets in order into access units: single NAL units, STAP-A and FU-A."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._timestamp: int | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        self._units = bytearray()
+        self._fragment: bytearray | None = None
+        self._complete = True
+        self._follows_gap = False
+
+    def push(self, packet: Packet, gap: bool) -> Iterator[AccessUnit]:
+        """Access units that end with, or before, this packet."""
+        if self._timestamp is not None and packet.timestamp != self._timestamp:
+            # Its last packet was lost, or never had the marker.
+            yield self._finish(complete=not gap)
+        if gap:
+            self._follows_gap = True
+            self._fragment = None
+            # Nothing of this one is missing if the packet after the gap is its first.
+            self._complete = self._timestamp is None and _begins_access_unit(packet.payload)
+        self._timestamp = packet.timestamp
+        self._arrival_ns = packet.arrival_ns
+        if not self._take(packet.payload):
+            self._counters.malformed += 1
+            self._complete = False
+        if packet.marker:
+            yield self._finish(complete=True)
+
+    def _finish(self, *, complete: bool) -> AccessUnit:
+        whole = complete and self._complete and self._fragment is None
+        unit = AccessUnit(bytes(self._units), whole, self._follows_gap, self._arrival_ns)
+        self._clear()
+        self._timestamp = None
+        return unit
+
+    def _take(self, payload: bytes) -> bool:
+        kind = payload[0] & 0x1F
+        if len(self._units) + len(payload) > MAX_ACCESS_UNIT_BYTES:
+            return False
+        if 1 <= kind <= 23:
+            self._units += START_CODE + payload
+            return self._fragment is None
+        if kind == _STAP_A:
+            return self._take_aggregate(payload)
+        if kind == _FU_A and len(payload) > 2:
+            return self._take_fragment(payload)
+        return False
+
+    def _take_aggregate(self, payload: bytes) -> bool:
+        at = 1
+        while at + 2 <= len(payload):
+            (size,) = struct.unpack_from(">H", payload, at)
+            at += 2
+            if size == 0 or at + size > len(payload):
+                return False
+            self._units += START_CODE + payload[at : at + size]
+            at += size
+        return at == len(payload) and self._fragment is None
+
+    def _take_fragment(self, payload: bytes) -> bool:
+        indicator, header = payload[0], payload[1]
+        if header & _FU_START:
+            whole = self._fragment is None
+            self._fragment = bytearray([indicator & 0xE0 | header & 0x1F])
+        elif self._fragment is None:
+            return False
+        else:
+            whole = True
+        if len(self._fragment) + len(payload) > MAX_ACCESS_UNIT_BYTES:
+            return False
+        self._fragment += payload[2:]
+        if header & _FU_END:
+            self._units += START_CODE + self._fragment
+            self._fragment = None
+        return whole
+
+
+def _begins_access_unit(payload: bytes) -> bool:
+    """Whether a packet starts with a unit that only ever comes first (H.264, 7.4.1.2.3)."""
+    kind = payload[0] & 0x1F
+    if kind == _STAP_A and len(payload) > 3:
+        kind = payload[3] & 0x1F
+    return kind in (NAL_SPS, NAL_AUD)

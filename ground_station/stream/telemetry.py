@@ -1,0 +1,198 @@
+"""What the payloads say: battery, gate, events and liveliness, kept per payload."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Any, TypeVar
+
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, open_session
+
+M = TypeVar("M", bound=messages.Message)
+
+_KEPT_DECISIONS = 10_000
+_KEPT_EVENTS = 200
+_KEPT_PAYLOADS = 64
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """The payload's own account: `captured` = `gated` + `sent` once its stream has ended."""
+
+    captured: int
+    gated: int
+    heartbeats: int
+    sent: int
+
+
+@dataclass
+class PayloadState:
+    """The latest of what one payload said since it started.
+
+    `decisions` are the gate's by frame sequence number, the newest 10,000 of them. `refused` counts
+    messages that were not as agreed.
+    """
+
+    payload_id: str
+    alive: bool = False
+    battery: messages.Battery | None = None
+    gate: messages.Gate | None = None
+    decisions: dict[int, messages.Gate] = field(default_factory=dict)
+    events: list[messages.Event] = field(default_factory=list)
+    refused: int = 0
+
+    @property
+    def frames(self) -> FrameCounts | None:
+        """The newest counters, of a gate's message or an event; None before the first."""
+        last = self.events[-1] if self.events else None
+        if last is not None and (self.gate is None or last.time_ns >= self.gate.time_ns):
+            v = last.values
+            if {"captured", "gated", "heartbeats", "sent"} <= v.keys():
+                return FrameCounts(v["captured"], v["gated"], v["heartbeats"], v["sent"])
+        g = self.gate
+        return FrameCounts(g.captured, g.gated, g.heartbeats, g.sent) if g else None
+
+    @property
+    def ssrc(self) -> int | None:
+        """The SSRC of the payload's video, which it announces; None before it did."""
+        if self.gate is not None:
+            return self.gate.ssrc
+        return next((e.values["ssrc"] for e in reversed(self.events) if "ssrc" in e.values), None)
+
+
+class TelemetryListener:
+    """Listens to all payloads; a context manager. Its methods can be called from any thread.
+
+    An endpoint `tcp/127.0.0.1:0` takes a free port, which `endpoints` then tells. Raises
+    `TelemetryError` with one line when an endpoint is in use. `on_event` is called with the
+    payload's id for each event, on a thread of the session.
+    """
+
+    def __init__(
+        self,
+        listen: Sequence[str] = (LOCAL_ENDPOINT,),
+        *,
+        connect: Sequence[str] = (),
+        on_event: Callable[[str, messages.Event], None] | None = None,
+    ) -> None:
+        self._states: dict[str, PayloadState] = {}
+        self._changed = threading.Condition()
+        self._on_event = on_event
+        self._session = open_session(listen=listen, connect=connect)
+        self.endpoints = self._session.listening
+        session = self._session.zenoh
+        self._subscribers = [
+            session.declare_subscriber(keys.every_payload(keys.BATTERY), self._take_battery),
+            session.declare_subscriber(keys.every_payload(keys.GATE), self._take_gate),
+            session.declare_subscriber(keys.every_payload(keys.EVENT), self._take_event),
+            session.liveliness().declare_subscriber(
+                keys.every_payload(keys.ALIVE), self._take_liveliness, history=True
+            ),
+        ]
+
+    def __enter__(self) -> TelemetryListener:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stops listening; what was heard stays readable."""
+        self._session.close()
+
+    def payloads(self) -> list[str]:
+        """The ids of all payloads heard of, sorted."""
+        with self._changed:
+            return sorted(self._states)
+
+    def state(self, payload_id: str) -> PayloadState | None:
+        """A snapshot of one payload; None when nothing was heard of it."""
+        with self._changed:
+            found = self._states.get(payload_id)
+            return self._copy(found) if found else None
+
+    def wait(
+        self, payload_id: str, condition: Callable[[PayloadState], bool], timeout_s: float
+    ) -> PayloadState | None:
+        """Waits until a payload's state meets the condition; None when it does not in time."""
+
+        def met() -> bool:
+            return payload_id in self._states and condition(self._states[payload_id])
+
+        with self._changed:
+            in_time = self._changed.wait_for(met, timeout_s)
+            return self._copy(self._states[payload_id]) if in_time else None
+
+    def wait_for_event(self, payload_id: str, name: str, timeout_s: float) -> messages.Event | None:
+        """Waits for an event since the payload's start; None when it does not come in time."""
+        state = self.wait(payload_id, lambda s: any(e.name == name for e in s.events), timeout_s)
+        return next(e for e in reversed(state.events) if e.name == name) if state else None
+
+    @staticmethod
+    def _copy(state: PayloadState) -> PayloadState:
+        return replace(state, decisions=dict(state.decisions), events=list(state.events))
+
+    def _state_of(self, sample: Any) -> PayloadState | None:
+        """The state a sample belongs to, created at the first; call with the lock held."""
+        payload_id = keys.payload_of(str(sample.key_expr))
+        if payload_id is None:
+            return None
+        if payload_id not in self._states and len(self._states) >= _KEPT_PAYLOADS:
+            return None
+        return self._states.setdefault(payload_id, PayloadState(payload_id))
+
+    def _decoded(self, sample: Any, kind: type[M]) -> tuple[PayloadState, M] | None:
+        state = self._state_of(sample)
+        if state is None:
+            return None
+        try:
+            return state, messages.decode(kind, sample.payload.to_bytes())
+        except TelemetryError:
+            state.refused += 1
+            return None
+
+    def _take_battery(self, sample: Any) -> None:
+        with self._changed:
+            if found := self._decoded(sample, messages.Battery):
+                found[0].battery = found[1]
+            self._changed.notify_all()
+
+    def _take_gate(self, sample: Any) -> None:
+        with self._changed:
+            if found := self._decoded(sample, messages.Gate):
+                state, message = found
+                state.gate = message
+                state.decisions[message.sequence] = message
+                if len(state.decisions) > _KEPT_DECISIONS:
+                    del state.decisions[next(iter(state.decisions))]
+            self._changed.notify_all()
+
+    def _take_event(self, sample: Any) -> None:
+        with self._changed:
+            found = self._decoded(sample, messages.Event)
+            if found:
+                state, message = found
+                if message.name == messages.EVENT_STARTED:  # a new flight counts from zero
+                    state.gate, state.decisions, state.events = None, {}, []
+                state.events.append(message)
+                del state.events[:-_KEPT_EVENTS]
+            self._changed.notify_all()
+        if found and self._on_event is not None:
+            self._on_event(found[0].payload_id, found[1])
+
+    def _take_liveliness(self, sample: Any) -> None:
+        import zenoh
+
+        with self._changed:
+            if (state := self._state_of(sample)) is not None:
+                state.alive = sample.kind == zenoh.SampleKind.PUT
+            self._changed.notify_all()
