@@ -37,7 +37,7 @@ Out = TypeVar("Out")
 
 @dataclass(frozen=True)
 class Images:
-    """What is kept of the frames: names, times (n,) and features; pixels undistorted (N, 2) each."""
+    """What is kept of n frames: names, times (n,), features, their undistorted pixels (N, 2)."""
 
     names: list[str]
     time_ns: I64
@@ -54,7 +54,7 @@ def build_map(
     total: int | None = None,
     built: dict[str, Any] | None = None,
 ) -> store.Map:
-    """Builds a map from frames and writes it to the folder `out`; a killed build leaves the old one.
+    """Builds a map from frames in the folder `out`; a killed build leaves the old map there.
 
     `total` is the number of frames if known, `built` what map.toml shall say of the inputs. Raises
     `InputError` when there are fewer than two frames, `MapError` when sizes differ from the

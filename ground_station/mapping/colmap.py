@@ -180,7 +180,11 @@ def adjust(model: Reconstruction, *, loss_px: float, refine_camera: bool, thread
     options.ceres.solver_options.num_threads = threads or -1
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-6
-    pycolmap.bundle_adjustment(model, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def to_arrays(model: Reconstruction) -> Model:
@@ -215,25 +219,26 @@ def to_arrays(model: Reconstruction) -> Model:
     )
 
 
-def drop_images(model: Reconstruction, image_ids: Sequence[int]) -> None:
+def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
     """Takes images out of a model, with their sights."""
-    for image_id in image_ids:
-        model.deregister_frame(model.images[int(image_id)].frame_id)
+    for image_id in np.asarray(image_ids).tolist():
+        model.deregister_frame(model.images[image_id].frame_id)
 
 
 def drop_observations(
-    model: Reconstruction, image_ids: Sequence[int], features: Sequence[int]
+    model: Reconstruction, image_ids: npt.ArrayLike, features: npt.ArrayLike
 ) -> None:
     """Takes sights out of a model; a point that keeps only one goes, too."""
-    for image_id, feature in zip(image_ids, features, strict=True):
-        if model.images[int(image_id)].points2D[int(feature)].has_point3D():
-            model.delete_observation(int(image_id), int(feature))
+    pairs = zip(np.asarray(image_ids).tolist(), np.asarray(features).tolist(), strict=True)
+    for image_id, feature in pairs:
+        if model.images[image_id].points2D[feature].has_point3D():
+            model.delete_observation(image_id, feature)
 
 
-def drop_points(model: Reconstruction, point_ids: Sequence[int]) -> None:
+def drop_points(model: Reconstruction, point_ids: npt.ArrayLike) -> None:
     """Takes points out of a model."""
-    for point_id in point_ids:
-        model.delete_point3D(int(point_id))
+    for point_id in np.asarray(point_ids).tolist():
+        model.delete_point3D(point_id)
 
 
 def transform(model: Reconstruction, scale: float, rotation: F64, translation: F64) -> None:

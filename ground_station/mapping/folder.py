@@ -40,7 +40,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     Files in `folder` that are not part of a map (recordings, the floor plan) stay. Raises
     `MapError` as `check_target` does, and when the disk refuses.
     """
-    folder = Path(os.path.abspath(folder))
+    folder = Path(folder).absolute()
     check_target(folder)
     part, old = folder.with_name(folder.name + ".part"), folder.with_name(folder.name + ".old")
     try:

@@ -28,11 +28,7 @@ def _in_camera(model: Model) -> F64:
 
 
 def largest_angles_deg(model: Model) -> F64:
-    """Each point's largest angle between two of its sights (M,), degrees.
-
-    Twice the angle of the sight farthest from the mean direction bounds it from above and is equal
-    for two sights; all pairs are compared only where that bound does not already decide.
-    """
+    """Each point's largest angle between two of its sights (M,), degrees."""
     rays = model.wTc[model.image, :3, 3] - model.position[model.point]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     order = np.argsort(model.point, kind="stable")
@@ -70,7 +66,7 @@ def covariances(model: Model, sigma: float) -> F64:
     J = J @ np.swapaxes(model.wTc[model.image, :3, :3], 1, 2)
     information = np.zeros((len(model.position), 3, 3))
     np.add.at(information, model.point, np.einsum("oki,okj->oij", J, J) / sigma**2)
-    return np.linalg.inv(information)
+    return np.asarray(np.linalg.inv(information), np.float64)
 
 
 def make_landmarks(model: Model, descriptors: F32) -> Landmarks:

@@ -106,4 +106,9 @@ def verify(
             inliers = on_plane
     if inliers.sum() < _MIN_SAMPLE:
         return None
-    return TwoView(matches[inliers], E, H, degenerate)
+    return TwoView(
+        matches[inliers],
+        np.asarray(E, np.float64),
+        None if H is None else np.asarray(H, np.float64),
+        degenerate,
+    )

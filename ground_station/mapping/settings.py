@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pi_firmware.wire import config
@@ -73,11 +73,18 @@ class MappingSettings:
     max_features: int = config.key(
         1500, "features of an image, the strongest", unit="features", low=50, high=20000
     )
+    max_images: int = config.key(
+        160,
+        "without a step in the range, every n-th frame, so that so many are left",
+        unit="images",
+        low=2,
+        high=5000,
+    )
     seed: int = config.key(0, "of every random choice", low=0, high=2**31 - 1)
     threads: int = config.key(0, "worker threads, 0: one a core", unit="threads", low=0, high=256)
     quantise: bool = config.key(True, "keep descriptors as one byte a number")
-    match: MatchSettings = config.table(MatchSettings)
-    sfm: SfmSettings = config.table(SfmSettings)
+    match: MatchSettings = field(default_factory=MatchSettings)
+    sfm: SfmSettings = field(default_factory=SfmSettings)
 
 
 def load_settings(path: str | Path | None = None) -> MappingSettings:

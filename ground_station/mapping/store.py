@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import tomli_w
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
@@ -170,7 +170,7 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
 
 def _save(path: Path, arrays: dict[str, npt.NDArray[Any]], metadata: dict[str, str]) -> None:
     part = path.with_name(path.name + ".part")
-    save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, part, metadata)
+    part.write_bytes(save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata))
     part.replace(path)
 
 
