@@ -25,7 +25,7 @@ from ground_station.mapping.consistency import plausible_frames
 from ground_station.mapping.folder import replacing
 from ground_station.mapping.matching import TwoView, mutual_matches, verify
 from ground_station.mapping.pairs import choose_pairs
-from ground_station.mapping.progress import Progress
+from ground_station.progress import Progress
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
