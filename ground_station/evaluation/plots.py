@@ -71,7 +71,15 @@ def trajectory_plot(
     axes.set_aspect("equal")
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
-    _legend(axes, dress)
+    if axes.get_legend_handles_labels()[1]:  # above the plan, not over it
+        axes.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=3,
+            frameon=False,
+            labelcolor=dress.ink,
+            fontsize=9,
+        )
     return figure
 
 
@@ -94,9 +102,12 @@ def error_plot(
     for axes, values, limit, label, colour in rows:
         axes.plot(*_broken_series(time_s, values), color=colour, linewidth=1.1)
         axes.set_ylabel(label)
-        axes.set_ylim(bottom=0)
         if limit is not None:
-            _limit(axes, limit, "RMSE bound", dress)
+            axes.axhline(
+                limit, color=dress.limit, linestyle="--", lw=1.2, label="bound of the RMSE"
+            )
+            _legend(axes, dress)
+        axes.set_ylim(0, 1.3 * max(float(np.nanmax(values, initial=0.0)), limit or 0.0, 1e-3))
     lower.set_xlabel("time, s")
     return figure
 
@@ -114,10 +125,12 @@ def latency_plot(
     axes.plot(time_s, latency_ms, ".", color=dress.estimate, markersize=4)
     axes.set_xlabel("time, s")
     axes.set_ylabel("latency, ms")
-    axes.set_ylim(0, 1.15 * max(float(np.max(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
-    for value, name in ((median_ms, "median"), (p99_ms, "99th percentile")):
+    for value, name, style in ((median_ms, "median", "-"), (p99_ms, "99th percentile", "--")):
         if value is not None:
-            _limit(axes, value, f"{name} {value:.0f} ms", dress)
+            label = f"{name}, {value:.0f} ms"
+            axes.axhline(value, color=dress.limit, linestyle=style, linewidth=1.2, label=label)
+    axes.set_ylim(0, 1.5 * max(float(np.nanmax(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
+    _legend(axes, dress)
     return figure
 
 
@@ -200,20 +213,6 @@ def _legend(axes: Axes, dress: Dress) -> None:
         )
 
 
-def _limit(axes: Axes, value: float, text: str, dress: Dress) -> None:
-    axes.axhline(value, color=dress.limit, linestyle="--", linewidth=1.0)
-    axes.annotate(
-        text,
-        (1.0, value),
-        xycoords=axes.get_yaxis_transform(),
-        xytext=(-4, 3),
-        textcoords="offset points",
-        ha="right",
-        color=dress.limit,
-        fontsize=8.5,
-    )
-
-
 def _draw_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
     width_m, height_m = plan.size_m
     x, y, yaw = plan.origin
@@ -231,7 +230,9 @@ def _draw_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
         interpolation="antialiased",
         zorder=0,
     )
-    corners = to_world.transform([[0, 0], [width_m, 0], [width_m, height_m], [0, height_m]])
+    corners = to_world.transform(
+        np.array([[0, 0], [width_m, 0], [width_m, height_m], [0, height_m]])
+    )
     margin = 0.02 * max(width_m, height_m)
     axes.set_xlim(corners[:, 0].min() - margin, corners[:, 0].max() + margin)
     axes.set_ylim(corners[:, 1].min() - margin, corners[:, 1].max() + margin)

@@ -49,7 +49,7 @@ def read(path: str | Path) -> dict[str, Any]:
             return tomllib.load(file)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
 
@@ -69,7 +69,8 @@ def _build(document: Mapping[str, Any], cls: type[T], where: str, prefix: str) -
     unknown = sorted(set(document) - set(fields))
     if unknown:
         known = ", ".join(sorted(fields))
-        raise ConfigError(f"{where}: unknown key '{prefix}{unknown[0]}' (known here: {known})")
+        name = _shown(prefix + unknown[0])
+        raise ConfigError(f"{where}: unknown key {name} (known here: {known})")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         full = prefix + name
@@ -101,30 +102,67 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
         origin = typing.get_origin(kind)
     if origin is list or kind is list:
         if not isinstance(value, list):
-            raise ConfigError(f"{what} must be a list, not {value!r}")
+            raise ConfigError(f"{what} must be a list, not {_shown(value)}")
         (item,) = typing.get_args(kind) or (Any,)
         return [_check(v, item, meta, f"{what}[{i}]") for i, v in enumerate(value)]
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        try:
+            value = float(value)
+        except OverflowError:
+            raise ConfigError(f"{what} must be a finite number, not {_shown(value)}") from None
     if kind is not Any and (
         not isinstance(value, kind) or (kind is int and isinstance(value, bool))
     ):
-        raise ConfigError(f"{what} must be {_kind_name(kind)}, not {value!r}")
+        raise ConfigError(f"{what} must be {_kind_name(kind)}, not {_shown(value)}")
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{what} must be a finite number, not {value!r}")
     choices = meta.get("choices")
     if choices is not None and value not in choices:
         allowed = ", ".join(map(repr, choices))
-        raise ConfigError(f"{what} is {value!r}; allowed: {allowed}")
+        raise ConfigError(f"{what} is {_shown(value)}; allowed: {allowed}")
     low, high, unit = meta.get("low"), meta.get("high"), meta.get("unit", "")
     if isinstance(value, int | float) and not isinstance(value, bool):
         too_low, too_high = low is not None and value < low, high is not None and value > high
         if too_low or too_high:
             span = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
-            raise ConfigError(f"{what} is {value}; allowed: {span}{' ' + unit if unit else ''}")
+            raise ConfigError(
+                f"{what} is {_shown(value)}; allowed: {span}{' ' + unit if unit else ''}"
+            )
     return value
 
 
 def _kind_name(kind: Any) -> str:
     names = {float: "a number", int: "a whole number", str: "a string", bool: "true or false"}
     return names.get(kind, str(kind))
+
+
+def _shown(value: Any) -> str:
+    """A value as one short line."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def differences(path: str | Path, cls: type) -> list[str]:
+    """What a shipped TOML file says otherwise than the dataclass `cls`, one line each.
+
+    A shipped file is documentation and default in one: it must load, hold every key (but those
+    whose default is None, which TOML cannot say), and give each its default.
+    """
+    return _differences(read(path), load(path, cls), cls, "")
+
+
+def _differences(document: Mapping[str, Any], loaded: Any, cls: type, prefix: str) -> list[str]:
+    lines: list[str] = []
+    for field in dataclasses.fields(typing.cast(Any, cls)):
+        full, value = prefix + field.name, getattr(loaded, field.name)
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if field.name not in document:
+            if default is not None:
+                lines.append(f"'{full}' is not in the file (default: {_shown(default)})")
+        elif dataclasses.is_dataclass(value):
+            lines += _differences(document[field.name], value, type(value), full + ".")
+        elif default is not dataclasses.MISSING and value != default:
+            lines.append(f"'{full}' is {_shown(value)} in the file; default: {_shown(default)}")
+    return lines
