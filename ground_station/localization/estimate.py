@@ -1,0 +1,89 @@
+"""What a localizer says about one frame."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class State(enum.Enum):
+    """How far a pose can be trusted."""
+
+    INITIALIZING = "INITIALIZING"
+    """No frame was ever solved."""
+    TRACKING = "TRACKING"
+    """This frame was solved, and well supported."""
+    DEGRADED = "DEGRADED"
+    """Solved with little support, or not solved a moment after one that was; `reason` says why."""
+    LOST = "LOST"
+    """Not solved, and too long since the last one that was."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Features of the frame, landmarks projected into it, pairs associated, inliers of the pose."""
+
+    features: int = 0
+    projected: int = 0
+    associated: int = 0
+    inliers: int = 0
+
+
+@dataclass(frozen=True)
+class Observations:
+    """The N pairs a pose was solved from.
+
+    `pixel_px` (N, 2), the features in the (distorted) image; `landmark` (N,), indices into the
+    map's landmarks; `residual_px` (N,), at the solution; `inlier` (N,).
+    """
+
+    pixel_px: npt.NDArray[np.float32]
+    landmark: npt.NDArray[np.intp]
+    residual_px: Array
+    inlier: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.landmark)
+
+
+def no_observations() -> Observations:
+    """Those of a frame that was not solved."""
+    return Observations(
+        np.empty((0, 2), np.float32), np.empty(0, np.intp), np.empty(0), np.empty(0, bool)
+    )
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """One frame's pose, or why there is none.
+
+    `wTc` (4, 4) is only there when the frame was solved from its own observations. `covariance`
+    (6, 6) is of the right tangent wTc·exp(ξ) in the camera's axes, rotation (rad) before
+    translation (m), as of GTSAM's Pose3. `predicted_wTc` is the motion model's, for drawing only.
+    `stage_ms` has entropy, features, projection, association, pose, relocalization and total, those
+    that ran.
+    """
+
+    time_ns: int
+    index: int
+    state: State
+    reason: str = ""
+    wTc: Array | None = None
+    covariance: Array | None = None
+    predicted_wTc: Array | None = None
+    counts: Counts = Counts()
+    observations: Observations = field(default_factory=no_observations)
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    entropy_bits: float = float("nan")
+    gated: bool = False
+    relocalized: bool = False
+
+    @property
+    def localized(self) -> bool:
+        """Whether the frame was solved from its own observations."""
+        return self.wTc is not None

@@ -1,0 +1,94 @@
+"""Which landmarks a camera at a pose would see, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
+from ground_station.localization.settings import ProjectionSettings
+from ground_station.mapping.store import Landmarks
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_NEAREST_M = 0.05
+"""Nearer than this a landmark has no useful projection."""
+
+
+@dataclass(frozen=True)
+class Projected:
+    """N landmarks in view: `landmark` (N,) indices, `pinhole_px` (N, 2), undistorted pixels."""
+
+    landmark: Indices
+    pinhole_px: Array
+
+
+class Lens:
+    """A camera with what is needed to tell quickly whether a direction is in its image.
+
+    A distortion polynomial folds back far outside of the image, so that directions no pixel sees
+    would land inside; `max_radius` bounds them on the plane z = 1.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        w, h = camera.width_px - 0.5, camera.height_px - 0.5
+        corners = np.array([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]])
+        self.max_radius = 1.02 * float(np.linalg.norm(camera.undistort(corners), axis=1).max())
+
+    def inside(self, normalized: Array) -> npt.NDArray[np.bool_]:
+        """Whether directions (N, 2) on the plane z = 1 land in the image; (N,)."""
+        camera = self.camera
+        near = np.einsum("ij,ij->i", normalized, normalized) <= self.max_radius**2
+        pixels = camera.distort(normalized[near])
+        near[near] = (
+            (pixels[:, 0] >= -0.5)
+            & (pixels[:, 1] >= -0.5)
+            & (pixels[:, 0] < camera.width_px - 0.5)
+            & (pixels[:, 1] < camera.height_px - 0.5)
+        )
+        return near
+
+
+def project(
+    landmarks: Landmarks, wTc: npt.ArrayLike, lens: Lens, settings: ProjectionSettings
+) -> Projected:
+    """The landmarks that a camera at `wTc` (4, 4) would see.
+
+    Those behind the camera or outside of its (distorted) image are dropped and, if the settings say
+    so, those looked at from outside of their viewing cone (Alcantarilla et al., ICRA 2010).
+    """
+    cTw = poses.inverse(wTc)
+    points = landmarks.position_m @ cTw[:3, :3].T + cTw[:3, 3]
+    index = np.flatnonzero(points[:, 2] > _NEAREST_M)
+    points = points[index]
+    normalized = points[:, :2] / points[:, 2:]
+    keep = lens.inside(normalized)
+    index, normalized = index[keep], normalized[keep]
+    if settings.viewing_cone and len(index):
+        keep = in_cone(landmarks, index, np.asarray(wTc)[:3, 3], settings)
+        index, normalized = index[keep], normalized[keep]
+    camera = lens.camera
+    pixels = normalized * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+    return Projected(index, pixels)
+
+
+def in_cone(
+    landmarks: Landmarks, index: Indices, position_m: Array, settings: ProjectionSettings
+) -> npt.NDArray[np.bool_]:
+    """Whether landmarks `index` (N,) are looked at from within their widened cones; (N,).
+
+    `position_m` (3,) is the camera's, in the world. The distances that keyframes had count, too.
+    """
+    rays = position_m - landmarks.position_m[index]
+    distance = np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
+    cosine = np.einsum("ij,ij->i", rays, landmarks.view_direction[index]) / distance
+    half = np.arccos(np.clip(landmarks.view_cos[index], -1.0, 1.0))
+    limit = np.cos(np.minimum(half + np.deg2rad(settings.cone_margin_deg), np.pi))
+    ratio = settings.max_distance_ratio
+    nearest, farthest = landmarks.distance_m[index].T
+    return (cosine >= limit) & (distance * ratio >= nearest) & (distance <= farthest * ratio)

@@ -1,0 +1,175 @@
+"""Every constant of the localizer, with unit, range and default, and the presets that ship."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
+
+PRESETS = ("default", "thesis")
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Which features a frame is described by; the map must have been built with the same."""
+
+    extractor: str = config.key("rootsift", "name of the extractor")
+    max_features: int = config.key(1000, "strongest key points kept a frame", low=50, high=20000)
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Which frames are not worth solving."""
+
+    min_entropy_bits: float = config.key(
+        0.0, "frames of less luma entropy are skipped; 0: none", unit="bits", low=0, high=8
+    )
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """How the next frame's pose is predicted."""
+
+    model: str = config.key(
+        "constant_velocity",
+        "static: where the last solved frame was",
+        choices=["static", "constant_velocity"],
+    )
+    max_step_s: float = config.key(
+        0.5, "two solved frames further apart give no velocity", unit="s", low=0.001, high=10
+    )
+    coast_s: float = config.key(
+        0.2, "the velocity is carried on for this long, then the pose is held", unit="s", high=10
+    )
+
+
+@dataclass(frozen=True)
+class ProjectionSettings:
+    """Which landmarks are looked for."""
+
+    viewing_cone: bool = config.key(
+        False, "drop landmarks seen from a direction from which no keyframe saw them"
+    )
+    cone_margin_deg: float = config.key(
+        30.0, "added to the cone's half angle", unit="deg", low=0, high=180
+    )
+    max_distance_ratio: float = config.key(
+        2.5, "how much nearer or farther than any keyframe was, with the cone", low=1, high=100
+    )
+
+
+@dataclass(frozen=True)
+class AssociationSettings:
+    """Which feature is which landmark."""
+
+    radius_px: float = config.key(
+        40.0, "a feature looks for landmarks this near", unit="px", low=1, high=500
+    )
+    max_descriptor_distance: float = config.key(
+        0.7, "largest L2 distance of unit descriptors", low=0, high=2
+    )
+    max_ratio: float = config.key(
+        1.0, "nearest over second nearest distance within the radius; 1: no test", low=0.1, high=1
+    )
+    refine_radius_px: float = config.key(
+        0.0, "associate again this near after a first solution; 0: no", unit="px", low=0, high=500
+    )
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """How a pose is solved from its observations, and when it is believed."""
+
+    solver: str = config.key(
+        "graph",
+        "graph: GTSAM factors on pose and landmarks; direct: landmarks marginalised, vectorised",
+        choices=["graph", "direct"],
+    )
+    sigma_px: float = config.key(
+        5.0, "standard deviation of an observation", unit="px", low=0.1, high=50
+    )
+    huber_k: float = config.key(
+        1.345, "Huber's threshold in standard deviations", low=0.1, high=100
+    )
+    landmark_sigma_m: float = config.key(
+        0.01, "standard deviation of a landmark's position", unit="m", low=1e-6, high=10
+    )
+    max_iterations: int = config.key(
+        30, "Gauss-Newton steps before it is a failure", low=1, high=500
+    )
+    max_observations: int = config.key(
+        400, "best observations (smallest descriptor distance) that are solved", low=6, high=10000
+    )
+    min_observations: int = config.key(12, "fewer associations are not solved", low=4, high=1000)
+    inlier_px: float = config.key(
+        12.0, "an observation with a smaller residual is an inlier", unit="px", low=0.5, high=100
+    )
+    min_inliers: int = config.key(12, "a pose with fewer is not believed", low=4, high=1000)
+    min_inlier_share: float = config.key(
+        0.35, "a pose with a smaller share of inliers is not believed", low=0, high=1
+    )
+    reject_outliers: bool = config.key(False, "solve once more from the inliers alone")
+
+
+@dataclass(frozen=True)
+class StateSettings:
+    """When a localizer calls itself degraded or lost."""
+
+    lost_after_s: float = config.key(
+        0.0, "without a solved frame for longer: LOST, before that DEGRADED", unit="s", high=60
+    )
+    good_inliers: int = config.key(25, "fewer inliers: DEGRADED", low=4, high=1000)
+    good_spread: float = config.key(
+        0.06, "inliers' spread (RMS from their centre over the image's diagonal) below: DEGRADED",
+        low=0, high=0.5,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """Relocalization from the whole map, without a predicted pose."""
+
+    relocalize: bool = config.key(False, "when INITIALIZING without a first pose, and when LOST")
+    interval_s: float = config.key(
+        0.2, "shortest time between two attempts", unit="s", low=0, high=60
+    )
+    max_ratio: float = config.key(
+        0.85, "nearest over second nearest descriptor distance", low=0.1, high=1
+    )
+    max_reprojection_px: float = config.key(
+        3.0, "RANSAC's inlier threshold", unit="px", low=0.5, high=50
+    )
+    max_iterations: int = config.key(2000, "RANSAC's hypotheses", low=10, high=100000)
+    min_inliers: int = config.key(25, "a relocalization with fewer is refused", low=6, high=1000)
+    min_inlier_share: float = config.key(
+        0.25, "of the matches; a smaller share is refused", low=0, high=1
+    )
+    min_spread: float = config.key(
+        0.06, "inliers' spread as in the state's; a smaller one is refused", low=0, high=0.5
+    )
+
+
+@dataclass(frozen=True)
+class LocalizerSettings:
+    """The localizer's configuration file."""
+
+    seed: int = config.key(0, "of RANSAC's draws", low=0, high=2**31 - 1)
+    features: FeatureSettings = config.table(FeatureSettings)
+    gate: GateSettings = config.table(GateSettings)
+    motion: MotionSettings = config.table(MotionSettings)
+    projection: ProjectionSettings = config.table(ProjectionSettings)
+    association: AssociationSettings = config.table(AssociationSettings)
+    pose: PoseSettings = config.table(PoseSettings)
+    state: StateSettings = config.table(StateSettings)
+    recovery: RecoverySettings = config.table(RecoverySettings)
+
+
+def load_preset(name: str) -> LocalizerSettings:
+    """The preset of that name; raises `ConfigError` naming the known ones."""
+    if name not in PRESETS:
+        raise ConfigError(f"preset: there is no '{name}' (known: {', '.join(PRESETS)})")
+    file = resources.files("ground_station.localization") / "presets" / f"{name}.toml"
+    with resources.as_file(file) as path:
+        return config.load(path, LocalizerSettings)
