@@ -1,0 +1,146 @@
+"""Flight plans: closed paths through a hall with the heading along them, at a given speed.
+
+The paths are ellipses about the hall's middle that keep clear of pillars, furniture and lamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from ground_station.simulator.scenes import Scene, SimulatorError
+
+Array = npt.NDArray[np.float64]
+
+Shape = Callable[[Array], tuple[Array, Array]]
+"""From a path parameter (N,) in turns to positions (N, 3), metres, and yaw (N,), radians."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp."""
+
+    name: str
+    shape: Shape
+    turns: float
+    speed_m_s: float
+    by_hand: bool
+    default_duration_s: float
+
+
+class Reference:
+    """Where a plan wants to be at a time: arc length grows at the plan's speed, forever."""
+
+    def __init__(self, plan: Plan, phase: float, ramp_s: float = 0.0) -> None:
+        s = np.linspace(0, plan.turns, 4000)
+        position, yaw = plan.shape(s)
+        steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        length = np.concatenate([[0], np.cumsum(steps)])
+        # The yaw of a lap differs by whole turns from its start: periodic but for that.
+        self._lap_m, self._lap_yaw = float(length[-1]), float(yaw[-1] - yaw[0])
+        self._position = CubicSpline(length, np.vstack([position[:-1], position[:1]]),
+                                     bc_type="periodic")  # fmt: skip
+        self._yaw = CubicSpline(length, yaw)
+        self._phase_m = phase * self._lap_m
+        self._speed, self._ramp_s = plan.speed_m_s, ramp_s
+
+    def at(self, times_s: npt.ArrayLike) -> tuple[Array, Array]:
+        """Positions (N, 3), metres, and yaw (N,), radians and unwrapped, at times (N,)."""
+        t = np.asarray(times_s, dtype=np.float64)
+        if self._ramp_s > 0:  # from rest: the integral of a smooth start
+            x = np.clip(t / self._ramp_s, 0, 1)
+            run = self._ramp_s * (x**3 - x**4 / 2) + np.maximum(t - self._ramp_s, 0)
+        else:
+            run = t
+        distance = self._phase_m + self._speed * run
+        laps = np.floor(distance / self._lap_m)
+        rest = distance - laps * self._lap_m
+        return self._position(rest), self._yaw(rest) + laps * self._lap_yaw
+
+
+def _smooth(x: Array, a: float, b: float) -> Array:
+    t = np.clip((x - a) / (b - a), 0, 1)
+    return t * t * t * (10 - 15 * t + 6 * t * t)
+
+
+def _ellipse(
+    angle: Array, centre: tuple[float, float], rx: Array | float, ry: Array | float, z: Array
+) -> Array:
+    return np.stack([centre[0] + rx * np.cos(angle), centre[1] + ry * np.sin(angle), z], axis=1)
+
+
+def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
+    """The plan of that name for a scene; `rng` shifts its path a little.
+
+    Raises `SimulatorError` naming the plans there are.
+    """
+    plans = {
+        "mapping": _mapping,
+        "loop": _loop,
+        "small-circle": _small_circle,
+        "fast": _fast,
+    }
+    if name not in plans:
+        raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
+    # Two thirds of the width: pillars stand along both long sides.
+    centre = (scene.size_m[0] / 2, scene.size_m[1] / 2 - 0.1)
+    shift = rng.uniform(-1, 1, 4)
+    return plans[name](centre, shift)
+
+
+def _mapping(centre: tuple[float, float], shift: Array) -> Plan:
+    """A wide lap looking inwards, flown sideways, then a narrow one looking outwards."""
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        inner = _smooth(s, 0.9, 1.2) - _smooth(s, 1.75, 2.0)
+        angle = 2 * np.pi * s
+        rx, ry = 7.9 - 4.5 * inner, 3.7 - 1.4 * inner
+        z = 2.75 + 0.75 * np.sin(3 * angle + shift[0]) + 0.35 * np.sin(angle)
+        # Outwards after half a turn more, which the return leg completes.
+        turned = _smooth(s, 0.9, 1.2) + _smooth(s, 1.65, 2.0)
+        yaw = angle + np.pi + np.pi * turned + 0.25 * np.sin(2 * angle)
+        return _ellipse(angle, centre, rx, ry, z), yaw
+
+    return Plan("mapping", shape, 2.0, 0.65, False, 100.0)
+
+
+def _loop(centre: tuple[float, float], shift: Array) -> Plan:
+    """A large loop facing inwards."""
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        angle = 2 * np.pi * s
+        z = 2.9 + 0.15 * shift[0] + 0.4 * np.sin(2 * angle + shift[1])
+        rx, ry = 6.6 + 0.3 * shift[2], 3.0 + 0.2 * shift[3]
+        yaw = angle + np.pi + 0.3 * np.sin(angle + 1.0)
+        return _ellipse(angle, centre, rx, ry, z), yaw
+
+    return Plan("loop", shape, 1.0, 0.65, False, 50.0)
+
+
+def _small_circle(centre: tuple[float, float], shift: Array) -> Plan:
+    """A small circle facing forwards, a little outwards."""
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        angle = 2 * np.pi * s
+        z = 2.8 + 0.15 * shift[0] + 0.25 * np.sin(angle + shift[1])
+        r = 1.9 + 0.15 * shift[2]
+        yaw = angle + np.pi / 2 - 0.5 + 0.0 * s
+        return _ellipse(angle, (centre[0] + 0.2 * shift[3], centre[1]), r, r, z), yaw
+
+    return Plan("small-circle", shape, 1.0, 0.5, False, 40.0)
+
+
+def _fast(centre: tuple[float, float], shift: Array) -> Plan:
+    """Run around the hall at 4 m/s, the camera in the hand: 4 m/s over 4.75 m is 48°/s."""
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        angle = 2 * np.pi * s
+        z = 1.65 + 0.03 * shift[0] + 0.0 * angle
+        yaw = angle + np.pi / 2 + 0.25 * np.sin(3 * angle + shift[1]) + 0.15
+        return _ellipse(angle, (centre[0], centre[1] - 0.15), 4.75, 4.75, z), yaw
+
+    return Plan("fast", shape, 1.0, 4.0, True, 30.0)

@@ -1,0 +1,278 @@
+"""A simulated flight: from its settings to a recording with the true pose of every frame."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.trajectory import Trajectory, write_tum
+from ground_station.simulator import dynamics, handheld, scenes
+from ground_station.simulator.encoding import H264Encoder
+from ground_station.simulator.imaging import AutoExposure, FrameMaker, Sensor, covering_pinhole
+from ground_station.simulator.known_points import choose_sights, write_pairs
+from ground_station.simulator.lighting import light_named, lit_textures
+from ground_station.simulator.motion import Motion
+from ground_station.simulator.plans import Plan, Reference, plan_named
+from ground_station.simulator.rendering import SceneRenderer
+from ground_station.simulator.scenes import Scene, SimulatorError
+from pi_firmware.wire.recording import FRAME_INFO_TOPIC, TRUTH_TOPIC, RecordingWriter
+
+FIRST_FRAME_S = 1.0
+"""Capture time of the first frame, seconds after the payload's (simulated) boot at 0."""
+
+_RUN_UP_S = 3.0  # a runner's way from rest to full speed
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """What to fly. `duration_s` None is the plan's own; `bitrate_kbps` replaces `crf`."""
+
+    out: Path
+    scene: str = "atrium"
+    plan: str = "loop"
+    light: str = "noon"
+    seed: int = 0
+    duration_s: float | None = None
+    rate_hz: float = 30.0
+    crf: float = 20.0
+    bitrate_kbps: int | None = None
+    truth: Path | None = None
+    points: Path | None = None
+    texels_per_m: float = 150.0
+    supersampling: float = 1.25
+    renders: int = 2
+    camera: Camera = THESIS_CAMERA
+
+    def __post_init__(self) -> None:
+        limits = {
+            "seed": (0, 2**63 - 1),
+            "rate_hz": (0.1, 120.0),
+            "crf": (0.0, 51.0),
+            "supersampling": (0.25, 3.0),
+            "renders": (1, 8),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise SimulatorError(f"{name} is {value}; allowed: {low:g} to {high:g}")
+        if self.duration_s is not None and not 0 < self.duration_s <= 3600:
+            raise SimulatorError(f"duration_s is {self.duration_s:g}; allowed: above 0 to 3600")
+        if self.bitrate_kbps is not None and not 10 <= self.bitrate_kbps <= 100_000:
+            raise SimulatorError(f"bitrate_kbps is {self.bitrate_kbps}; allowed: 10 to 100000")
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """What was written. `frame_s` is the mean time a frame took to make and encode, seconds."""
+
+    out: str
+    scene: str
+    plan: str
+    light: str
+    seed: int
+    frames: int
+    duration_s: float
+    rate_hz: float
+    bytes: int
+    setup_s: float
+    frame_s: float
+    interrupted: bool
+    sights: int
+    max_speed_m_s: float
+    max_turn_deg_s: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A plan in motion and the times of its frames, seconds on the motion's clock."""
+
+    scene: Scene
+    plan: Plan
+    motion: Motion
+    times_s: npt.NDArray[np.float64]
+    noise: np.random.Generator
+    clicks: np.random.Generator
+
+
+def prepare_flight(settings: SimulationSettings) -> Flight:
+    """Scene, plan and motion from the settings and their seed; raises `SimulatorError`."""
+    scene = scenes.build(settings.scene, settings.texels_per_m)
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(4)]
+    path, air, noise, clicks = streams
+    plan = plan_named(settings.plan, scene, path)
+    duration = settings.duration_s or plan.default_duration_s
+    count = max(1, round(duration * settings.rate_hz))
+    phase = float(path.random())
+    if plan.by_hand:
+        motion = handheld.carry(Reference(plan, phase, _RUN_UP_S), duration, air)
+    else:
+        motion = dynamics.fly(Reference(plan, phase), duration, air)
+    return Flight(scene, plan, motion, np.arange(count) / settings.rate_hz, noise, clicks)
+
+
+def time_ns_of(times_s: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Capture times of frames from the motion's clock, integer nanoseconds."""
+    return np.rint((np.asarray(times_s) + FIRST_FRAME_S) * 1e9).astype(np.int64)
+
+
+@contextmanager
+def _interrupt_noted() -> Iterator[list[bool]]:
+    """Inside, Ctrl-C only sets the list's one element, so that a frame is written whole or not."""
+    noted = [False]
+    if threading.current_thread() is not threading.main_thread():
+        yield noted  # signals come to the main thread only
+        return
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        noted[0] = True
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _recording(path: Path) -> Iterator[RecordingWriter]:
+    """A recording written beside and renamed when it is closed properly."""
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimulatorError(f"{path.parent}: {error.strerror or error}") from None
+    try:
+        with RecordingWriter(part) as writer:
+            yield writer
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def simulate(settings: SimulationSettings, progress: Progress | None = None) -> SimulationResult:
+    """Flies, takes the frames and writes the recording; `progress` gets (frames done, all).
+
+    An interrupt (Ctrl-C) ends the flight early: what was taken until then is written whole, and
+    the result says so. Raises `SimulatorError`.
+    """
+    started = time.monotonic()
+    light = light_named(settings.light)
+    flight = prepare_flight(settings)
+    camera, sensor = settings.camera, Sensor()
+    lit = lit_textures(flight.scene, light)
+    pinhole = covering_pinhole(camera, settings.supersampling)
+    buffer = (pinhole.width_px, pinhole.height_px)
+    with SceneRenderer(flight.scene.surfaces, lit.textures, buffer) as renderer:
+        maker = FrameMaker(
+            renderer, lit.decoder(), camera, pinhole, sensor=sensor, renders=settings.renders
+        )
+        setup_s = time.monotonic() - started
+        taken, interrupted = _record(settings, flight, maker, progress)
+        frame_s = (time.monotonic() - started - setup_s) / max(taken, 1)
+        times = flight.times_s[:taken]
+        sights = []
+        if settings.points is not None:
+            sights = choose_sights(
+                renderer, pinhole, camera, flight.motion, times, flight.scene.known_points,
+                flight.clicks,
+            )  # fmt: skip
+            write_pairs(settings.points, sights)
+    if settings.truth is not None:
+        wTc = flight.motion.wTc(times)
+        write_tum(settings.truth, Trajectory.from_poses(time_ns_of(times), wTc))
+    speed, turn = flight.motion.speed(times)
+    return SimulationResult(
+        out=str(settings.out), scene=settings.scene, plan=settings.plan, light=settings.light,
+        seed=settings.seed, frames=taken, duration_s=round(taken / settings.rate_hz, 6),
+        rate_hz=settings.rate_hz, bytes=settings.out.stat().st_size, setup_s=round(setup_s, 3),
+        frame_s=round(frame_s, 4), interrupted=interrupted, sights=len(sights),
+        max_speed_m_s=round(float(speed.max(initial=0)), 3),
+        max_turn_deg_s=round(math.degrees(float(turn.max(initial=0))), 2),
+    )  # fmt: skip
+
+
+def _record(
+    settings: SimulationSettings, flight: Flight, maker: FrameMaker, progress: Progress | None
+) -> tuple[int, bool]:
+    """Takes and writes all frames; returns their number and whether it was interrupted."""
+    camera, motion, times = settings.camera, flight.motion, flight.times_s
+    stamps = time_ns_of(times).tolist()
+    encoder = H264Encoder(
+        camera.width_px, camera.height_px, settings.rate_hz,
+        crf=settings.crf, bitrate_kbps=settings.bitrate_kbps,
+    )  # fmt: skip
+    taken = 0
+    with _recording(settings.out) as writer, _interrupt_noted() as interrupted:
+        _write_head(writer, settings, flight, stamps[0])
+        exposure = AutoExposure(maker.sensor, maker.radiance(motion, float(times[0]), 0.0))
+        for k, t in enumerate(times.tolist()):
+            exposure_s, gain = exposure.settings
+            radiance = maker.radiance(motion, t, exposure_s)
+            picture = maker.expose(radiance, exposure_s, gain, flight.noise)
+            exposure.update(radiance, 1 / settings.rate_hz)
+            pose = motion.wTc([t])[0]
+            writer.write_pose(
+                stamps[k], pose[:3, 3].tolist(), poses.to_quaternion(pose).tolist(),
+                topic=TRUTH_TOPIC,
+            )  # fmt: skip
+            info = {"sequence": k, "exposure_s": exposure_s, "gain": gain}
+            writer.write_json(FRAME_INFO_TOPIC, stamps[k], info, schema_name="blimp.Frame")
+            for index, data in encoder.encode(picture):
+                writer.write_video(stamps[index], data)
+            taken = k + 1
+            if progress is not None:
+                progress(taken, len(times))
+            if interrupted[0]:
+                break
+        for index, data in encoder.finish():
+            writer.write_video(stamps[index], data)
+        end = {"frames": str(taken), "interrupted": str(interrupted[0]).lower()}
+        writer.write_metadata("simulation_end", end)
+    return taken, interrupted[0]
+
+
+def _write_head(
+    writer: RecordingWriter, settings: SimulationSettings, flight: Flight, first_ns: int
+) -> None:
+    camera = settings.camera
+    writer.write_metadata("camera", {k: str(v) for k, v in camera.as_dict().items()})
+    writer.write_metadata(
+        "simulation",
+        {
+            "seed": str(settings.seed),
+            "scene": settings.scene,
+            "plan": settings.plan,
+            "light": settings.light,
+            "rate_hz": f"{settings.rate_hz:g}",
+            "duration_s": f"{len(flight.times_s) / settings.rate_hz:g}",
+            "version": metadata.version("blimp-localization"),
+        },
+    )
+    writer.write_calibration(
+        first_ns,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        matrix=camera.matrix.ravel().tolist(),
+        distortion=camera.distortion.tolist(),
+    )
