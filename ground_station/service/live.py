@@ -1,0 +1,139 @@
+"""A live session: from the payload's stream to a pose a frame, every frame accounted for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.localization.estimate import PoseEstimate
+from ground_station.localization.localizer import Localizer
+from ground_station.stream.counters import Counters
+from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.telemetry import FrameCounts, PayloadState, TelemetryListener
+from pi_firmware.wire import messages
+from pi_firmware.wire.errors import StreamError
+
+_POLL_S = 0.1
+_DRAIN_S = 2.0
+"""After the payload's end-of-stream, packets still on their way come within this."""
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """One received frame and its estimate; wall-clock nanoseconds.
+
+    `clock_ns` is the payload's clock at capture, `arrival_ns` and `done_ns` are the ground's: with
+    both on one host their differences are latencies.
+    """
+
+    sequence: int
+    clock_ns: int
+    arrival_ns: int
+    done_ns: int
+    estimate: PoseEstimate
+
+
+@dataclass
+class LiveResult:
+    """A session's frames and counts.
+
+    `payload` is the payload's own account; `stream` the receiver's. sent = received + lost, and
+    received = localized + not localized + dropped from the full queue.
+    """
+
+    frames: list[LiveFrame] = field(default_factory=list)
+    pictures: list[tuple[npt.NDArray[np.uint8], LiveFrame]] = field(default_factory=list)
+    payload: FrameCounts | None = None
+    stream: Counters = field(default_factory=Counters)
+    battery: messages.Battery | None = None
+    events: list[messages.Event] = field(default_factory=list)
+    complete: bool = False
+    """Whether the payload announced the end of its stream, so that its counts are final."""
+
+    def accounts(self) -> dict[str, int]:
+        """Frames by what became of them, named as in results.json."""
+        sent = self.payload.sent if self.payload else self.stream.decoded
+        return {
+            "captured": self.payload.captured if self.payload else sent,
+            "gated": self.payload.gated if self.payload else 0,
+            "sent": sent,
+            "received": self.stream.decoded,
+            "lost": sent - self.stream.decoded,
+            "dropped": self.stream.dropped,
+            "localized": sum(frame.estimate.localized for frame in self.frames),
+        }
+
+    def latency_ms(self) -> npt.NDArray[np.float64]:
+        """Capture to pose of every frame, (N,), milliseconds."""
+        return np.array([(frame.done_ns - frame.clock_ns) / 1e6 for frame in self.frames])
+
+
+def run(
+    receiver: Receiver,
+    telemetry: TelemetryListener,
+    payload_id: str,
+    localizer: Localizer,
+    *,
+    check: Callable[[], None],
+    running: Callable[[], bool],
+    start_timeout_s: float,
+    on_start: Callable[[int], None] = lambda time_ns: None,
+    keep_picture: Callable[[ReceivedFrame], bool] = lambda frame: False,
+    on_frame: Callable[[LiveFrame], None] = lambda frame: None,
+) -> LiveResult:
+    """Localizes what comes until the payload ends its stream.
+
+    `check` raises when the payload has failed, `running` tells whether it may still send,
+    `on_start` gets the first frame's capture time before that frame is localized. Frames
+    for which `keep_picture` holds keep their image. Raises `StreamError` when no frame came within
+    `start_timeout_s`.
+    """
+    result = LiveResult()
+    started_s = last_s = time.monotonic()
+    while True:
+        frame = receiver.get(_POLL_S)
+        now_s = time.monotonic()
+        if frame is None:
+            check()
+            state = telemetry.state(payload_id)
+            ended = _ended(state)
+            if ended is not None and _drained(receiver, ended, now_s - last_s):
+                break
+            if not running() and now_s - last_s > _DRAIN_S:
+                break
+            if not result.frames and now_s - started_s > start_timeout_s:
+                raise StreamError(
+                    f"no video within {start_timeout_s:g} s on UDP port {receiver.port}"
+                )
+            continue
+        if not result.frames:
+            on_start(frame.time_ns)
+        estimate = localizer.process(frame.time_ns, frame.image, frame.sequence)
+        live = LiveFrame(frame.sequence, frame.clock_ns, frame.arrival_ns, time.time_ns(), estimate)
+        result.frames.append(live)
+        if keep_picture(frame):
+            result.pictures.append((frame.image, live))
+        on_frame(live)
+        last_s = time.monotonic()
+    final = telemetry.state(payload_id)
+    if final is not None:
+        result.payload, result.battery, result.events = final.frames, final.battery, final.events
+        result.complete = _ended(final) is not None
+    result.stream = receiver.counters
+    return result
+
+
+def _ended(state: PayloadState | None) -> FrameCounts | None:
+    """The payload's final counts once it has ended its stream."""
+    ends = (messages.EVENT_END_OF_STREAM, messages.EVENT_STOPPED)
+    if state is None or not any(event.name in ends for event in state.events):
+        return None
+    return state.frames
+
+
+def _drained(receiver: Receiver, counts: FrameCounts, idle_s: float) -> bool:
+    return receiver.counters.decoded >= counts.sent or idle_s > _DRAIN_S

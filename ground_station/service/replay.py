@@ -1,0 +1,218 @@
+"""A recorded flight through the real firmware, the real link and the localizer, in real time."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground_station.errors import InputError
+from ground_station.evaluation import ate
+from ground_station.features import extractor
+from ground_station.geometry.camera import Camera
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.mapping import store
+from ground_station.progress import Progress
+from ground_station.recording.flight import camera_of, trajectory_of
+from ground_station.service import live
+from ground_station.service.firmware import FirmwareProcess
+from ground_station.stream.receiver import Receiver
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
+
+PAYLOAD_ID = "replay"
+_START_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """What is replayed, and how."""
+
+    recording: Path
+    rate_hz: float
+    preset: str
+    init: str
+    """`truth`: the recording's true pose of the first frame; `none`; or a TUM file."""
+    start_s: float = 0.0
+    duration_s: float = 0.0
+    """0: to the end."""
+    gate_min_entropy_bits: float = 7.0
+    """The thesis's threshold; the payload's own default is lower."""
+    bitrate_kbps: int = 2000
+    pictures: int = 4
+    """How many frames are kept with their matches, for the report."""
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """The session, and its errors against the recording's truth when it has one."""
+
+    settings: ReplaySettings
+    localizer: LocalizerSettings
+    camera: Camera
+    live: live.LiveResult
+    truth: Trajectory | None
+    evaluation: ate.Evaluation | None
+
+    @property
+    def estimate(self) -> Trajectory:
+        """The localized frames' poses, by capture time."""
+        found = [frame.estimate for frame in self.live.frames if frame.estimate.wTc is not None]
+        return Trajectory.from_poses(
+            [estimate.time_ns for estimate in found], [estimate.wTc for estimate in found]
+        )
+
+    def stage_ms(self) -> dict[str, dict[str, float]]:
+        """Median and 99th percentile of each stage that ran, milliseconds."""
+        stages: dict[str, list[float]] = {}
+        for frame in self.live.frames:
+            for name, value in frame.estimate.stage_ms.items():
+                stages.setdefault(name, []).append(value)
+        return {name: percentiles(values) for name, values in stages.items()}
+
+    def document(self) -> dict[str, Any]:
+        """The result as results.json holds it."""
+        latency = self.live.latency_ms()
+        times = sorted(frame.estimate.time_ns for frame in self.live.frames)
+        span_s = (times[-1] - times[0]) / 1e9 if len(times) > 1 else 0.0
+        within = None
+        if self.evaluation is not None and "none" in self.evaluation.errors:
+            shares = ate.shares(self.evaluation.errors["none"])
+            within = [
+                {"position_m": m, "rotation_deg": deg, "share": share}
+                for (m, deg), share in zip(ate.THRESHOLDS, shares, strict=True)
+            ]
+        states: dict[str, int] = {}
+        for frame in self.live.frames:
+            name = frame.estimate.state.value
+            states[name] = states.get(name, 0) + 1
+        return {
+            "recording": self.settings.recording.name,
+            "frames": self.live.accounts(),
+            "complete": self.live.complete,
+            "states": states,
+            "ate": self.evaluation.ate() if self.evaluation else None,
+            "shares": within,
+            "stage_ms": self.stage_ms(),
+            "latency_ms": percentiles(latency.tolist()),
+            "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,
+            "stream": asdict(self.live.stream),
+            "preset": self.settings.preset,
+            "init": self.settings.init,
+            "seed": self.localizer.seed,
+            "settings": asdict(self.localizer),
+        }
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    """`p50` and `p99` of some numbers; an empty list gives an empty table."""
+    if not values:
+        return {}
+    return {"p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99))}
+
+
+def replay(
+    map_: store.Map, localizer_settings: LocalizerSettings, settings: ReplaySettings
+) -> ReplayResult:
+    """Starts the firmware on the recording as its own process and localizes what it streams.
+
+    Ports are ephemeral. Raises a `BlimpError` with one line for a recording without a camera, a map
+    of other features, a firmware that fails, or a stream that does not come.
+    """
+    reader = RecordingReader(settings.recording)
+    camera = camera_of(reader)
+    if camera is None:
+        raise InputError(f"{settings.recording}: it carries no camera calibration")
+    features = localizer_settings.features
+    extract = extractor.create(features.extractor, features.max_features)
+    localizer = Localizer(map_, camera, extract, localizer_settings)
+    truth = None
+    if TRUTH_TOPIC in reader.topics():
+        truth = trajectory_of(settings.recording)
+    start = first_pose(settings.init, truth)
+    expected = _expected_frames(reader, settings)
+    every = max(1, expected // (settings.pictures + 1))
+
+    def set_start(time_ns: int) -> None:
+        if start is not None:
+            localizer.set_initial_pose(start.at(time_ns), time_ns)
+
+    with (
+        tempfile.TemporaryDirectory(prefix="blimp-replay-") as folder,
+        Receiver(port=0) as receiver,
+        TelemetryListener(["tcp/127.0.0.1:0"]) as telemetry,
+        FirmwareProcess(
+            _payload_config(settings, camera, receiver.port, telemetry.endpoints), Path(folder)
+        ) as firmware,
+        Progress("live, frames", expected) as progress,
+    ):
+        result = live.run(
+            receiver,
+            telemetry,
+            PAYLOAD_ID,
+            localizer,
+            check=firmware.check,
+            running=firmware.running,
+            start_timeout_s=_START_TIMEOUT_S,
+            on_start=set_start,
+            keep_picture=lambda frame: frame.sequence % every == every // 2,
+            on_frame=lambda frame: progress.step(),
+        )
+    for event in result.events:
+        if event.name not in ("started", "end-of-stream"):
+            print(f"payload: {event.text}", file=sys.stderr)
+    done = ReplayResult(settings, localizer_settings, camera, result, truth, None)
+    evaluation = None
+    if truth is not None and map_.info.registered and len(done.estimate):
+        evaluation = ate.evaluate(done.estimate, truth)
+    return ReplayResult(settings, localizer_settings, camera, result, truth, evaluation)
+
+
+def first_pose(init: str, truth: Trajectory | None) -> Trajectory | None:
+    """Where the first frame's pose comes from; None for `none`. Raises `InputError`."""
+    from ground_station.geometry.trajectory import read_tum
+
+    if init == "none":
+        return None
+    if init != "truth":
+        return read_tum(init)
+    if truth is None:
+        raise InputError("--init truth: the recording has no true poses; give a TUM file or none")
+    return truth
+
+
+def _expected_frames(reader: RecordingReader, settings: ReplaySettings) -> int:
+    times = [sample.time_ns for sample in reader.video()]
+    span_s = (times[-1] - times[0]) / 1e9 - settings.start_s if times else 0.0
+    if settings.duration_s:
+        span_s = min(span_s, settings.duration_s)
+    return max(1, round(span_s * settings.rate_hz))
+
+
+def _payload_config(
+    settings: ReplaySettings, camera: Camera, port: int, endpoints: tuple[str, ...]
+) -> dict[str, Any]:
+    options = [f"rate_hz={settings.rate_hz:g}"]
+    if settings.start_s:
+        options.append(f"start_s={settings.start_s:g}")
+    if settings.duration_s:
+        options.append(f"duration_s={settings.duration_s:g}")
+    path = settings.recording.resolve()
+    return {
+        "payload_id": PAYLOAD_ID,
+        "camera": {
+            "uri": f"replay:{path}?{'&'.join(options)}",
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+        },
+        "gate": {"min_entropy_bits": settings.gate_min_entropy_bits},
+        "encoder": {"bitrate_kbps": settings.bitrate_kbps},
+        "link": {"port": port},
+        "telemetry": {"connect": list(endpoints)},
+    }
