@@ -54,17 +54,17 @@ class Payload:
         self._gauge = gauge
         self._gate = Gate(settings.gate)
         self._source = open_source(settings.camera)
-        try:
-            self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
-        except BaseException:
-            self._source.close()
-            raise
         self._gst = gstreamer.load()
         self._video = gstreamer.load_video()
         self._in_encoder: dict[int, sei.FrameInfo] = {}
         self._last_idr_ns = 0
         self._error: Exception | None = None
-        self._pipeline = self._build()
+        try:
+            self._pipeline = self._build()
+            self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
+        except BaseException:
+            self._source.close()
+            raise
 
     def run(self, stop: threading.Event) -> None:
         """Flies until the source ends or `stop` is set, then sends what is still inside.
@@ -112,7 +112,7 @@ class Payload:
             "! appsink name=encoded emit-signals=true sync=false "
             f"{link.description(settings.link, self.ssrc)}"
         )
-        self._link = link.Link(pipeline)
+        self._link = link.Link(pipeline, settings.link)
         self._encoder = pipeline.get_by_name("encoder")
         pad = self._encoder.get_static_pad("sink")
         pad.add_probe(self._gst.PadProbeType.BUFFER, self._on_captured)
@@ -174,6 +174,8 @@ class Payload:
             access_unit = buffer.extract_dup(0, buffer.get_size())
             if annexb.is_idr(access_unit):
                 self._last_idr_ns = running_ns
+            for earlier in [ns for ns in list(self._in_encoder) if ns < running_ns]:
+                del self._in_encoder[earlier]  # the encoder keeps order: it dropped this one
             info = self._in_encoder.pop(running_ns)
             stamped = annexb.insert_before_slice(access_unit, sei.encode(info))
             if self._link.send(stamped, running_ns):

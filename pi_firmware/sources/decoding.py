@@ -88,12 +88,12 @@ class RecordingDecoder:
     def _feed(self) -> None:
         gst = gstreamer.load()
         first_ns: int | None = None
+        saw_sets = False
         try:
             for sample in self._reader.video():
                 if first_ns is None:
                     first_ns = sample.time_ns
-                    if not has_parameter_sets(sample.data):
-                        raise RecordingError(f"{self._path}: {NO_PARAMETER_SETS}")
+                saw_sets = saw_sets or has_parameter_sets(sample.data)
                 pts = sample.time_ns - first_ns
                 if pts < 0:
                     continue
@@ -104,6 +104,8 @@ class RecordingDecoder:
                     return
             if first_ns is None:
                 raise RecordingError(f"{self._path}: the recording has no video")
+            if not saw_sets:
+                raise RecordingError(f"{self._path}: {NO_PARAMETER_SETS}")
             self.cut_reason = self._reader.cut_reason if self._reader.cut else ""
         except BlimpError as error:
             self._error = error

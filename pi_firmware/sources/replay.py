@@ -37,7 +37,7 @@ class RateGrid:
         if self._first_ns is None:
             self._first_ns = self._previous_ns = time_ns
             return True
-        half_interval_ns = (time_ns - self._previous_ns) / 2
+        half_interval_ns = min(time_ns - self._previous_ns, self._period_ns) / 2
         self._previous_ns = time_ns
         instant = int((time_ns - self._first_ns + half_interval_ns) / self._period_ns)
         if instant <= self._taken:
