@@ -99,6 +99,8 @@ def read_tum(path: str | Path) -> Trajectory:
             time_ns, values = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
         except (ValueError, OverflowError):
             raise GeometryError(f"{path}, line {number}: not a number in {line!r:.80}") from None
+        if not -(2**63) <= time_ns < 2**63:
+            raise GeometryError(f"{path}, line {number}: the time {words[0]:.40} s is out of range")
         if len(values) != 7 or not np.all(np.isfinite(values)):
             raise GeometryError(f"{path}, line {number}: eight finite numbers are needed")
         if np.linalg.norm(values[3:]) < 1e-6:

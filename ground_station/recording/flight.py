@@ -12,9 +12,9 @@ from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
-from ground_station.recording.h264 import PPS, SPS, Decoder, grey, nal_types
+from ground_station.recording.h264 import Decoder, grey
 from ground_station.recording.video import check_given, frame_name
-from pi_firmware.wire import config
+from pi_firmware.wire import annexb, config
 from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
 
 CAMERA_TABLE = "camera"
@@ -60,18 +60,19 @@ class FlightRecording:
     ) -> Iterator[tuple[int, int, av.VideoFrame]]:
         """Every picture up to the range's end with its access unit's number and capture time."""
         times_ns: dict[int, int] = {}
-        types: set[int] = set()
+        missing, is_empty = {annexb.NAL_SPS, annexb.NAL_PPS}, True
         for k, sample in enumerate(reader.video()):
             if self._range.is_past(k):
                 break
-            if not {SPS, PPS} <= types:
-                types |= nal_types(sample.data)
+            is_empty = False
+            if missing:
+                missing -= set(annexb.nal_types(sample.data))
             times_ns[k] = sample.time_ns
             for number, picture in decoder.decode(sample.data, k):
                 yield number, times_ns.pop(number), picture
         for number, picture in decoder.flush():
             yield number, times_ns.pop(number), picture
-        if types and not {SPS, PPS} <= types:
+        if missing and not is_empty:
             raise InputError(f"{self.path}: its video carries no H.264 parameter sets (SPS/PPS)")
 
     def _frame(self, number: int, time_ns: int, image: np.ndarray) -> Frame:

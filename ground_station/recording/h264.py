@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -11,30 +10,26 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-SLICE, IDR_SLICE, SPS, PPS = 1, 5, 7, 8
-"""NAL unit types of ITU-T H.264, table 7-1."""
+from pi_firmware.wire import annexb
 
-_START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 _LUMA_8_BIT = {"yuv420p", "yuv422p", "yuv444p", "nv12", "nv21", "gray"}
 _FULL_RANGE_8_BIT = {"yuvj420p", "yuvj422p", "yuvj444p"}
 _FULL_RANGE = 2  # av.video.reformatter.ColorRange.JPEG
+
+MAX_PIXELS = 8192 * 4320
+"""Parameter sets that claim more are refused: they could ask for gigabytes."""
 
 _LIMITED_TO_FULL = np.clip(np.round((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 """Luma of 16 to 235 (ITU-R BT.601, 2.5.3) to grey of 0 to 255."""
 
 
-def nal_types(data: bytes) -> set[int]:
-    """The NAL unit types in Annex B bytes."""
-    return {match[0] & 0x1F for match in _START_CODE.findall(data)}
-
-
 def parameter_sets_in(blocks: Iterable[bytes]) -> bool:
     """Whether a byte stream, given block by block, has both an SPS and a PPS somewhere."""
-    seen: set[int] = set()
+    missing = {annexb.NAL_SPS, annexb.NAL_PPS}
     tail = b""
     for block in blocks:
-        seen |= nal_types(tail + block)
-        if {SPS, PPS} <= seen:
+        missing -= set(annexb.nal_types(tail + block))
+        if not missing:
             return True
         tail = block[-3:]
     return False
@@ -71,6 +66,7 @@ class Decoder:
     def __init__(self) -> None:
         self._codec: Any = av.CodecContext.create("h264", "r")
         self._codec.thread_count = 1  # threads would hold back one picture each
+        self._codec.options = {"max_pixels": str(MAX_PIXELS)}
         self.damaged = 0
 
     def decode(self, data: bytes, number: int) -> Iterator[tuple[int, av.VideoFrame]]:
