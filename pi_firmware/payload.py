@@ -20,6 +20,7 @@ from pi_firmware.wire.errors import BlimpError, StreamError
 from pi_firmware.wire.video import MAX_IDR_INTERVAL_NS
 
 _POLL_NS = 50_000_000
+_START_LIMIT_NS = 5_000_000_000
 _FLUSH_LIMIT_S = 10.0
 
 
@@ -71,12 +72,10 @@ class Payload:
 
         Raises `BlimpError` when camera, encoder or link fail on the way.
         """
-        if self._pipeline.set_state(self._gst.State.PLAYING) == self._gst.StateChangeReturn.FAILURE:
-            raise self._pipeline_error()
-        self._pipeline.get_state(5 * self._gst.SECOND)
         self._announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
-        self._source.start()
         try:
+            self._play()
+            self._source.start()
             self._supervise(stop)
         except BlimpError as error:
             self._announce(messages.EVENT_FAILED, str(error))
@@ -109,7 +108,7 @@ class Payload:
         pipeline = gstreamer.launch(
             f"{self._source.elements()} ! {encoding} "
             "! video/x-h264,stream-format=byte-stream,alignment=au "
-            "! appsink name=encoded emit-signals=true sync=false "
+            "! appsink name=encoded emit-signals=true sync=false async=false "
             f"{link.description(settings.link, self.ssrc)}"
         )
         self._link = link.Link(pipeline, settings.link)
@@ -219,10 +218,12 @@ class Payload:
             if flush_until is not None and now > flush_until:
                 raise StreamError(f"the encoder did not end within {_FLUSH_LIMIT_S:g} s")
 
-    def _pipeline_error(self) -> StreamError:
-        message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
-        text = message.parse_error()[0].message if message else "it does not start"
-        return StreamError(f"video pipeline: {text}")
+    def _play(self) -> None:
+        if self._pipeline.set_state(self._gst.State.PLAYING) == self._gst.StateChangeReturn.FAILURE:
+            message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
+            text = message.parse_error()[0].message if message else "it does not start"
+            raise StreamError(f"video pipeline: {text}")
+        self._pipeline.get_state(_START_LIMIT_NS)
 
     def _tell_gate(self, info: sei.FrameInfo, decision: Decision) -> None:
         counters = self.counters

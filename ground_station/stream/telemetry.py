@@ -6,14 +6,17 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, open_session
 
-M = TypeVar("M", bound=messages.Message)
-
+_KINDS: dict[str, type[messages.Message]] = {
+    keys.BATTERY: messages.Battery,
+    keys.GATE: messages.Gate,
+    keys.EVENT: messages.Event,
+}
 _KEPT_DECISIONS = 10_000
 _KEPT_EVENTS = 200
 _KEPT_PAYLOADS = 64
@@ -85,10 +88,9 @@ class TelemetryListener:
         self._session = open_session(listen=listen, connect=connect)
         self.endpoints = self._session.listening
         session = self._session.zenoh
+        # One subscriber for all kinds keeps the order in which a payload said things.
         self._subscribers = [
-            session.declare_subscriber(keys.every_payload(keys.BATTERY), self._take_battery),
-            session.declare_subscriber(keys.every_payload(keys.GATE), self._take_gate),
-            session.declare_subscriber(keys.every_payload(keys.EVENT), self._take_event),
+            session.declare_subscriber(keys.every_payload("*"), self._take),
             session.liveliness().declare_subscriber(
                 keys.every_payload(keys.ALIVE), self._take_liveliness, history=True
             ),
@@ -141,58 +143,54 @@ class TelemetryListener:
     def _copy(state: PayloadState) -> PayloadState:
         return replace(state, decisions=dict(state.decisions), events=list(state.events))
 
-    def _state_of(self, sample: Any) -> PayloadState | None:
-        """The state a sample belongs to, created at the first; call with the lock held."""
-        payload_id = keys.payload_of(str(sample.key_expr))
+    def _state_of(self, key_expression: str) -> PayloadState | None:
+        """The state a key belongs to, created at the first; call with the lock held."""
+        payload_id = keys.payload_of(key_expression)
         if payload_id is None:
             return None
         if payload_id not in self._states and len(self._states) >= _KEPT_PAYLOADS:
             return None
         return self._states.setdefault(payload_id, PayloadState(payload_id))
 
-    def _decoded(self, sample: Any, kind: type[M]) -> tuple[PayloadState, M] | None:
-        state = self._state_of(sample)
-        if state is None:
-            return None
-        try:
-            return state, messages.decode(kind, sample.payload.to_bytes())
-        except TelemetryError:
-            state.refused += 1
-            return None
-
-    def _take_battery(self, sample: Any) -> None:
+    def _take(self, sample: Any) -> None:
+        key = str(sample.key_expr)
+        kind = _KINDS.get(key.rpartition("/")[2])
+        if kind is None:
+            return
+        message: messages.Message | None = None
         with self._changed:
-            if found := self._decoded(sample, messages.Battery):
-                found[0].battery = found[1]
+            state = self._state_of(key)
+            if state is None:
+                return
+            try:
+                message = messages.decode(kind, sample.payload.to_bytes())
+                _keep(state, message)
+            except TelemetryError:
+                state.refused += 1
             self._changed.notify_all()
-
-    def _take_gate(self, sample: Any) -> None:
-        with self._changed:
-            if found := self._decoded(sample, messages.Gate):
-                state, message = found
-                state.gate = message
-                state.decisions[message.sequence] = message
-                if len(state.decisions) > _KEPT_DECISIONS:
-                    del state.decisions[next(iter(state.decisions))]
-            self._changed.notify_all()
-
-    def _take_event(self, sample: Any) -> None:
-        with self._changed:
-            found = self._decoded(sample, messages.Event)
-            if found:
-                state, message = found
-                if message.name == messages.EVENT_STARTED:  # a new flight counts from zero
-                    state.gate, state.decisions, state.events = None, {}, []
-                state.events.append(message)
-                del state.events[:-_KEPT_EVENTS]
-            self._changed.notify_all()
-        if found and self._on_event is not None:
-            self._on_event(found[0].payload_id, found[1])
+        if isinstance(message, messages.Event) and self._on_event is not None:
+            self._on_event(state.payload_id, message)
 
     def _take_liveliness(self, sample: Any) -> None:
         import zenoh
 
         with self._changed:
-            if (state := self._state_of(sample)) is not None:
+            if (state := self._state_of(str(sample.key_expr))) is not None:
                 state.alive = sample.kind == zenoh.SampleKind.PUT
             self._changed.notify_all()
+
+
+def _keep(state: PayloadState, message: messages.Message) -> None:
+    """Puts a message into its payload's state."""
+    if isinstance(message, messages.Battery):
+        state.battery = message
+    elif isinstance(message, messages.Gate):
+        state.gate = message
+        state.decisions[message.sequence] = message
+        if len(state.decisions) > _KEPT_DECISIONS:
+            del state.decisions[next(iter(state.decisions))]
+    elif isinstance(message, messages.Event):
+        if message.name == messages.EVENT_STARTED:  # a new flight counts from zero
+            state.gate, state.decisions, state.events = None, {}, []
+        state.events.append(message)
+        del state.events[:-_KEPT_EVENTS]

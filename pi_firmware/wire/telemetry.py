@@ -63,7 +63,7 @@ def open_session(*, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> 
     for attempt in range(_ATTEMPTS):
         endpoints = [_with_port(endpoint) for endpoint in listen]
         try:
-            return Session(zenoh.open(_config(endpoints, connect)), tuple(endpoints))
+            return Session(zenoh.open(session_config(endpoints, connect)), tuple(endpoints))
         except zenoh.ZError as error:
             in_use = "in use" in str(error)
             # Another program may take the free port between choosing and opening it.
@@ -86,7 +86,8 @@ def _with_port(endpoint: str) -> str:
         return f"tcp/{host}:{probe.getsockname()[1]}"
 
 
-def _config(listen: Sequence[str], connect: Sequence[str]) -> Any:
+def session_config(listen: Sequence[str], connect: Sequence[str]) -> Any:
+    """The `zenoh.Config` of a session that listens and connects at these endpoints only."""
     import zenoh
 
     config = zenoh.Config()

@@ -1,0 +1,306 @@
+"""The payload's program flies a recording to the receiver: every frame is accounted for."""
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from lossy_link import LossyLink
+from numbered_flight import (
+    START_NS,
+    capture_ns,
+    encoded,
+    number_in,
+    start_payload,
+    write_flight,
+)
+
+from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware.wire import messages
+from pi_firmware.wire.recording import RecordingWriter
+
+LIMIT_S = 30.0
+
+
+@dataclass
+class Flight:
+    """What came of one run of the payload."""
+
+    frames: list[ReceivedFrame]
+    state: PayloadState
+    end: messages.Event | None
+    status: int
+    out: str
+    err: str
+
+
+def fly(
+    receiver: Receiver,
+    *settings: str,
+    port: int | None = None,
+    on_frame: Callable[[subprocess.Popen[str], int], None] = lambda process, count: None,
+) -> Flight:
+    """Runs the payload to its end, taking all frames, and listens to its telemetry."""
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+        process = start_payload(
+            f"link.port={port or receiver.port}",
+            f"telemetry.connect={json.dumps(listener.endpoints)}",
+            *settings,
+        )
+        try:
+            frames = []
+            while (frame := receiver.get(0.5)) or process.poll() is None:
+                if frame:
+                    frames.append(frame)
+                    on_frame(process, len(frames))
+            out, err = process.communicate(timeout=LIMIT_S)
+        finally:
+            process.kill()
+        ends = (messages.EVENT_END_OF_STREAM, messages.EVENT_STOPPED)
+        state = listener.wait(
+            "blimp-1", lambda s: any(e.name in ends for e in s.events) and not s.alive, LIMIT_S
+        )
+        assert state is not None, err
+        end = next(event for event in state.events if event.name in ends)
+        return Flight(frames, state, end, process.returncode, out, err)
+
+
+def assert_true(frames: list[ReceivedFrame]) -> None:
+    """Each picture is the one captured at the time that came with it."""
+    assert [frame.time_ns for frame in frames] == [
+        capture_ns(number_in(frame.image)) for frame in frames
+    ]
+
+
+def test_all_frames_of_a_flight_arrive_with_their_exact_capture_times(flight: Path) -> None:
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{flight}")
+        assert flown.status == 0, flown.err
+        assert_true(flown.frames)
+        assert [frame.sequence for frame in flown.frames] == list(range(60))
+        assert [number_in(frame.image) for frame in flown.frames] == list(range(60))
+        for index, frame in enumerate(flown.frames):
+            assert frame.exposure_s == pytest.approx(0.01 + index / 2**16, rel=1e-6)
+            assert frame.gain == 2.0
+            assert frame.clock_ns <= frame.arrival_ns
+        assert flown.state.ssrc == receiver.ssrc
+        counters = receiver.counters
+        assert counters.packets_lost == counters.withheld == counters.garbage == 0
+    assert flown.end is not None and flown.end.name == messages.EVENT_END_OF_STREAM
+    assert flown.end.values["captured"] == flown.end.values["sent"] == 60
+    assert "60 captured, 0 gated, 60 sent" in flown.out
+    assert flown.state.battery is not None and flown.state.battery.power_supply_status == 2
+
+
+def test_the_gate_says_for_every_frame_what_the_video_says(flight: Path) -> None:
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{flight}?duration_s=1")
+    decisions = flown.state.decisions
+    assert list(decisions) == list(range(30)) == [frame.sequence for frame in flown.frames]
+    for frame in flown.frames:
+        said = decisions[frame.sequence]
+        assert said.capture_ns == frame.time_ns
+        assert said.entropy_bits == pytest.approx(frame.entropy_bits, rel=1e-6)
+        assert said.sharpness == pytest.approx(frame.sharpness, rel=1e-6)
+
+
+def test_dark_frames_are_gated_and_counted_but_a_heartbeat_comes(tmp_path: Path) -> None:
+    dark = set(range(15, 45))
+    recording = write_flight(tmp_path / "dark.mcap", 60, dark)
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{recording}", "gate.heartbeat_s=0.5")
+    assert flown.status == 0, flown.err
+    assert_true(flown.frames)
+    counts = flown.state.frames
+    assert counts is not None
+    assert counts.captured == 60 == counts.gated + counts.sent
+    assert counts.sent == len(flown.frames)
+    beats = [frame for frame in flown.frames if frame.heartbeat]
+    assert counts.heartbeats == len(beats) == 2
+    assert {frame.sequence for frame in beats} < dark
+    assert all(frame.entropy_bits < 5.0 for frame in beats)
+    gated = {sequence for sequence, said in flown.state.decisions.items() if not said.passed}
+    assert gated == dark - {frame.sequence for frame in beats}
+    assert {frame.sequence for frame in flown.frames} == set(range(60)) - gated
+
+
+def test_a_slower_camera_takes_its_frames_at_their_own_times(flight: Path) -> None:
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{flight}?rate_hz=5")
+    assert_true(flown.frames)
+    assert [number_in(frame.image) for frame in flown.frames] == list(range(0, 60, 6))
+    assert [frame.sequence for frame in flown.frames] == list(range(10))
+
+
+def test_at_five_percent_loss_every_frame_is_right_and_accounted_for(flight: Path) -> None:
+    with (
+        Receiver(0, queue_frames=100) as receiver,
+        LossyLink(receiver.port, loss=0.05, seed=2) as link,
+    ):
+        flown = fly(
+            receiver,
+            f"camera.uri=replay:{flight}",
+            "encoder.gop_frames=3",
+            "encoder.bitrate_kbps=400",
+            port=link.port,
+        )
+        counters = receiver.counters
+    assert flown.status == 0, flown.err
+    assert link.lost > 0
+    assert_true(flown.frames)
+    assert all(number_in(frame.image) == frame.sequence for frame in flown.frames)
+    assert counters.packets == link.passed
+    assert counters.access_units == counters.decoded + counters.withheld + counters.failed
+    assert counters.decoded == len(flown.frames) < 60
+    counts = flown.state.frames
+    assert counts is not None and counts.sent == 60
+    # Frames of which nothing arrived are known by their sequence numbers, from the telemetry.
+    lost = {s for s, said in flown.state.decisions.items() if said.passed}
+    lost -= {frame.sequence for frame in flown.frames}
+    assert len(lost) == 60 - len(flown.frames) >= counters.withheld
+
+
+def test_start_and_duration_choose_a_stretch_and_speed_shortens_it(flight: Path) -> None:
+    with Receiver(0, queue_frames=100) as receiver:
+        uri = f"camera.uri=replay:{flight}?start_s=0.5&duration_s=1&speed=4"
+        flown = fly(receiver, uri)
+    assert_true(flown.frames)
+    first = capture_ns(0) + 500_000_000
+    expected = [i for i in range(60) if first <= capture_ns(i) < first + 1_000_000_000]
+    assert [number_in(frame.image) for frame in flown.frames] == expected
+    took_ns = flown.frames[-1].clock_ns - flown.frames[0].clock_ns
+    assert took_ns < 1_000_000_000
+
+
+def test_a_loop_goes_on_with_rising_times_until_it_is_stopped(flight: Path) -> None:
+    def stop(process: subprocess.Popen[str], count: int) -> None:
+        if count == 40:
+            process.send_signal(signal.SIGTERM)
+
+    with Receiver(0, queue_frames=100) as receiver:
+        uri = f"camera.uri=replay:{flight}?duration_s=0.5&loop=1&speed=2"
+        flown = fly(receiver, uri, on_frame=stop)
+    assert flown.status == 0, flown.err
+    times = [frame.time_ns for frame in flown.frames]
+    assert times == sorted(set(times))
+    assert [number_in(frame.image) for frame in flown.frames[:32]] == [*range(15), *range(15), 0, 1]
+    gaps = [b - a for a, b in pairwise(times)]
+    assert max(gaps) < 40_000_000  # rounds join at the camera's own pace
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_flight_in_order(flight: Path, number: signal.Signals) -> None:
+    def stop(process: subprocess.Popen[str], count: int) -> None:
+        if count == 10:
+            process.send_signal(number)
+
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{flight}?loop=1", on_frame=stop)
+    assert (flown.status, flown.err) == (0, "")
+    assert flown.end is not None and flown.end.name == messages.EVENT_STOPPED
+    # What was captured before the signal was still sent.
+    assert flown.end.values["captured"] == flown.end.values["sent"] == len(flown.frames)
+
+
+def test_a_cut_recording_is_flown_up_to_the_cut_and_says_so(flight: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flight.read_bytes()[: int(0.6 * flight.stat().st_size)])
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, f"camera.uri=replay:{cut}")
+    assert flown.status == 0, flown.err
+    assert 10 < len(flown.frames) < 60
+    assert_true(flown.frames)
+    assert "the recording is cut" in flown.out
+    assert messages.EVENT_SOURCE_CUT in [event.name for event in flown.state.events]
+
+
+def test_the_test_picture_flies_with_the_payloads_clock() -> None:
+    with Receiver(0, queue_frames=100) as receiver:
+        flown = fly(receiver, "camera.uri=test:?duration_s=1", "camera.width_px=320",
+                    "camera.height_px=240")  # fmt: skip
+    assert len(flown.frames) == 30
+    assert flown.frames[0].image.shape == (240, 320)
+    for frame in flown.frames:
+        assert frame.time_ns == frame.clock_ns <= frame.arrival_ns
+
+
+def video_of(path: Path, units: list[bytes]) -> Path:
+    with RecordingWriter(path) as recording:
+        for index, unit in enumerate(units):
+            recording.write_video(START_NS + index * 10**7, unit)
+    return path
+
+
+def make_missing(folder: Path) -> Path:
+    return folder / "none.mcap"
+
+
+def make_text(folder: Path) -> Path:
+    (folder / "text.mcap").write_text("no recording")
+    return folder / "text.mcap"
+
+
+def make_without_video(folder: Path) -> Path:
+    return video_of(folder / "empty.mcap", [])
+
+
+def make_without_parameter_sets(folder: Path) -> Path:
+    return video_of(folder / "sets.mcap", list(encoded(12)[1:]))
+
+
+def make_noise(folder: Path) -> Path:
+    return video_of(folder / "noise.mcap", [b"\x00\x00\x00\x01\x65" + b"\xa5" * 99] * 5)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (make_missing, "No such file"),
+        (make_text, "not an MCAP recording"),
+        (make_without_video, "no video"),
+        (make_without_parameter_sets, "no parameter sets"),
+        (make_noise, "no parameter sets"),
+    ],
+)
+def test_a_recording_that_cannot_be_flown_is_one_line(
+    tmp_path: Path, make: Callable[[Path], Path], named: str
+) -> None:
+    path = make(tmp_path)
+    process = start_payload(f"camera.uri=replay:{path}", "telemetry.enabled=false")
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2, out
+    assert err.count("\n") == 1 and str(path) in err and named in err
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ("camera.width_px=320", "640x480"),
+        ("gate.min_entropy_bits=99", "0 to 8"),
+        ("camera.uri=libcamera:", "not available yet"),
+        ("link.host=no.such.host.invalid", "link.host 'no.such.host.invalid'"),
+    ],
+)
+def test_a_bad_setting_is_one_line(flight: Path, setting: str, named: str) -> None:
+    process = start_payload(
+        f"camera.uri=replay:{flight}", "telemetry.enabled=false", "link.port=9", setting
+    )
+    _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2
+    assert err.count("\n") == 1 and named in err
+
+
+def test_a_telemetry_endpoint_in_use_is_one_line(flight: Path) -> None:
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+        process = start_payload(
+            f"camera.uri=replay:{flight}", f"telemetry.listen={json.dumps(listener.endpoints)}"
+        )
+        _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2
+    assert err.count("\n") == 1 and listener.endpoints[0] in err and "in use" in err
+    assert "Traceback" not in err

@@ -1,0 +1,230 @@
+"""The receiver hands out only what was sent, with its capture time, and counts everything else."""
+
+import random
+import socket
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from numbered_flight import capture_ns, encoded, number_in, packets, stamped
+
+from ground_station.stream.receiver import ReceivedFrame, Receiver
+from pi_firmware.wire import annexb
+from pi_firmware.wire.errors import StreamError
+
+FRAMES = 45
+STREAMS = Path(__file__).parents[3] / "shared/data/streams"
+
+
+def flight_units() -> list[bytes]:
+    return [stamped(unit, index) for index, unit in enumerate(encoded(FRAMES))]
+
+
+def without_loss() -> list[np.ndarray]:
+    codec = av.CodecContext.create("h264", "r")
+    decoded = [frame for unit in encoded(FRAMES) for frame in codec.decode(av.Packet(unit))]
+    return [frame.to_ndarray(format="gray") for frame in [*decoded, *codec.decode(None)]]
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return condition()
+
+
+def send(datagrams: Iterable[bytes], receiver: Receiver) -> None:
+    """Sends datagrams no faster than the receiver takes them: the socket's buffer may be small."""
+
+    def taken() -> int:
+        c = receiver.counters
+        return c.packets + c.garbage + c.other_streams
+
+    before = taken()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number, datagram in enumerate(datagrams, start=1):
+            sender.sendto(datagram, ("127.0.0.1", receiver.port))
+            assert until(lambda: number - (taken() - before) < 60)  # noqa: B023
+
+
+def all_frames(receiver: Receiver) -> list[ReceivedFrame]:
+    frames = []
+    while (frame := receiver.get(0.3)) is not None:
+        frames.append(frame)
+    return frames
+
+
+def accounted(receiver: Receiver) -> bool:
+    c = receiver.counters
+    return c.access_units == c.decoded + c.withheld + c.failed + c.unstamped
+
+
+def test_every_frame_comes_with_its_own_picture_and_capture_time() -> None:
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(packets(flight_units()), receiver)
+        frames = all_frames(receiver)
+        assert [frame.sequence for frame in frames] == list(range(FRAMES))
+        assert [number_in(frame.image) for frame in frames] == list(range(FRAMES))
+        assert [frame.time_ns for frame in frames] == [capture_ns(i) for i in range(FRAMES)]
+        assert all(frame.clock_ns == frame.time_ns + 5 for frame in frames)
+        assert all(frame.ssrc == 77 for frame in frames) and receiver.ssrc == 77
+        for frame, picture in zip(frames, without_loss(), strict=True):
+            assert np.array_equal(frame.image, picture)
+        counters = receiver.counters
+        assert counters.decoded == counters.access_units == FRAMES
+        assert counters.packets_lost == counters.withheld == counters.dropped == 0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("share", [0.002, 0.02])
+def test_no_frame_painted_over_a_loss_is_handed_out(seed: int, share: float) -> None:
+    rng = random.Random(seed)
+    datagrams = packets(flight_units())
+    kept = [d for number, d in enumerate(datagrams) if number < 2 or rng.random() >= share]
+    truth = without_loss()
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(kept, receiver)
+        frames = all_frames(receiver)
+        for frame in frames:
+            assert np.array_equal(frame.image, truth[frame.sequence]), frame.sequence
+        counters = receiver.counters
+        assert counters.packets == len(kept)
+        assert counters.decoded == len(frames)
+        assert accounted(receiver)
+        assert counters.withheld > 0 or len(kept) == len(datagrams)
+
+
+def test_after_a_loss_frames_come_again_from_the_next_idr() -> None:
+    units = flight_units()
+    datagrams = packets(units)
+    missing = len(packets(units[:5]))  # the first packet of frame 5
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send([*datagrams[:missing], *datagrams[missing + 1 :]], receiver)
+        assert [frame.sequence for frame in all_frames(receiver)] == [*range(5), *range(15, 45)]
+        assert receiver.counters.packets_lost == 1
+        assert receiver.counters.withheld == 10
+
+
+def test_a_receiver_that_starts_late_begins_with_an_idr() -> None:
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(packets(flight_units()[7:]), receiver)
+        assert [frame.sequence for frame in all_frames(receiver)] == list(range(15, 45))
+        assert receiver.counters.withheld == 8
+
+
+def test_a_slow_reader_gets_the_newest_frames_and_is_told_of_the_dropped() -> None:
+    with Receiver(0, queue_frames=4) as receiver:
+        send(packets(flight_units()), receiver)
+        assert until(lambda: receiver.counters.decoded == FRAMES)
+        assert [frame.sequence for frame in all_frames(receiver)] == [41, 42, 43, 44]
+        assert receiver.counters.dropped == FRAMES - 4
+
+
+def test_garbage_is_counted_and_changes_nothing() -> None:
+    rng = random.Random(9)
+    genuine = packets(flight_units())
+    garbage = [rng.randbytes(rng.randint(0, 1500)) for _ in range(300)]
+    cut = [datagram[: rng.randint(0, 11)] for datagram in genuine[:50]]
+    wrong_type = [datagram[:1] + b"\x21" + datagram[2:] for datagram in genuine[:50]]
+    looks_right = [b"\x80\x60" + rng.randbytes(40) for _ in range(50)]
+    mixed = [*garbage, *cut, *wrong_type, *looks_right]
+    places = [(rng.uniform(0, len(genuine)), datagram) for datagram in mixed]
+    ordered = sorted([*places, *enumerate(genuine)], key=lambda entry: entry[0])
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send([datagram for _, datagram in ordered], receiver)
+        frames = all_frames(receiver)
+        assert [frame.sequence for frame in frames] == list(range(FRAMES))
+        assert [number_in(frame.image) for frame in frames] == list(range(FRAMES))
+        counters = receiver.counters
+        assert counters.packets == len(genuine)
+        assert counters.garbage + counters.other_streams == len(mixed)
+        assert counters.garbage >= 390 and counters.packets_lost == 0
+
+
+def test_hostile_access_units_of_the_own_stream_do_not_end_it() -> None:
+    rng = random.Random(4)
+    units = flight_units()
+    noise = [b"\x00\x00\x01\x65" + rng.randbytes(900) for _ in range(10)]
+    noise += [units[0][:40] + rng.randbytes(400) for _ in range(10)]
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(packets([*units[:5], *noise, *units]), receiver)
+        assert until(lambda: receiver.counters.access_units == 25 + FRAMES)
+        frames = all_frames(receiver)
+        assert [frame.sequence for frame in frames[-FRAMES:]] == list(range(FRAMES))
+        assert accounted(receiver)
+
+
+def test_frames_without_capture_time_are_not_handed_out_but_counted() -> None:
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(packets(list(encoded(FRAMES))), receiver)
+        assert until(lambda: receiver.counters.unstamped == FRAMES)
+        assert receiver.get(0.01) is None
+        assert accounted(receiver)
+
+
+def test_of_two_streams_the_first_is_kept_and_the_other_counted() -> None:
+    own = packets(flight_units(), ssrc=1)
+    other = packets(flight_units(), ssrc=2)
+    mixed = [datagram for pair in zip(own, other, strict=True) for datagram in pair]
+    with Receiver(0, queue_frames=2 * FRAMES) as receiver:
+        send([own[0], own[1], other[0], *mixed[3:]], receiver)
+        frames = all_frames(receiver)
+        assert {frame.ssrc for frame in frames} == {1}
+        assert len(frames) == FRAMES
+        assert receiver.counters.other_streams == len(other)
+
+
+def test_the_stream_asked_for_is_taken_whichever_comes_first() -> None:
+    own, other = packets(flight_units(), ssrc=5), packets(flight_units(), ssrc=6)
+    with Receiver(0, queue_frames=FRAMES, ssrc=5) as receiver:
+        send([*other[:40], *own], receiver)
+        frames = all_frames(receiver)
+        assert len(frames) == FRAMES and {frame.ssrc for frame in frames} == {5}
+        assert receiver.counters.other_streams == 40
+
+
+def test_colour_comes_as_bgr() -> None:
+    with Receiver(0, queue_frames=FRAMES, color=True) as receiver:
+        send(packets(flight_units()[:3]), receiver)
+        frames = all_frames(receiver)
+        assert [frame.image.shape for frame in frames] == [(480, 640, 3)] * 3
+        assert [number_in(frame.image) for frame in frames] == [0, 1, 2]
+
+
+def test_a_port_in_use_is_one_line() -> None:
+    with Receiver(0) as receiver, pytest.raises(StreamError) as caught:
+        Receiver(receiver.port)
+    assert str(receiver.port) in str(caught.value) and "in use" in str(caught.value)
+
+
+def test_a_host_that_is_not_ours_is_one_line() -> None:
+    with pytest.raises(StreamError, match=r"192\.0\.2\.1"):
+        Receiver(0, "192.0.2.1")
+
+
+def test_a_stream_without_parameter_sets_is_said_in_one_line() -> None:
+    path = STREAMS / "tello-no-parameter-sets.h264"
+    if not path.is_file():
+        pytest.skip("shared/data/streams is not here")
+    units = [annexb.START_CODE + nal for nal in annexb.nal_units(path.read_bytes())]
+    with Receiver(0, parameter_sets_timeout_s=0.2) as receiver:
+        with pytest.raises(StreamError) as caught:
+            for datagram in packets(units):
+                send([datagram], receiver)
+                receiver.get(0.002)
+        assert "no parameter sets" in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert receiver.problem is not None
+        # And it recovers: a stream that has them is shown.
+        send(packets(flight_units(), first=20_000), receiver)
+        assert until(lambda: receiver.problem is None)
+        assert receiver.get(1.0) is not None
+
+
+def test_closing_wakes_who_waits() -> None:
+    receiver = Receiver(0)
+    receiver.close()
+    assert receiver.get(60.0) is None

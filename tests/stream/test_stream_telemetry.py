@@ -1,0 +1,147 @@
+"""The listener keeps what payloads say, refuses what they should not say, and knows who lives."""
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from ground_station.stream.telemetry import FrameCounts, TelemetryListener
+from pi_firmware.settings import TelemetrySettings
+from pi_firmware.telemetry import Telemetry
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.telemetry import open_session, session_config
+
+LIMIT_S = 20.0
+
+
+def gate(sequence: int, **fields: int) -> messages.Gate:
+    values = {"captured": sequence + 1, "gated": 0, "heartbeats": 0, "sent": sequence, "ssrc": 9}
+    return messages.Gate(
+        time_ns=sequence, capture_ns=sequence, sequence=sequence, passed=True, heartbeat=False,
+        entropy_bits=7.0, sharpness=1.0, **(values | fields),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def listener() -> Iterator[TelemetryListener]:
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as opened:
+        yield opened
+
+
+def payload(listener: TelemetryListener, payload_id: str = "blimp-1") -> Telemetry:
+    return Telemetry(payload_id, TelemetrySettings(connect=list(listener.endpoints)))
+
+
+def test_a_payload_lives_from_its_start_to_its_end(listener: TelemetryListener) -> None:
+    telemetry = payload(listener)
+    assert listener.wait("blimp-1", lambda state: state.alive, LIMIT_S)
+    telemetry.close()
+    assert listener.wait("blimp-1", lambda state: not state.alive, LIMIT_S)
+
+
+def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
+    one, two = payload(listener, "one"), payload(listener, "two")
+    one.battery(messages.Battery(time_ns=1, voltage=3.5))
+    two.battery(messages.Battery(time_ns=2, voltage=4.1))
+    for payload_id, voltage in (("one", 3.5), ("two", 4.1)):
+        state = listener.wait(payload_id, lambda s: s.battery is not None, LIMIT_S)
+        assert state is not None and state.battery is not None
+        assert state.battery.voltage == voltage
+    assert listener.payloads() == ["one", "two"]
+    one.close()
+    two.close()
+
+
+def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryListener) -> None:
+    telemetry = payload(listener)
+    for sequence in range(50):
+        telemetry.gate(gate(sequence, gated=sequence // 10))
+    state = listener.wait("blimp-1", lambda s: len(s.decisions) == 50, LIMIT_S)
+    assert state is not None
+    assert state.frames == FrameCounts(captured=50, gated=4, heartbeats=0, sent=49)
+    assert state.ssrc == 9
+    telemetry.close()
+
+
+def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
+    telemetry = payload(listener)
+    telemetry.gate(gate(5))
+    telemetry.event(messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again"))
+    assert listener.wait_for_event("blimp-1", messages.EVENT_STARTED, LIMIT_S)
+    state = listener.state("blimp-1")
+    assert state is not None and state.decisions == {} and state.frames is None
+    telemetry.close()
+
+
+def test_the_last_event_arrives_although_the_payload_ends_at_once(
+    listener: TelemetryListener,
+) -> None:
+    for number in range(20):
+        telemetry = payload(listener, f"p{number}")
+        telemetry.event(messages.Event(time_ns=1, name=messages.EVENT_END_OF_STREAM, text=""))
+        telemetry.close()
+    for number in range(20):
+        assert listener.wait_for_event(f"p{number}", messages.EVENT_END_OF_STREAM, LIMIT_S), number
+
+
+def test_hostile_messages_are_refused_and_counted(listener: TelemetryListener) -> None:
+    session = open_session(connect=listener.endpoints)
+    kinds = (keys.BATTERY, keys.GATE, keys.EVENT)
+    hostile = [b"", b"\xff" * 99, b"{}", b"[[[[", b'{"schema":"blimp.gate/1.0"}', b"null"]
+    publishers = [session.zenoh.declare_publisher(keys.key("bad", kind)) for kind in kinds]
+    for publisher in publishers:
+        for body in hostile:
+            publisher.put(body)
+    expected = len(kinds) * len(hostile)
+    state = listener.wait("bad", lambda s: s.refused == expected, LIMIT_S)
+    assert state is not None and state.battery is None and state.events == []
+    session.zenoh.put("blimp/Not-An-Id/battery", b"{}")
+    publishers[0].put(messages.encode(messages.Battery(time_ns=1, voltage=3.3)))
+    assert listener.wait("bad", lambda s: s.battery is not None, LIMIT_S)
+    assert listener.payloads() == ["bad"]
+    session.close()
+
+
+def test_events_are_handed_on_as_they_come() -> None:
+    heard: list[tuple[str, str]] = []
+    with TelemetryListener(
+        ["tcp/127.0.0.1:0"],
+        on_event=lambda payload_id, event: heard.append((payload_id, event.name)),
+    ) as listener:
+        telemetry = payload(listener)
+        telemetry.event(messages.Event(time_ns=1, name="hello", text=""))
+        assert listener.wait_for_event("blimp-1", "hello", LIMIT_S)
+        telemetry.close()
+    assert heard == [("blimp-1", "hello")]
+
+
+def test_an_endpoint_in_use_is_one_line(listener: TelemetryListener) -> None:
+    with pytest.raises(TelemetryError) as caught:
+        TelemetryListener(listener.endpoints)
+    assert listener.endpoints[0] in str(caught.value) and "in use" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_listeners_on_free_ports_do_not_meet(listener: TelemetryListener) -> None:
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as other:
+        assert other.endpoints != listener.endpoints
+        telemetry = payload(listener)
+        assert listener.wait("blimp-1", lambda state: state.alive, LIMIT_S)
+        assert other.payloads() == []
+        telemetry.close()
+
+
+def test_a_payload_that_starts_first_is_found_when_the_listener_comes() -> None:
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as before:
+        endpoints = before.endpoints
+    telemetry = Telemetry("early", TelemetrySettings(connect=list(endpoints)))
+    with TelemetryListener(endpoints) as listener:
+        assert listener.wait("early", lambda state: state.alive, LIMIT_S)
+        telemetry.close()
+
+
+def test_a_session_uses_neither_shared_memory_nor_multicast() -> None:
+    settings = session_config(["tcp/127.0.0.1:7447"], [])
+    for name in ("transport/shared_memory", "scouting/multicast", "scouting/gossip"):
+        assert json.loads(settings.get_json(f"{name}/enabled")) is False
