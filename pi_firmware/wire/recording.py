@@ -6,6 +6,7 @@ Times are integer nanoseconds; a message's log time is its capture time.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -112,8 +113,8 @@ class RecordingWriter:
         """Writes index and footer; a second call does nothing."""
         if not self._closed:
             self._closed = True
-            self._writer.finish()
-            self._file.close()
+            with self._disk(), self._file:
+                self._writer.finish()
 
     def write_video(
         self, time_ns: int, data: bytes, *, topic: str = VIDEO_TOPIC, frame_id: str = "camera"
@@ -175,17 +176,34 @@ class RecordingWriter:
         schema_name: str,
         schema: Mapping[str, Any] | None = None,
     ) -> None:
-        """Adds a JSON object; `schema` is its JSON schema (any object when not given)."""
+        """Adds a JSON object; `schema` is its JSON schema (any object when not given).
+
+        Raises `RecordingError` for what JSON cannot say, such as NaN.
+        """
+        try:
+            payload = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
+        except (TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{self.path}: a message on {topic} is not JSON: {error}"
+            ) from None
         if topic not in self._channels:
             text = json.dumps(schema or {"type": "object"}).encode()
             schema_id = self._schema(schema_name, "jsonschema", text)
             self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
-        payload = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
         self._add(topic, time_ns, payload)
 
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Adds a named table of strings about the recording: seed, scene, program version."""
-        self._writer.add_metadata(name, dict(values))
+        with self._disk():
+            self._writer.add_metadata(name, dict(values))
+
+    @contextlib.contextmanager
+    def _disk(self) -> Iterator[None]:
+        """A full or lost disk is told in one line."""
+        try:
+            yield
+        except OSError as error:
+            raise RecordingError(f"{self.path}: {error.strerror or error}") from None
 
     def _write_protobuf(self, topic: str, time_ns: int, message: Message) -> None:
         if topic not in self._channels:
@@ -202,13 +220,16 @@ class RecordingWriter:
     def _add(self, topic: str, time_ns: int, payload: bytes) -> None:
         sequence = self._sequence.get(topic, 0)
         self._sequence[topic] = sequence + 1
-        self._writer.add_message(
-            self._channels[topic],
-            log_time=time_ns,
-            publish_time=time_ns,
-            data=payload,
-            sequence=sequence & 0xFFFFFFFF,
-        )
+        if not 0 <= time_ns < 1 << 63:
+            raise RecordingError(f"{self.path}: the time {time_ns} ns is not between 0 and 2^63")
+        with self._disk():
+            self._writer.add_message(
+                self._channels[topic],
+                log_time=time_ns,
+                publish_time=time_ns,
+                data=payload,
+                sequence=sequence & 0xFFFFFFFF,
+            )
 
 
 class RecordingReader:
@@ -316,8 +337,8 @@ class RecordingReader:
         """The JSON objects of `topic` with their log times; raises when one is not an object."""
         for _, record in self.messages({topic}):
             try:
-                value = json.loads(record.data)
-            except ValueError:
+                value = json.loads(record.data, parse_constant=_refuse)
+            except (ValueError, RecursionError):
                 value = None
             if not isinstance(value, dict):
                 raise RecordingError(f"{self.path}: a message on {topic} is not a JSON object")
@@ -329,3 +350,8 @@ class RecordingReader:
         except DecodeError:
             name = kind.DESCRIPTOR.full_name
             raise RecordingError(f"{self.path}: a message is not a {name}") from None
+
+
+def _refuse(constant: str) -> None:
+    """JSON has no NaN and no infinities, though Python's parser takes them."""
+    raise ValueError(constant)
