@@ -6,7 +6,6 @@ library's; its own stream reader believes every length and skips what it does no
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import struct
 import zlib
@@ -19,9 +18,15 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Metadata
-from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 MAGIC = b"\x89MCAP0\r\n"
+
+
+Record = Channel | Metadata | Message
+
+
+class _WrongChecksum(ValueError):
+    """Of a chunk."""
 
 
 class Damage(Exception):
@@ -35,6 +40,7 @@ PARSE_ERRORS = (
     ValueError,
     KeyError,
     MemoryError,
+    OverflowError,
     StopIteration,
     RuntimeError,
     zstandard.ZstdError,
@@ -51,7 +57,7 @@ _CHUNK_LIMIT_BYTES = 1 << 30
 """No sane writer's chunk unpacks to more; compressed ones could claim anything."""
 
 
-def records(file: IO[bytes]) -> Iterator[Channel | Metadata | Message | Footer]:
+def records(file: IO[bytes]) -> Iterator[Record | Footer]:
     """The records that matter, in file order; raises `Damage` where the file is not whole.
 
     Follows the MCAP specification 0: records are opcode (1), length (8), content. A length is held
@@ -81,13 +87,13 @@ def records(file: IO[bytes]) -> Iterator[Channel | Metadata | Message | Footer]:
             else:
                 yield from _parse_record(opcode, content)
         except PARSE_ERRORS as error:
-            reason = "a checksum is wrong" if isinstance(error, CRCValidationError) else "not MCAP"
+            reason = "a checksum is wrong" if isinstance(error, _WrongChecksum) else "not MCAP"
             raise Damage(f"damaged at byte {at}: {reason}") from None
         crc = zlib.crc32(content, zlib.crc32(head, crc))
         at += 9 + length
 
 
-def _parse_record(opcode: int, content: bytes) -> Iterator[Channel | Metadata | Message]:
+def _parse_record(opcode: int, content: bytes) -> Iterator[Record]:
     """One record of the data section as those inside it; none for what the reader does not use."""
     if opcode == Opcode.CHANNEL:
         yield Channel.read(_stream(content))
@@ -96,13 +102,17 @@ def _parse_record(opcode: int, content: bytes) -> Iterator[Channel | Metadata | 
     elif opcode == Opcode.MESSAGE:
         yield Message.read(_stream(content), len(content))
     elif opcode == Opcode.CHUNK:
-        chunk = _unpacked(Chunk.read(_stream(content)))
-        for record in breakup_chunk(chunk, validate_crc=True):
-            if isinstance(record, Channel | Message):
-                yield record
+        chunk = Chunk.read(_stream(content))
+        data = _unpacked(chunk)
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise _WrongChecksum
+        inside, end = _inside(data, 0)
+        if end != len(data):
+            raise ValueError("the chunk's last record is not whole")
+        yield from inside
 
 
-def _whole_ones(content: bytes) -> Iterator[Channel | Metadata | Message]:
+def _whole_ones(content: bytes) -> list[Record]:
     """The whole records in the beginning of a chunk whose end is missing, if not compressed.
 
     Its checksum cannot be verified: it stands for bytes that are not there.
@@ -111,27 +121,32 @@ def _whole_ones(content: bytes) -> Iterator[Channel | Metadata | Message]:
         stream = _stream(content)
         stream.read(_CHUNK_HEAD_BYTES)
         if stream.read_prefixed_string() != "":
-            return
+            return []
         stream.read8()
-        at = stream.count
-        while len(content) - at >= 9:
-            opcode, length = struct.unpack_from("<BQ", content, at)
-            at += 9
-            if length > len(content) - at:
-                return
-            if opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-                yield from _parse_record(opcode, content[at : at + length])
-            at += length
+        return _inside(content, stream.count)[0]
     except PARSE_ERRORS:
-        return
+        return []
+
+
+def _inside(content: bytes, at: int) -> tuple[list[Record], int]:
+    """The records of a chunk's content from byte `at` on, and where the last whole one ends."""
+    result: list[Record] = []
+    while len(content) - at >= 9:
+        opcode, length = struct.unpack_from("<BQ", content, at)
+        if length > len(content) - at - 9:
+            break
+        if opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
+            result += _parse_record(opcode, content[at + 9 : at + 9 + length])
+        at += 9 + length
+    return result, at
 
 
 def _stream(content: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(content))
 
 
-def _unpacked(chunk: Chunk) -> Chunk:
-    """The chunk without compression, at most as large as it claims; raises ValueError else."""
+def _unpacked(chunk: Chunk) -> bytes:
+    """The chunk's content without compression; raises ValueError if it is not as long as claimed."""
     claimed = chunk.uncompressed_size
     if claimed > _CHUNK_LIMIT_BYTES:
         raise ValueError("the chunk claims an absurd size")
@@ -145,4 +160,4 @@ def _unpacked(chunk: Chunk) -> Chunk:
         raise ValueError(f"unknown compression {chunk.compression!r}")
     if len(data) != claimed:
         raise ValueError("the chunk is not as long as it claims")
-    return dataclasses.replace(chunk, data=data, compression="")
+    return bytes(data)
