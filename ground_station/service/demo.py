@@ -24,6 +24,9 @@ from pi_firmware.wire.recording import RecordingReader
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 RATE_HZ = 5.0
 """What the thesis's localizer can follow on two cores."""
+QUEUE_FRAMES = 512
+"""More than the flight has: a machine that cannot keep up shows a longer latency, and every frame
+still counts."""
 LIMITS = {
     flight_report.GATED: 5.0,
     flight_report.LOCALIZED: 95.0,
@@ -45,7 +48,9 @@ def run(out: Path, *, preset: str, init: str, sample: Path = SAMPLE) -> int:
     map_ = build(mapping, sample, out / "map")
     map_s = time.monotonic() - start_s
     print(f"2 of 3: the other flight, streamed by the firmware at {RATE_HZ:g} Hz", flush=True)
-    settings = ReplaySettings(recording=flight, rate_hz=RATE_HZ, preset=preset, init=init)
+    settings = ReplaySettings(
+        recording=flight, rate_hz=RATE_HZ, preset=preset, init=init, queue_frames=QUEUE_FRAMES
+    )
     result = replay(map_, load_preset(preset), settings)
     print("3 of 3: the report\n", flush=True)
     seeds = {

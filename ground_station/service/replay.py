@@ -45,6 +45,8 @@ class ReplaySettings:
     gate_min_entropy_bits: float = 7.0
     """The thesis's threshold; the payload's own default is lower."""
     bitrate_kbps: int = 2000
+    queue_frames: int = 4
+    """Frames that may wait for the localizer before the oldest is dropped and counted."""
     pictures: int = 4
     """How many frames are kept with their matches, for the report."""
 
@@ -145,7 +147,7 @@ def replay(
 
     with (
         tempfile.TemporaryDirectory(prefix="blimp-replay-") as folder,
-        Receiver(port=0) as receiver,
+        Receiver(port=0, queue_frames=settings.queue_frames) as receiver,
         TelemetryListener(["tcp/127.0.0.1:0"]) as telemetry,
         FirmwareProcess(
             _payload_config(settings, camera, receiver.port, telemetry.endpoints), Path(folder)
