@@ -2,13 +2,16 @@
 
 import json
 import signal
+import socket
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import av
 import pytest
+from av.video.frame import PictureType
 from lossy_link import LossyLink
 from numbered_flight import (
     START_NS,
@@ -19,9 +22,11 @@ from numbered_flight import (
     write_flight,
 )
 
+from ground_station.stream import rtp
+from ground_station.stream.counters import Counters
 from ground_station.stream.receiver import ReceivedFrame, Receiver
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
-from pi_firmware.wire import messages
+from pi_firmware.wire import annexb, messages, sei
 from pi_firmware.wire.recording import RecordingWriter
 
 LIMIT_S = 30.0
@@ -163,6 +168,55 @@ def test_at_five_percent_loss_every_frame_is_right_and_accounted_for(flight: Pat
     lost = {s for s, said in flown.state.decisions.items() if said.passed}
     lost -= {frame.sequence for frame in flown.frames}
     assert len(lost) == 60 - len(flown.frames) >= counters.withheld
+
+
+def test_what_is_on_the_wire_is_as_agreed(tmp_path: Path) -> None:
+    """Frames far apart are the hard case: only each fifth one passes the gate."""
+    sparse = write_flight(tmp_path / "sparse.mcap", 75, [i for i in range(75) if i % 5])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(0.2)
+        process = start_payload(
+            f"camera.uri=replay:{sparse}",
+            f"link.port={receiver.getsockname()[1]}",
+            "link.ssrc=4242",
+            "telemetry.enabled=false",
+        )
+        datagrams = []
+        while True:
+            try:
+                datagrams.append(receiver.recv(65535))
+            except TimeoutError:
+                if process.poll() is not None:
+                    break
+        assert process.communicate()[1] == ""
+    counters = Counters()
+    reorderer, depacketizer = rtp.Reorderer(counters), rtp.Depacketizer(counters)
+    units = []
+    for datagram in datagrams:
+        assert len(datagram) <= 1400
+        packet = rtp.parse(datagram, 0)
+        assert packet is not None and packet.ssrc == 4242
+        for ordered, gap in reorderer.push(packet):
+            units += depacketizer.push(ordered, gap)
+    assert counters == Counters() and all(unit.complete for unit in units)
+    infos = [sei.find(unit.data) for unit in units]
+    assert [info and info.sequence for info in infos] == list(range(0, 75, 5))
+    idr_ns = []
+    codec = av.CodecContext.create("h264", "r")
+    for unit, info in zip(units, infos, strict=True):
+        types = annexb.nal_types(unit.data)
+        first_slice = next(i for i, kind in enumerate(types) if kind in (1, 5))
+        assert annexb.NAL_SEI in types[:first_slice]
+        if annexb.is_idr(unit.data):
+            assert {annexb.NAL_SPS, annexb.NAL_PPS} < set(types[:first_slice])
+            assert info is not None
+            idr_ns.append(info.time_ns)
+        for frame in codec.decode(av.Packet(unit.data)):
+            assert frame.pict_type != PictureType.B
+    idr_ns.append(capture_ns(70))
+    assert len(idr_ns) >= 3
+    assert max(b - a for a, b in pairwise(idr_ns)) <= 1_010_000_000
 
 
 def test_start_and_duration_choose_a_stretch_and_speed_shortens_it(flight: Path) -> None:

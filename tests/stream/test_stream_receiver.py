@@ -97,15 +97,25 @@ def test_no_frame_painted_over_a_loss_is_handed_out(seed: int, share: float) -> 
         assert counters.withheld > 0 or len(kept) == len(datagrams)
 
 
-def test_after_a_loss_frames_come_again_from_the_next_idr() -> None:
-    units = flight_units()
+@pytest.mark.parametrize("delimiter", [b"", b"\x00\x00\x00\x01\x09\xf0"])
+@pytest.mark.parametrize("part", ["first", "middle", "last", "whole"])
+def test_after_a_loss_frames_come_again_from_the_next_idr(part: str, delimiter: bytes) -> None:
+    units = [delimiter + unit for unit in flight_units()]
     datagrams = packets(units)
-    missing = len(packets(units[:5]))  # the first packet of frame 5
+    begin, end = len(packets(units[:5])), len(packets(units[:6]))  # the packets of frame 5
+    assert end - begin >= 3
+    lost = {
+        "first": range(begin, begin + 1),
+        "middle": range(begin + 1, begin + 2),
+        "last": range(end - 1, end),
+        "whole": range(begin, end),
+    }[part]
     with Receiver(0, queue_frames=FRAMES) as receiver:
-        send([*datagrams[:missing], *datagrams[missing + 1 :]], receiver)
+        send([d for number, d in enumerate(datagrams) if number not in lost], receiver)
         assert [frame.sequence for frame in all_frames(receiver)] == [*range(5), *range(15, 45)]
-        assert receiver.counters.packets_lost == 1
-        assert receiver.counters.withheld == 10
+        counters = receiver.counters
+        assert counters.packets_lost == len(lost)
+        assert counters.withheld == (9 if part == "whole" else 10)
 
 
 def test_a_receiver_that_starts_late_begins_with_an_idr() -> None:
