@@ -146,7 +146,7 @@ def _stream(content: bytes) -> ReadDataStream:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """The chunk's content without compression; raises ValueError if it is not as long as claimed."""
+    """The chunk's content without compression; raises ValueError when not as long as claimed."""
     claimed = chunk.uncompressed_size
     if claimed > _CHUNK_LIMIT_BYTES:
         raise ValueError("the chunk claims an absurd size")
