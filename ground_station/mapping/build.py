@@ -25,8 +25,8 @@ from ground_station.mapping.consistency import plausible_frames
 from ground_station.mapping.folder import replacing
 from ground_station.mapping.matching import TwoView, mutual_matches, verify
 from ground_station.mapping.pairs import choose_pairs
-from ground_station.progress import Progress
 from ground_station.mapping.settings import MappingSettings
+from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
 
 F64 = npt.NDArray[np.float64]
@@ -182,8 +182,14 @@ def match(
 
     def one(pair: tuple[int, int]) -> tuple[tuple[int, int], TwoView | None]:
         i, j = pair
-        matches = mutual_matches(descriptors[i], descriptors[j], wanted.ratio)
         far = j - i > wanted.neighbours
+        # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
+        # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
+        if far and wanted.preview:
+            first, second = (descriptors[k][: wanted.preview] for k in pair)
+            if len(mutual_matches(first, second, wanted.ratio)) < wanted.preview_matches:
+                return pair, None
+        matches = mutual_matches(descriptors[i], descriptors[j], wanted.ratio)
         least = wanted.min_inliers_far if far else wanted.min_inliers
         if len(matches) < least:
             return pair, None

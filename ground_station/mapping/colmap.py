@@ -133,6 +133,7 @@ def incremental(
     takes one a core. Raises `MapError` when no model comes of it.
     """
     _quiet()
+    pycolmap.set_random_seed(seed)  # else a second run in one process goes on where the first ended
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = threads or -1
@@ -152,12 +153,17 @@ def incremental(
     options.mapper.filter_min_tri_angle = min_tri_angle_deg
     options.triangulation.min_angle = min_tri_angle_deg
     out.mkdir(parents=True, exist_ok=True)
+
+    def on_pair() -> None:
+        on_image()
+        on_image()
+
     models = pycolmap.incremental_mapping(
         database,
         out,  # where images would be; without colours none is opened
         out,
         options,
-        initial_image_pair_callback=on_image,
+        initial_image_pair_callback=on_pair,
         next_image_callback=on_image,
     )
     if not models:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -75,6 +76,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
+    # Before numpy is loaded: matching runs on a thread a core, and a BLAS with threads of its own
+    # would have them wait for each other, spinning, whenever the machine has other work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
     import dataclasses
 
     from ground_station.geometry.camera import load_camera
@@ -191,7 +196,7 @@ def _register(args: argparse.Namespace) -> int:
     }
     _print_table(shown)
     held = found.report.get("point_held_out_m", [])
-    if len(held) == len(found.report.get("point_names", [])):
+    if held:
         rows = zip(found.report["point_names"], found.report["point_residual_m"], held, strict=True)
         print(f"\n{'point':<24} {'residual_m':>10} {'held out_m':>10}")
         for name, residual, left in rows:

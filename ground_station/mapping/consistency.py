@@ -8,7 +8,7 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
-_SLACK_DEPTHS = 0.02
+_SLACK_DEPTHS = 0.05
 """A step that is always plausible, in depths of the scene: a hovering camera has no usual speed."""
 _GAP_STEPS = 20.0
 """A pause so many usual steps long says nothing about where the camera went meanwhile."""
@@ -21,7 +21,7 @@ def plausible_frames(
 
     `time_ns` (K,) in the order of the input, `position` (K, 3) and `depth`, the median distance of
     what the frames see, in the same units. A step between frames is plausible when it is at most
-    `max_jump` times as fast as the upper quartile of all steps. Where time falls back or pauses
+    `max_jump` times as fast as nine in ten of all steps. Where time falls back or pauses
     for long (another input), a new sequence starts, which is judged by itself.
     """
     keep = np.ones(len(time_ns), dtype=bool)
@@ -34,7 +34,7 @@ def plausible_frames(
     inside = (dt > 0) & (dt <= _GAP_STEPS * usual_s)
     if not inside.any():
         return keep
-    speed = max_jump * float(np.percentile(steps[inside] / dt[inside], 75))
+    speed = max_jump * float(np.percentile(steps[inside] / dt[inside], 90))
     for part in np.split(np.arange(len(time_ns)), breaks):
         keep[part] = _longest_chain(
             time_ns[part] / 1e9, position[part], speed, _SLACK_DEPTHS * depth

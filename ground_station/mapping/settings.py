@@ -23,6 +23,16 @@ class MatchSettings:
     similar: int = config.key(
         20, "above that: and with so many that look like it", unit="images", low=0, high=1000
     )
+    preview: int = config.key(
+        400,
+        "of images far apart, first so many of the strongest features",
+        unit="features",
+        low=0,
+        high=20000,
+    )
+    preview_matches: int = config.key(
+        5, "must give so many matches, or the pair is left out", unit="matches", low=1, high=1000
+    )
     ratio: float = config.key(
         0.8, "a match's distance over its runner-up's, both ways", low=0.1, high=1.0
     )
@@ -61,7 +71,7 @@ class SfmSettings:
         1.0, "scale of the final adjustment's Cauchy loss", unit="px", low=0.1, high=100.0
     )
     max_jump: float = config.key(
-        8.0, "a frame's offset from its neighbours' line over the usual one", low=2.0, high=1000.0
+        4.0, "a frame is dropped when its step is so many times a fast one", low=1.5, high=1000.0
     )
 
 

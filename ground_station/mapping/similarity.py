@@ -1,4 +1,4 @@
-"""The similarity from a model's coordinates to the world's: robust, refined, with held-out errors."""
+"""The similarity from a model's coordinates to the world's: robust, then refined in pixels."""
 
 from __future__ import annotations
 

@@ -1,0 +1,229 @@
+"""A map built from a known room is that room, and COLMAP reads the same from its folder."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_station.errors import InputError, MapError
+from ground_station.geometry import poses
+from ground_station.geometry.alignment import align
+from ground_station.geometry.camera import Camera
+from ground_station.mapping import build, colmap, store
+from ground_station.recording.frames import Frame
+
+pycolmap = colmap.pycolmap
+
+
+def test_poses_and_points_of_the_room_are_recovered(built):
+    kf, lm = built.map.keyframes, built.map.landmarks
+    assert kf.names == [f"frame-{k:06d}" for k in range(len(built.scene.wTc))]
+    truth = built.scene.wTc
+    fit = align(kf.wTc[:, :3, 3], truth[:, :3, 3], True)
+    found = fit.apply_poses(kf.wTc)
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01
+    turned = found[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2)
+    assert np.degrees(poses.rotation_angle(turned)).max() < 0.1
+    distance = np.linalg.norm(fit.apply(lm.position_m)[:, None] - built.scene.points, axis=2)
+    assert len(lm) > 200
+    assert np.median(distance.min(axis=1)) < 0.01
+
+
+def test_colmap_reads_the_same_positions_poses_and_projections(built):
+    model = pycolmap.Reconstruction(built.folder / "sparse")
+    loaded = store.load(built.folder)
+    lm, kf, camera = loaded.landmarks, loaded.keyframes, loaded.info.camera
+    assert sorted(model.point3D_ids()) == lm.id.tolist()
+    assert np.allclose([model.points3D[i].xyz for i in lm.id.tolist()], lm.position_m, atol=1e-12)
+    by_name = {image.name: image for image in model.images.values()}
+    for k, name in enumerate(kf.names):
+        image = by_name[name]
+        assert np.allclose(image.cam_from_world().inverse().matrix(), kf.wTc[k, :3], atol=1e-12)
+        mine = kf.landmark[kf.offset[k] : kf.offset[k + 1]]
+        local = poses.transform(poses.inverse(kf.wTc[k]), lm.position_m[mine])
+        ours = camera.undistort_to_pinhole(camera.project(local))
+        theirs = np.array([image.project_point(p) for p in lm.position_m[mine]])
+        assert np.allclose(ours + 0.5, theirs, atol=1e-6)
+
+
+def test_colmap_observes_the_keyframes_pixels_undistorted_and_half_a_pixel_on(built):
+    model = pycolmap.Reconstruction(built.folder / "sparse")
+    kf, lm = built.map.keyframes, built.map.landmarks
+    image = next(image for image in model.images.values() if image.name == kf.names[4])
+    rows = slice(kf.offset[4], kf.offset[5])
+    theirs = {p.point3D_id: p.xy for p in image.points2D if p.has_point3D()}
+    assert len(theirs) == rows.stop - rows.start
+    expected = built.scene.camera.undistort_to_pinhole(kf.pixel_px[rows]) + 0.5
+    got = [theirs[i] for i in lm.id[kf.landmark[rows]].tolist()]
+    assert np.allclose(got, expected, atol=1e-3)  # the database keeps float32
+
+
+def test_observations_lie_where_the_landmarks_project(built):
+    kf, lm = built.map.keyframes, built.map.landmarks
+    for k in range(len(kf)):
+        rows = slice(kf.offset[k], kf.offset[k + 1])
+        local = poses.transform(poses.inverse(kf.wTc[k]), lm.position_m[kf.landmark[rows]])
+        error = np.linalg.norm(built.scene.camera.project(local) - kf.pixel_px[rows], axis=1)
+        assert np.median(error) < 0.6
+        assert error.max() < 4
+
+
+def test_cones_and_distances_hold_every_camera_that_saw_a_landmark(built):
+    kf, lm = built.map.keyframes, built.map.landmarks
+    image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
+    rays = kf.wTc[image, :3, 3] - lm.position_m[kf.landmark]
+    distance = np.linalg.norm(rays, axis=1)
+    cos = np.sum(rays / distance[:, None] * lm.view_direction[kf.landmark], axis=1)
+    assert (cos >= lm.view_cos[kf.landmark] - 1e-5).all()
+    near, far = lm.distance_m[kf.landmark].T
+    assert ((distance >= near * (1 - 1e-5)) & (distance <= far * (1 + 1e-5))).all()
+    assert (np.bincount(kf.landmark, minlength=len(lm)) == lm.observations).all()
+    assert lm.observations.min() >= built.settings.sfm.min_track
+
+
+def test_descriptors_are_unit_means_and_the_quantised_ones_within_a_degree(built):
+    exact, loaded = built.map.landmarks.descriptor, store.load(built.folder).landmarks.descriptor
+    assert np.allclose(np.linalg.norm(exact, axis=1), 1, atol=1e-5)
+    assert np.allclose(np.linalg.norm(loaded, axis=1), 1, atol=1e-5)
+    angle = np.degrees(np.arccos(np.clip((exact * loaded).sum(axis=1), -1, 1)))
+    assert angle.max() < 1
+
+
+def test_covariances_say_how_far_points_are_off(built):
+    """Errors over their deviations are of the order of one: three degrees of freedom a point."""
+    kf, lm, truth = built.map.keyframes, built.map.landmarks, built.scene
+    fit = align(kf.wTc[:, :3, 3], truth.wTc[:, :3, 3], True)
+    aligned = fit.apply(lm.position_m)
+    nearest = truth.points[np.linalg.norm(aligned[:, None] - truth.points, axis=2).argmin(axis=1)]
+    error = (aligned - nearest) @ fit.rotation / fit.scale
+    covariance = lm.covariance_m2.astype(float)
+    square = np.einsum("mi,mij,mj->m", error, np.linalg.inv(covariance), error)
+    assert 0.5 < np.median(square) / 2.37 < 6  # median of chi-square with 3; poses are off, too
+
+
+def test_map_toml_says_how_it_was_built(built):
+    info = store.load_info(built.folder)
+    assert info.frame == "sfm" and info.units == "arbitrary" and not info.registered
+    assert info.features == "scene" and info.dimension == 32
+    assert info.camera == built.scene.camera
+    assert info.built["registered"] == len(built.scene.wTc)
+    assert info.built["settings"]["seed"] == 0 and info.built["threads"] == 2
+    assert 0.15 < info.built["sigma_px"] < 0.5  # 0.3 px was added
+
+
+def test_the_same_input_gives_the_same_map(built, use_scene, tmp_path):
+    use_scene(built.scene)
+    again = build.build_map(
+        built.scene.frames(), built.scene.camera, built.settings, tmp_path / "again"
+    )
+    assert again.keyframes.names == built.map.keyframes.names
+    assert np.allclose(again.keyframes.wTc, built.map.keyframes.wTc, atol=1e-6)
+
+
+def test_refined_focal_lengths_find_the_true_ones_and_the_lens_follows(built, use_scene, tmp_path):
+    import dataclasses
+
+    scene = built.scene
+    use_scene(scene)
+    wrong = dataclasses.replace(scene.camera, fx_px=515.0, fy_px=519.0)
+    settings = dataclasses.replace(
+        built.settings, sfm=dataclasses.replace(built.settings.sfm, refine_camera=True)
+    )
+    map_ = build.build_map(scene.frames(), wrong, settings, tmp_path / "refined")
+    found = map_.info.camera
+    assert abs(found.fx_px - scene.camera.fx_px) < 0.5 * abs(wrong.fx_px - scene.camera.fx_px)
+    pixels = np.stack(np.meshgrid([40.0, 320, 600], [40.0, 240, 440]), axis=-1).reshape(-1, 2)
+    model = pycolmap.Reconstruction(tmp_path / "refined" / "sparse")
+    fx, fy, cx, cy = model.cameras[1].params - [0, 0, 0.5, 0.5]
+    rays = (wrong.undistort_to_pinhole(pixels) - [cx, cy]) / [fx, fy]
+    assert np.abs(found.distort(rays) - pixels).max() < 0.1
+
+
+def _noise_frames(count: int, size: tuple[int, int] = (480, 640)):
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        yield Frame(k, f"noise-{k}.png", k, rng.integers(0, 256, size, dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("frames", "error", "words"),
+    [
+        (lambda: _noise_frames(0), InputError, "at least 2 frames; the input has 0"),
+        (lambda: _noise_frames(1), InputError, "at least 2 frames; the input has 1"),
+        (lambda: _noise_frames(3), MapError, "no two of the 3 images overlap"),
+        (lambda: _noise_frames(2, (240, 320)), MapError, "is 320x240 pixels, the camera 640x480"),
+    ],
+)
+def test_frames_that_give_no_map_are_refused_in_one_line(tmp_path, frames, error, words):
+    from ground_station.mapping.settings import MappingSettings
+
+    with pytest.raises(error, match=words) as caught:
+        build.build_map(frames(), Camera(), MappingSettings(max_features=200), tmp_path / "map")
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_other_things_is_not_overwritten(built, use_scene, tmp_path):
+    use_scene(built.scene)
+    target = tmp_path / "mine"
+    (target / "sparse").mkdir(parents=True)
+    with pytest.raises(MapError, match="is not a map"):
+        build.build_map(built.scene.frames(), built.scene.camera, built.settings, target)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(MapError, match="not a folder"):
+        build.build_map(built.scene.frames(), built.scene.camera, built.settings, tmp_path / "file")
+
+
+def test_recordings_beside_a_map_outlive_its_rebuilding(built, use_scene, tmp_path):
+    use_scene(built.scene)
+    target = tmp_path / "sample"
+    target.mkdir()
+    (target / "flight.mcap").write_bytes(b"recording")
+    for _ in range(2):
+        build.build_map(built.scene.frames(), built.scene.camera, built.settings, target)
+        assert (target / "flight.mcap").read_bytes() == b"recording"
+        assert len(store.load(target).landmarks)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["sample"]
+
+
+_BLOCKED = """
+import sys
+from pathlib import Path
+import numpy as np
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.build import build_map
+from ground_station.mapping.settings import MappingSettings
+from ground_station.recording.frames import Frame
+
+def frames():
+    for k in range(20):
+        yield Frame(k, str(k), k, np.zeros((480, 640), np.uint8))
+    print("reading", flush=True)
+    sys.stdin.read()
+
+build_map(frames(), Camera(), MappingSettings(), Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_build_leaves_the_old_map_whole(built, tmp_path, how):
+    target = tmp_path / "map"
+    shutil.copytree(built.folder, target)
+    with subprocess.Popen(
+        [sys.executable, "-c", _BLOCKED, str(target)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        cwd=Path(__file__).parents[2],
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline() == "reading\n"
+        process.send_signal(how)
+        assert process.wait(30) != 0
+    loaded = store.load(target)
+    assert np.array_equal(loaded.landmarks.position_m, built.map.landmarks.position_m)
+    assert pycolmap.Reconstruction(target / "sparse").num_points3D() == len(loaded.landmarks)
