@@ -94,28 +94,31 @@ def _heading(result: Evaluation, estimated: int, true: int, args: argparse.Names
 def table(result: Evaluation, names: list[str]) -> str:
     """The errors of the alignments `names`, then the shares of the first of them, as plain text."""
     from ground_station.evaluation import ate
+    from ground_station.evaluation.text import columns
 
-    lines = [
-        "alignment         position, m                    rotation, °               Zhang, m",
-        "                  RMSE     median   max          RMSE    median  max       RMSE",
+    rows = [
+        ["alignment", "position, m", "", "", "rotation, °", "", "", "Zhang, m"],
+        ["", "RMSE", "median", "max", "RMSE", "median", "max", "RMSE"],
     ]
-    for name in names:
-        if name in result.impossible:
-            lines.append(f"{name:<9}         impossible: {result.impossible[name]}")
-            continue
+    for name in (n for n in names if n in result.errors):
         e = result.errors[name]
         p, r = ate.Statistics.of(e.position_m), ate.Statistics.of(e.rotation_deg)
-        lines.append(
-            f"{name:<9}         {p.rmse:<8.4f} {p.median:<8.4f} {p.max:<8.4f}     "
-            f"{r.rmse:<7.3f} {r.median:<7.3f} {r.max:<7.3f}   {e.rmse()['position_zhang_m']:.4f}"
+        rows.append(
+            [name]
+            + [f"{value:.4f}" for value in (p.rmse, p.median, p.max)]
+            + [f"{value:.3f}" for value in (r.rmse, r.median, r.max)]
+            + [f"{e.rmse()['position_zhang_m']:.4f}"]
         )
+    lines = columns(rows)
+    lines += [f"{n}: impossible, {result.impossible[n]}" for n in names if n in result.impossible]
     if "sim3" in names and "sim3" in result.errors:
-        lines.append(f"\nscale of sim3     {result.errors['sim3'].alignment.scale:.6f}")
-    lines.append("")
-    first = result.errors[names[0]]
-    for (metres, degrees), share in zip(ate.THRESHOLDS, ate.shares(first), strict=True):
-        limit = f"within {metres * 100:g} cm, {degrees:g}°"
-        lines.append(f"{limit:<17} {share:7.1%} of the pairs ({names[0]})")
+        lines += ["", f"scale of sim3   {result.errors['sim3'].alignment.scale:.6f}"]
+    within = ate.shares(result.errors[names[0]])
+    shares = [
+        [f"within {metres * 100:g} cm, {degrees:g}°", f"{share:.1%}", f"of the pairs ({names[0]})"]
+        for (metres, degrees), share in zip(ate.THRESHOLDS, within, strict=True)
+    ]
+    lines += ["", *columns(shares)]
     return "\n".join(lines)
 
 

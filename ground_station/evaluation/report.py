@@ -20,6 +20,7 @@ from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
 from ground_station.evaluation.floorplan import load_floorplan
+from ground_station.evaluation.text import columns
 from ground_station.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -174,7 +175,7 @@ def summary_table(data: ReportData) -> str:
     lines = [data.title + (" (simulated flight)" if data.simulated else "")]
     for heading, rows in sections:
         if any(row[0] for row in rows):
-            lines += ["", heading, *_aligned(rows)]
+            lines += ["", heading, *("  " + line for line in columns(rows))]
     lines += ["", *filter(None, [*data.verdict, data.outcome]), *data.notes]
     return "\n".join(lines)
 
@@ -319,19 +320,6 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
         else:
             rows.append((f"{prefix}{key}", str(value)))
     return rows
-
-
-def _aligned(rows: list[list[str]]) -> list[str]:
-    """Rows as lines: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  "
-        + "   ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def _jpeg(image: Image) -> str:

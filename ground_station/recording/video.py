@@ -61,7 +61,8 @@ class VideoFile:
         check_given(self.path, given, self._range)
 
     def _decode(self, container: Any, stream: Any) -> Iterator[av.VideoFrame]:
-        damaged, k = 0, 0
+        damaged = k = 0
+        reason = ""
         try:
             for picture in container.decode(stream):
                 if picture.is_corrupt:
@@ -71,6 +72,10 @@ class VideoFile:
                 yield picture
         except av.error.FFmpegError as error:
             reason = error.strerror or str(error)
+        promised = int(stream.frames)
+        if k + damaged < promised:
+            reason = f"its header promises {promised} frames"
+        if reason:
             self.notes.append(f"{self.path}: cut ({reason}); {k} frames read")
         if damaged:
             self.notes.append(f"{self.path}: {damaged} damaged frames left out")

@@ -20,9 +20,14 @@ STREAMS = Path(__file__).parents[3] / "shared" / "data" / "streams"
 needs_streams = pytest.mark.skipif(not STREAMS.is_dir(), reason="../shared/data is not there")
 
 
-def write_video(path: Path, times_ms: list[int], options: dict[str, str] | None = None) -> None:
+def write_video(
+    path: Path,
+    times_ms: list[int],
+    options: dict[str, str] | None = None,
+    container_options: dict[str, str] | None = None,
+) -> None:
     """A container whose frame k shows k and is at times_ms[k]."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "10", **(options or {})})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.codec_context.time_base = Fraction(1, 1000)
@@ -96,6 +101,22 @@ def test_a_cut_video_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     frames = list(open_input(path))
     assert 3 < len(frames) < 30
     assert [number_in(f.image) for f in frames] == list(range(len(frames)))
+
+
+def test_a_cut_video_whose_header_counts_frames_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    write_video(
+        path, [k * 33 for k in range(30)], {"x264-params": "keyint=5"}, {"movflags": "+faststart"}
+    )
+    whole = open_input(path)
+    assert len(list(whole)) == whole.count() == 30 and whole.notes == []
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    source = open_input(path)
+    frames = list(source)
+    assert 3 < len(frames) < 30 and len(source.notes) >= 1
+    assert "cut (its header promises 30 frames)" in source.notes[0]
+    part = open_input(path, frame_range=parse_range("0:3"))
+    assert len(list(part)) == 3 and part.notes == []
 
 
 def test_files_that_are_no_videos_are_refused_in_one_line(tmp_path: Path) -> None:
