@@ -54,15 +54,15 @@ class _Atrium:
                     [3 * i, 4 * j, 0], [3, 0, 0], [0, 4, 0], "terrazzo", slab_m=1.0, detail=0.9
                 )
         # The inlay: a border of darker slabs around the middle of the hall.
-        for x, y, w, h in (
+        for left, low, w, h in (
             (5, 5, 14, 0.4),
             (5, 10.6, 14, 0.4),
             (5, 5.4, 0.4, 5.2),
             (18.6, 5.4, 0.4, 5.2),
         ):
             self.b.rectangle(
-                [x, y, 0.004], [w, 0, 0], [0, h, 0], "terrazzo", slab_m=0.4, rgb=(0.2, 0.13, 0.1),
-                detail=0.9,
+                [left, low, 0.004], [w, 0, 0], [0, h, 0], "terrazzo", slab_m=0.4,
+                rgb=(0.2, 0.13, 0.1), detail=0.9,
             )  # fmt: skip
         for i in range(12):
             for j in range(8):
@@ -90,10 +90,10 @@ class _Atrium:
                 [beam - 0.15, 0, 8.45], [beam + 0.15, WIDTH_M, HEIGHT_M], "wood",
                 faces=("-x", "+x", "-z"), detail=0.6, plank_m=0.28,
             )  # fmt: skip
-        for j in (4.0, 12.0):
+        for along in (4.0, 12.0):
             self.b.box(
-                [0, j - 0.1, 8.6], [LENGTH_M, j + 0.1, HEIGHT_M], "wood", faces=("-y", "+y", "-z"),
-                detail=0.5, plank_m=0.2,
+                [0, along - 0.1, 8.6], [LENGTH_M, along + 0.1, HEIGHT_M], "wood",
+                faces=("-y", "+y", "-z"), detail=0.5, plank_m=0.2,
             )  # fmt: skip
 
     def south(self) -> None:

@@ -28,6 +28,7 @@ _MARGIN = 0.05
 _MAX_SAMPLES = 12
 # Saturation of the sensor over the level of white: headroom for the tone curve.
 _OVERRANGE = 4.0
+_CONTRAST = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Sensor:
     full_well_e: float = 11000.0
     """Electrons at white and gain 1: a 1.12 µm pixel's 4,700, 2x2 binned and then scaled."""
     read_noise_e: float = 5.0
-    sensitivity: float = 160.0
+    sensitivity: float = 230.0
     """Level per second of exposure and unit of radiance, at gain 1."""
     gain_limits: tuple[float, float] = (1.0, 16.0)
     exposure_limits_s: tuple[float, float] = (1e-4, 1 / 60)
@@ -92,10 +93,13 @@ class FrameMaker:
         self._vignette = 1 - np.float32(self.sensor.vignetting) * (r2 / r2.max())
         self._rows_s = row_offsets_s(camera)
         codes = np.arange(16384) / 16383.0
-        # Gamma with a soft shoulder (Reinhard et al. 2002, eq. 4): highlights fade into white.
+        # Gamma with a soft shoulder (Reinhard et al. 2002, eq. 4), so that highlights fade into
+        # white, and the S of a camera's contrast setting.
         level = _OVERRANGE * codes
         curve = level * (1 + level / _OVERRANGE**2) / (1 + level)
-        self._tone = np.rint(255 * curve ** (1 / 2.2)).astype(np.uint8)
+        coded = curve ** (1 / 2.2)
+        coded += _CONTRAST * (coded * coded * (3 - 2 * coded) - coded)
+        self._tone = np.rint(255 * coded).astype(np.uint8)
 
     def radiance(self, motion: Motion, time_s: float, exposure_s: float) -> Floats:
         """Mean radiance (H, W, 3) that each pixel collects in the frame at `time_s`.

@@ -8,6 +8,8 @@ energy balance of an integrating sphere. Irradiances are relative: the noon sky 
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from ground_station.simulator import scenes
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scenes import Scene, SimulatorError
 from ground_station.simulator.surfaces import Surface
@@ -26,10 +29,10 @@ Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
-_GRID_M = 0.07  # spacing of the light samples on a surface
+_GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels
 _SKY_DIRECTIONS = 48
 _MAP_PX, _SUN_MAP_PX = 768, 4096
-_VOXEL_M = 0.3
+_VOXEL_M = 0.4
 _SUN_RADIUS_M = 0.025  # half a penumbra some six metres behind an edge (the sun's disc: 0.53°)
 _ALBEDO = 0.50  # mean of the hall's surfaces
 
@@ -134,7 +137,7 @@ def _indirect(scene: Scene, points: Floats, normals: Floats, area: Floats, flux:
     np.add.at(source, cells(0.5 * _VOXEL_M), flux)
     open_ = (1 - 0.95 * wall)[..., None]
     field = source.copy()
-    for _ in range(250):  # Jacobi steps; walls swallow what they don't reflect
+    for _ in range(140):  # Jacobi steps; walls swallow what they don't reflect
         total = sum(np.roll(field, s, axis=a) for a in range(3) for s in (-1, 1))
         field = (0.985 * total / 6) * open_ + source
     field = ndimage.gaussian_filter(field, (0.8, 0.8, 0.8, 0))
@@ -161,7 +164,9 @@ def irradiance(scene: Scene, light: Light) -> list[Floats]:
     inside = [s for s in scene.surfaces if not s.outside]
     grids, points, normals, area = [], [], [], []
     for s in inside:
-        columns, rows = (max(2, int(np.ceil(length / _GRID_M))) for length in s.size_m)
+        columns, rows = (
+            max(2, math.ceil(length / max(_GRID_M, 4 / s.texels_per_m))) for length in s.size_m
+        )
         grids.append((rows, columns))
         points.append(s.points(columns, rows).reshape(-1, 3))
         normals.append(np.broadcast_to(s.normal, (rows * columns, 3)))
@@ -243,6 +248,17 @@ class LitTextures:
     def decoder(self) -> Floats:
         """The 256 radiances of the codes."""
         return ((np.arange(256) / 255.0) ** 2 * self.white).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=1)
+def lit_scene(scene_name: str, texels_per_m: float, light_name: str) -> tuple[Scene, LitTextures]:
+    """A scene and its lit textures by name; the last is kept, since flights come in series.
+
+    Raises `SimulatorError` naming what there is.
+    """
+    light = light_named(light_name)
+    scene = scenes.build(scene_name, texels_per_m)
+    return scene, lit_textures(scene, light)
 
 
 def lit_textures(scene: Scene, light: Light) -> LitTextures:

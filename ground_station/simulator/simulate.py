@@ -24,7 +24,7 @@ from ground_station.simulator import dynamics, handheld, scenes
 from ground_station.simulator.encoding import H264Encoder
 from ground_station.simulator.imaging import AutoExposure, FrameMaker, Sensor, covering_pinhole
 from ground_station.simulator.known_points import choose_sights, write_pairs
-from ground_station.simulator.lighting import light_named, lit_textures
+from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
 from ground_station.simulator.rendering import SceneRenderer
@@ -177,10 +177,10 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     the result says so. Raises `SimulatorError`.
     """
     started = time.monotonic()
-    light = light_named(settings.light)
+    light_named(settings.light)  # refused before anything costly
     flight = prepare_flight(settings)
     camera, sensor = settings.camera, Sensor()
-    lit = lit_textures(flight.scene, light)
+    _, lit = lit_scene(settings.scene, settings.texels_per_m, settings.light)
     pinhole = covering_pinhole(camera, settings.supersampling)
     buffer = (pinhole.width_px, pinhole.height_px)
     with SceneRenderer(flight.scene.surfaces, lit.textures, buffer) as renderer:

@@ -269,9 +269,8 @@ def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     """A printed sign, unlike any other: headline, a picture of shapes, lines of text."""
     hue = rng.random(3)
     background = np.clip(0.25 + 0.6 * hue, 0, 0.85).astype(np.float32)
-    ink = tuple(
-        float(v) for v in (0.04 + 0.25 * rng.random(3)) * (1 if background.mean() > 0.4 else 3)
-    )
+    tones = 0.02 + 0.12 * rng.random(3) if background.mean() > 0.4 else 0.6 + 0.3 * rng.random(3)
+    ink = tuple(float(v) for v in tones)
     image = np.empty((rows, columns, 3), np.float32)
     image[:] = background
     margin = max(2, round(0.06 * columns))

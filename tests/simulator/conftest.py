@@ -1,0 +1,91 @@
+"""A plain room of dots for geometry, and short flights at low resolution for everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.simulator.imaging import FrameMaker, covering_pinhole
+from ground_station.simulator.rendering import SceneRenderer
+from ground_station.simulator.simulate import SimulationSettings, simulate
+from ground_station.simulator.surfaces import SceneBuilder, Surface
+
+Array = npt.NDArray[np.float64]
+
+TEXELS_PER_M = 100
+DOT_M = 0.10
+
+
+@dataclass(frozen=True)
+class Room:
+    """Dark surfaces with bright square dots: their centres and half-edges in world metres."""
+
+    renderer: SceneRenderer
+    centres: Array
+    half_edges: Array  # (N, 2, 3)
+    decoder: npt.NDArray[np.float32]
+    supersampling: float
+
+    def maker(self, camera: Camera, renders: int) -> FrameMaker:
+        pinhole = covering_pinhole(camera, self.supersampling)
+        return FrameMaker(self.renderer, self.decoder, camera, pinhole, renders=renders)
+
+
+def _dotted(
+    surface: Surface, rng: np.random.Generator
+) -> tuple[npt.NDArray[np.uint8], Array, Array]:
+    columns, rows = surface.size_texels
+    texture = np.full((rows, columns, 3), 40, np.uint8)
+    n = round(DOT_M * TEXELS_PER_M)
+    centres, halves = [], []
+    u, v = (e / np.linalg.norm(e) for e in (surface.u_m, surface.v_m))
+    for row in range(20, rows - 30, 45):
+        for column in range(20, columns - 30, 45):
+            r, c = row + int(rng.integers(10)), column + int(rng.integers(10))
+            texture[r : r + n, c : c + n] = 255
+            s = (c + n / 2) / TEXELS_PER_M
+            t = (rows - r - n / 2) / TEXELS_PER_M
+            centres.append(surface.origin_m + s * u + t * v)
+            halves.append([0.5 * DOT_M * u, 0.5 * DOT_M * v])
+    return texture, np.array(centres), np.array(halves)
+
+
+@pytest.fixture(scope="session")
+def room() -> Iterator[Room]:
+    builder = SceneBuilder(TEXELS_PER_M)
+    builder.rectangle([5, 2.5, 0], [0, -5.5, 0], [0, 0, 4], "dots")  # ahead
+    builder.rectangle([0, 2.5, 0], [5, 0, 0], [0, 0, 4], "dots")  # left
+    builder.rectangle([0, -3, 0], [5, 0, 0], [0, 5.5, 0], "dots")  # floor
+    rng = np.random.default_rng(4)
+    textures, centres, halves = zip(*(_dotted(s, rng) for s in builder.surfaces), strict=True)
+    decoder = (np.arange(256) / 255.0).astype(np.float32)
+    supersampling = 1.25
+    pinhole = covering_pinhole(THESIS_CAMERA, supersampling)
+    size = (pinhole.width_px, pinhole.height_px)
+    with SceneRenderer(builder.surfaces, textures, size) as renderer:
+        yield Room(
+            renderer, np.concatenate(centres), np.concatenate(halves), decoder, supersampling
+        )
+
+
+def quick_settings(out: Path, **changes: object) -> SimulationSettings:
+    """A flight that takes seconds: coarse textures, small renders, few frames."""
+    values: dict[str, object] = {
+        "out": out, "plan": "loop", "light": "noon", "seed": 5, "duration_s": 0.8, "rate_hz": 5.0,
+        "texels_per_m": 12.0, "supersampling": 0.5, "renders": 1,
+    }  # fmt: skip
+    return SimulationSettings(**(values | changes))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short recording."""
+    out = tmp_path_factory.mktemp("simulator") / "flight.mcap"
+    simulate(quick_settings(out))
+    return out
