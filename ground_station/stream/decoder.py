@@ -43,14 +43,12 @@ class Decoder:
             return None
         try:
             (frame,) = self._codec.decode(av.Packet(unit.data))
-            picture = frame.to_ndarray(format=self._format).astype(np.uint8, copy=False)
+            return frame.to_ndarray(format=self._format).astype(np.uint8, copy=False)
         except (av.FFmpegError, ValueError):  # ValueError: not exactly one picture
             self._counters.failed += 1
             self._trusted = False
             self._codec = _open()
             return None
-        self._counters.decoded += 1
-        return picture
 
 
 def _open() -> av.VideoCodecContext:

@@ -152,6 +152,18 @@ class Receiver:
         return self._problem
 
     def _run(self) -> None:
+        try:
+            self._receive()
+        except Exception as error:  # whoever waits for frames must hear of it
+            self._tell_problem(f"the receiver failed: {error!r}")
+            raise
+
+    def _tell_problem(self, problem: str) -> None:
+        with self._ready:
+            self._problem = problem
+            self._ready.notify_all()
+
+    def _receive(self) -> None:
         while not self._closing.is_set():
             try:
                 datagram: bytes | None = self._socket.recv(65535)
@@ -216,9 +228,7 @@ class Receiver:
         if stream.decoder.saw_parameter_sets:
             self._problem = None
         elif stream.last_arrival_ns - stream.first_arrival_ns > self._sets_timeout_ns:
-            with self._ready:
-                self._problem = NO_PARAMETER_SETS
-                self._ready.notify_all()
+            self._tell_problem(NO_PARAMETER_SETS)
 
     def _assemble(self, stream: _Stream, packet: rtp.Packet, gap: bool) -> None:
         for unit in stream.depacketizer.push(packet, gap):
@@ -228,9 +238,9 @@ class Receiver:
                 continue
             info = sei.find(unit.data)
             if info is None:
-                self._counters.decoded -= 1
                 self._counters.unstamped += 1
                 continue
+            self._counters.decoded += 1
             since_ns = time.monotonic_ns() - unit.arrival_ns
             self._deliver(_frame(image, info, time.time_ns() - since_ns, stream.ssrc))
 

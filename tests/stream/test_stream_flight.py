@@ -100,16 +100,12 @@ def test_all_frames_of_a_flight_arrive_with_their_exact_capture_times(flight: Pa
     assert flown.end.values["captured"] == flown.end.values["sent"] == 60
     assert "60 captured, 0 gated, 60 sent" in flown.out
     assert flown.state.battery is not None and flown.state.battery.power_supply_status == 2
-
-
-def test_the_gate_says_for_every_frame_what_the_video_says(flight: Path) -> None:
-    with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{flight}?duration_s=1")
+    # The gate said for every frame what its video says.
     decisions = flown.state.decisions
-    assert list(decisions) == list(range(30)) == [frame.sequence for frame in flown.frames]
+    assert list(decisions) == [frame.sequence for frame in flown.frames]
     for frame in flown.frames:
         said = decisions[frame.sequence]
-        assert said.capture_ns == frame.time_ns
+        assert said.passed and said.capture_ns == frame.time_ns
         assert said.entropy_bits == pytest.approx(frame.entropy_bits, rel=1e-6)
         assert said.sharpness == pytest.approx(frame.sharpness, rel=1e-6)
 
@@ -118,7 +114,7 @@ def test_dark_frames_are_gated_and_counted_but_a_heartbeat_comes(tmp_path: Path)
     dark = set(range(15, 45))
     recording = write_flight(tmp_path / "dark.mcap", 60, dark)
     with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{recording}", "gate.heartbeat_s=0.5")
+        flown = fly(receiver, f"camera.uri=replay:{recording}?speed=2", "gate.heartbeat_s=0.2")
     assert flown.status == 0, flown.err
     assert_true(flown.frames)
     counts = flown.state.frames
@@ -136,7 +132,7 @@ def test_dark_frames_are_gated_and_counted_but_a_heartbeat_comes(tmp_path: Path)
 
 def test_a_slower_camera_takes_its_frames_at_their_own_times(flight: Path) -> None:
     with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{flight}?rate_hz=5")
+        flown = fly(receiver, f"camera.uri=replay:{flight}?rate_hz=5&speed=4")
     assert_true(flown.frames)
     assert [number_in(frame.image) for frame in flown.frames] == list(range(0, 60, 6))
     assert [frame.sequence for frame in flown.frames] == list(range(10))
@@ -265,7 +261,7 @@ def test_a_cut_recording_is_flown_up_to_the_cut_and_says_so(flight: Path, tmp_pa
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[: int(0.6 * flight.stat().st_size)])
     with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{cut}")
+        flown = fly(receiver, f"camera.uri=replay:{cut}?speed=2")
     assert flown.status == 0, flown.err
     assert 10 < len(flown.frames) < 60
     assert_true(flown.frames)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numbered_flight import capture_ns, encoded, number_in, packets, stamped
 
+from ground_station.stream import receiver as receiver_module
 from ground_station.stream.receiver import ReceivedFrame, Receiver
 from pi_firmware.wire import annexb
 from pi_firmware.wire.errors import StreamError
@@ -194,6 +195,32 @@ def test_the_stream_asked_for_is_taken_whichever_comes_first() -> None:
         frames = all_frames(receiver)
         assert len(frames) == FRAMES and {frame.ssrc for frame in frames} == {5}
         assert receiver.counters.other_streams == 40
+
+
+def test_after_a_silence_the_next_stream_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(receiver_module, "_SILENCE_NS", 100_000_000)
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(packets(flight_units()[:20], ssrc=1), receiver)
+        assert len(all_frames(receiver)) == 20  # and 0.3 s of silence
+        send(packets(flight_units(), ssrc=2), receiver)
+        frames = all_frames(receiver)
+        assert len(frames) == FRAMES and {frame.ssrc for frame in frames} == {2}
+        assert receiver.ssrc == 2
+
+
+def test_a_real_cameras_stream_gives_a_picture_for_each_access_unit() -> None:
+    path = STREAMS / "tello.h264"
+    if not path.is_file():
+        pytest.skip("shared/data/streams is not here")
+    with av.open(str(path)) as container:
+        units = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    start = next(i for i, unit in enumerate(units) if annexb.has_parameter_sets(unit))
+    stamps = [stamped(unit, index) for index, unit in enumerate(units[start : start + 60])]
+    with Receiver(0, queue_frames=60) as receiver:
+        send(packets(stamps), receiver)
+        frames = all_frames(receiver)
+        assert receiver.counters.failed == 0
+        assert [frame.sequence for frame in frames] == list(range(len(stamps)))
 
 
 def test_colour_comes_as_bgr() -> None:

@@ -77,11 +77,11 @@ def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
 def test_the_last_event_arrives_although_the_payload_ends_at_once(
     listener: TelemetryListener,
 ) -> None:
-    for number in range(20):
+    for number in range(8):
         telemetry = payload(listener, f"p{number}")
         telemetry.event(messages.Event(time_ns=1, name=messages.EVENT_END_OF_STREAM, text=""))
         telemetry.close()
-    for number in range(20):
+    for number in range(8):
         assert listener.wait_for_event(f"p{number}", messages.EVENT_END_OF_STREAM, LIMIT_S), number
 
 
