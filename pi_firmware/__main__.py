@@ -61,7 +61,10 @@ def _run(arguments: argparse.Namespace) -> None:
         )
         payload.run(stop)
         if payload.cut_reason:
-            print(f"the recording is cut and was played up to the cut: {payload.cut_reason}")
+            notice = (
+                f"{loaded.camera.uri} is cut and was played up to the cut: {payload.cut_reason}"
+            )
+            print(f"pi_firmware: {notice}", file=sys.stderr)
         print(f"frames: {payload.counters}", flush=True)
     finally:
         payload.close()

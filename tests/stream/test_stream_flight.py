@@ -265,7 +265,7 @@ def test_a_cut_recording_is_flown_up_to_the_cut_and_says_so(flight: Path, tmp_pa
     assert flown.status == 0, flown.err
     assert 10 < len(flown.frames) < 60
     assert_true(flown.frames)
-    assert "the recording is cut" in flown.out
+    assert flown.err.count("\n") == 1 and "is cut and was played up to the cut" in flown.err
     assert messages.EVENT_SOURCE_CUT in [event.name for event in flown.state.events]
 
 
