@@ -19,9 +19,12 @@ def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fracti
     """
     wTc_last = np.asarray(wTc_last, dtype=np.float64)
     step = poses.inverse(wTc_before) @ wTc_last
-    if fraction == 1.0:
-        return wTc_last @ step
-    return wTc_last @ poses.exp(fraction * poses.log(step))
+    if fraction != 1.0:
+        step = poses.exp(fraction * poses.log(step))
+    wTc = wTc_last @ step
+    # Each product of products doubles the rounding error, and a solver keeps what it starts from:
+    # unless it is made a rotation again, some fifty frames later it is none.
+    return poses.from_quaternion(wTc[:3, 3], poses.to_quaternion(wTc))
 
 
 class MotionModel:
