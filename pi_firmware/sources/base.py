@@ -21,8 +21,8 @@ class Stamp:
 class Source(Protocol):
     """Frames for the pipeline; whichever camera they come from.
 
-    The pipeline is built from `elements`, `attach`ed, set to playing, and then `start`ed. The source
-    ends the stream itself when it has no more frames, or when `stop` is called.
+    The pipeline is built from `elements`, `attach`ed, set to playing, and then `start`ed. The
+    source ends the stream itself when it has no more frames, or when `stop` is called.
     """
 
     rate_hz: float
