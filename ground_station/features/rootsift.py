@@ -36,11 +36,12 @@ class RootSift:
         if not keypoints or descriptors is None:
             empty = np.empty((0, 2), np.float32)
             return Features(empty, np.empty(0, np.float32), np.empty((0, 128), np.float32))
-        positions = cv2.KeyPoint.convert(keypoints)
+        positions = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
         scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
         # OpenCV may return a few more than asked for when responses tie.
         order = np.argsort(-scores, kind="stable")[: self.max_features]
-        return Features(positions[order], scores[order], hellinger(descriptors[order]))
+        histograms = np.asarray(descriptors, np.float32)
+        return Features(positions[order], scores[order], hellinger(histograms[order]))
 
 
 def hellinger(sift: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
