@@ -319,7 +319,7 @@ class _Atrium:
         for k in range(8):
             x = 8.0 * k - 20
             self.b.rectangle(
-                [x, -14, 0], [8, 0, 0], [0, 13.7, 0], "concrete", detail=0.15, outside=True
+                [x, -14, 0], [8, 0, 0], [0, 14.0, 0], "concrete", detail=0.15, outside=True
             )
             self.b.rectangle(
                 [x + 8, -13.9, -0.5], [-8, 0, 0], [0, 0, 4.0 + 1.3 * ((3 * k) % 4)], "foliage",
@@ -328,15 +328,15 @@ class _Atrium:
             self.b.rectangle(
                 [x + 8, -14, 0], [-8, 0, 0], [0, 0, 18], "sky", detail=0.25, outside=True
             )
-        for x, along in ((-20, 1.0), (44, -1.0)):
-            y0 = -14.0 if along > 0 else -0.3
+        for x, along in ((-19.9, 1.0), (43.9, -1.0)):
+            y0 = -14.0 if along > 0 else 0.0
             self.b.rectangle(
-                [x, y0, -0.5], [0, 13.7 * along, 0], [0, 0, 5.5], "foliage", detail=0.4, zoom=1.2,
+                [x, y0, -0.5], [0, 14.0 * along, 0], [0, 0, 5.5], "foliage", detail=0.4, zoom=1.2,
                 outside=True,
             )  # fmt: skip
             self.b.rectangle(
-                [x - along, y0, 0],
-                [0, 13.7 * along, 0],
+                [x - 0.1 * along, y0, -0.5],
+                [0, 14.0 * along, 0],
                 [0, 0, 18],
                 "sky",
                 detail=0.25,

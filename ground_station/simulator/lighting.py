@@ -30,8 +30,8 @@ Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 _GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels
-_SKY_DIRECTIONS = 48
-_MAP_PX, _SUN_MAP_PX = 768, 4096
+_SKY_DIRECTIONS = 128
+_MAP_PX, _SUN_MAP_PX = 512, 4096
 _VOXEL_M = 0.4
 _SUN_RADIUS_M = 0.025  # half a penumbra some six metres behind an edge (the sun's disc: 0.53°)
 _ALBEDO = 0.50  # mean of the hall's surfaces

@@ -18,11 +18,11 @@ _TEXELS_PER_M = 150.0
 def sample_settings(folder: Path) -> tuple[SimulationSettings, SimulationSettings]:
     """The mapping flight, a picture every 0.8 s, and the localization flight at 30 Hz."""
     mapping = SimulationSettings(
-        out=folder / "mapping.mcap", plan="mapping", light="noon", seed=11, rate_hz=1.25, crf=23.0,
+        out=folder / "mapping.mcap", plan="mapping", light="noon", seed=11, rate_hz=1.25, crf=24.5,
         points=folder / "PAIRS.csv", texels_per_m=_TEXELS_PER_M,
     )  # fmt: skip
     flight = SimulationSettings(
-        out=folder / "flight.mcap", plan="loop", light="noon", seed=29, rate_hz=30.0, crf=27.0,
+        out=folder / "flight.mcap", plan="loop", light="noon", seed=29, rate_hz=30.0, crf=23.0,
         duration_s=32.0, texels_per_m=_TEXELS_PER_M,
     )  # fmt: skip
     return mapping, flight

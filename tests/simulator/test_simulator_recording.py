@@ -127,24 +127,6 @@ def test_a_seed_gives_its_recording_again_and_another_seed_another(
     assert np.abs(a - b).mean() > 5
 
 
-def test_the_light_changes_colour_contrast_and_exposure(flight: Path, tmp_path: Path) -> None:
-    sunset = tmp_path / "sunset.mcap"
-    simulate(quick_settings(sunset, light="sunset"))
-    noon_picture, sunset_picture = pictures(flight)[0], pictures(sunset)[0]
-    for picture in (noon_picture, sunset_picture):
-        assert 60 < picture.mean() < 190
-
-    def warmth(picture: np.ndarray) -> float:
-        return float(picture[..., 0].mean() / picture[..., 2].mean())
-
-    def light_taken(path: Path) -> float:
-        _, info = next(iter(RecordingReader(path).json(FRAME_INFO_TOPIC)))
-        return float(info["exposure_s"] * info["gain"])
-
-    assert warmth(sunset_picture) > 1.15 * warmth(noon_picture)
-    assert light_taken(sunset) > 2 * light_taken(flight)
-
-
 def test_sights_of_known_points_reproject_and_spread(tmp_path: Path) -> None:
     out, pairs, tum = tmp_path / "m.mcap", tmp_path / "PAIRS.csv", tmp_path / "t.txt"
     settings = quick_settings(
@@ -275,3 +257,21 @@ def test_the_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
     assert at(1.5, 5.0) == 254
     assert at(-0.6, -0.6) == 205  # outside
     assert at(20.0, 9.0) == 0  # reception
+
+
+def test_the_light_changes_colour_contrast_and_exposure(flight: Path, tmp_path: Path) -> None:
+    sunset = tmp_path / "sunset.mcap"
+    simulate(quick_settings(sunset, light="sunset"))
+    noon_picture, sunset_picture = pictures(flight)[0], pictures(sunset)[0]
+    for picture in (noon_picture, sunset_picture):
+        assert 60 < picture.mean() < 190
+
+    def warmth(picture: np.ndarray) -> float:
+        return float(picture[..., 0].mean() / picture[..., 2].mean())
+
+    def light_taken(path: Path) -> float:
+        _, info = next(iter(RecordingReader(path).json(FRAME_INFO_TOPIC)))
+        return float(info["exposure_s"] * info["gain"])
+
+    assert warmth(sunset_picture) > 1.15 * warmth(noon_picture)
+    assert light_taken(sunset) > 2 * light_taken(flight)
