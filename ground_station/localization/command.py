@@ -137,7 +137,7 @@ def _process(
     initial: Any,
     estimates: list[PoseEstimate],
 ) -> None:
-    from ground_station.mapping.progress import Progress
+    from ground_station.progress import Progress
 
     with Progress("localize", source.count()) as progress:
         for frame in source:

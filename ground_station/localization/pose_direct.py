@@ -48,7 +48,7 @@ def solve_direct(
         inlier = residual < settings.inlier_px
     if np.linalg.cond(information) > 1e14:
         return failure(len(points_w), iterations, "singular")
-    covariance: Array = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     return PoseSolution(wTc, covariance, residual, inlier, iterations)
 
 

@@ -87,7 +87,7 @@ def solve_graph(
             return failure(n, iterations, f"not converged in {iterations} iterations")
         if not np.isfinite(solved).all() or not np.isfinite(error):
             return failure(n, iterations, "not finite")
-        if error > graph.error(values):
+        if error > graph.error(values) * (1 + 1e-6) + 1e-6:
             return failure(n, iterations, "diverged")
         covariance = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(X(0)))
     except RuntimeError:  # GTSAM's way of saying that the system is singular

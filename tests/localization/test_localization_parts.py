@@ -1,0 +1,226 @@
+"""Entropy, motion, projection, association, settings: against other implementations or by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tomllib
+from importlib import resources
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from skimage.measure import shannon_entropy
+
+from ground_station.geometry import poses
+from ground_station.localization.association import associate
+from ground_station.localization.entropy import entropy_bits
+from ground_station.localization.motion import MotionModel, constant_velocity
+from ground_station.localization.projection import Lens, project
+from ground_station.localization.settings import (
+    PRESETS,
+    AssociationSettings,
+    LocalizerSettings,
+    MotionSettings,
+    ProjectionSettings,
+    load_preset,
+)
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
+
+
+def test_entropy_is_shannons_as_scikit_image_computes_it():
+    rng = np.random.default_rng(1)
+    for high in (2, 40, 256):
+        image = rng.integers(0, high, (48, 64), dtype=np.uint8)
+        assert entropy_bits(image) == pytest.approx(shannon_entropy(image, base=2), abs=1e-6)
+    assert entropy_bits(np.full((48, 64), 9, np.uint8)) == 0.0
+
+
+def test_constant_velocity_makes_the_last_step_once_more():
+    before = poses.pose(np.eye(3), [1.0, 0.0, 0.0])
+    last = poses.pose(np.eye(3), [1.5, 0.0, 0.0])
+    assert np.allclose(constant_velocity(before, last, 1.0)[:3, 3], [2.0, 0, 0])
+    assert np.allclose(constant_velocity(before, last, 3.0)[:3, 3], [3.0, 0, 0])
+    # A quarter turn about z while going 1 m along the camera's own x: a square is driven.
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    step = poses.pose(turn, [1.0, 0, 0])
+    first = np.eye(4)
+    second = first @ step
+    third = constant_velocity(first, second, 1.0)
+    assert np.allclose(third, poses.pose(turn @ turn, [1.0, 1.0, 0]), atol=1e-12)
+    assert np.allclose(third, second @ np.linalg.inv(first) @ second, atol=1e-12)
+
+
+def test_predictions_stay_rotations_over_a_long_flight():
+    model = MotionModel(MotionSettings())
+    wTc = poses.exp([0.3, -0.2, 0.1, 1.0, 2.0, 3.0])
+    model.restart(0, wTc)
+    model.update(33, wTc @ poses.exp([0.01, 0.02, -0.01, 0.02, 0.0, 0.01]))
+    for k in range(2, 2000):
+        predicted = model.predict(33 * k)
+        model.update(33 * k, predicted)
+    assert np.abs(predicted[:3, :3] @ predicted[:3, :3].T - np.eye(3)).max() < 1e-12
+
+
+def test_a_late_frame_stretches_the_prediction_until_it_is_held():
+    settings = MotionSettings(coast_s=0.2)
+    model = MotionModel(settings)
+    model.restart(0, np.eye(4))
+    model.update(100_000_000, poses.pose(np.eye(3), [0.1, 0, 0]))
+    assert model.predict(200_000_000)[0, 3] == pytest.approx(0.2)
+    assert model.predict(250_000_000)[0, 3] == pytest.approx(0.25)
+    assert model.predict(9_000_000_000)[0, 3] == pytest.approx(0.3)
+    static = MotionModel(dataclasses.replace(settings, model="static"))
+    static.restart(0, np.eye(4))
+    static.update(100_000_000, poses.pose(np.eye(3), [0.1, 0, 0]))
+    assert static.predict(200_000_000)[0, 3] == pytest.approx(0.1)
+
+
+def test_steps_too_far_apart_give_no_velocity():
+    model = MotionModel(MotionSettings(max_step_s=0.5))
+    model.restart(0, np.eye(4))
+    model.update(600_000_000, poses.pose(np.eye(3), [1.0, 0, 0]))
+    assert model.predict(700_000_000)[0, 3] == pytest.approx(1.0)
+
+
+def test_projection_agrees_with_gtsam_and_opencv(room):
+    _, path = room.path(1)
+    camera, wTc = room.camera, path[0]
+    seen = project(room.map.landmarks, wTc, Lens(camera), ProjectionSettings())
+    assert len(seen.landmark) > 100
+    K = gtsam.Cal3_S2(camera.fx_px, camera.fy_px, 0, camera.cx_px, camera.cy_px)
+    pinhole = gtsam.PinholeCameraCal3_S2(gtsam.Pose3(wTc), K)
+    points = room.map.landmarks.position_m
+    theirs = np.array([pinhole.project(points[i]) for i in seen.landmark])
+    assert np.abs(theirs - seen.pinhole_px).max() < 1e-8
+    cTw = np.linalg.inv(wTc)
+    in_front = (points @ cTw[:3, :3].T + cTw[:3, 3])[:, 2] > 0.05
+    distorted, _ = cv2.projectPoints(
+        points, cv2.Rodrigues(cTw[:3, :3])[0], cTw[:3, 3], camera.matrix, camera.distortion
+    )
+    x, y = distorted.reshape(-1, 2).T
+    inside = in_front & (x >= -0.5) & (y >= -0.5) & (x < 639.5) & (y < 479.5)
+    kept = np.zeros(len(points), bool)
+    kept[seen.landmark] = True
+    assert not (kept & ~inside).any()
+    # What OpenCV puts inside and we drop lies past the lens's fold, outside of any real image.
+    normalized = (points @ cTw[:3, :3].T + cTw[:3, 3])[inside & ~kept]
+    radius = np.linalg.norm(normalized[:, :2] / normalized[:, 2:], axis=1)
+    assert (radius > Lens(camera).max_radius).all()
+
+
+def test_landmarks_looked_at_from_outside_their_cones_are_dropped(room):
+    wTc = room.path(1)[1][0]
+    lens, landmarks = Lens(room.camera), room.map.landmarks
+    landmarks.view_cos[:] = np.cos(np.deg2rad(10.0))
+    turned = landmarks.view_direction + room.rng.normal(0, 0.3, (len(landmarks), 3))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    landmarks.view_direction[:] = turned
+    everything = project(landmarks, wTc, lens, ProjectionSettings())
+    cone = ProjectionSettings(viewing_cone=True, cone_margin_deg=10, max_distance_ratio=100)
+    seen = project(landmarks, wTc, lens, cone)
+    rays = wTc[:3, 3] - landmarks.position_m
+    cosine = np.einsum("ij,ij->i", rays, landmarks.view_direction)
+    cosine /= np.linalg.norm(rays, axis=1)
+    wanted = [i for i in everything.landmark if cosine[i] >= np.cos(np.deg2rad(20.0))]
+    assert 0 < len(wanted) < len(everything.landmark)
+    assert seen.landmark.tolist() == wanted
+
+
+def _associate_by_loops(fp, fd, lp, ld, settings, radius):
+    best = {}
+    for i in range(len(fp)):
+        near = np.flatnonzero(np.linalg.norm(lp - fp[i], axis=1) <= radius)
+        if not len(near):
+            continue
+        distance = np.linalg.norm(fd[i].astype(float) - ld[near], axis=1)
+        order = np.argsort(distance, kind="stable")
+        if distance[order[0]] >= settings.max_descriptor_distance:
+            continue
+        if (
+            settings.max_ratio < 1
+            and len(near) > 1
+            and distance[order[0]] > settings.max_ratio * distance[order[1]]
+        ):
+            continue
+        j = int(near[order[0]])
+        if j not in best or distance[order[0]] < best[j][0]:
+            best[j] = (distance[order[0]], i)
+    return sorted((i, j) for j, (_, i) in best.items())
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.9])
+@pytest.mark.parametrize("radius", [8.0, 60.0])
+def test_association_finds_the_pairs_of_a_plain_loop(ratio, radius):
+    rng = np.random.default_rng(3)
+    features, landmarks = 300, 900
+    lp = rng.uniform(0, 1, (landmarks, 2)) * [640, 480]
+    ld = rng.normal(size=(landmarks, 32)).astype(np.float32)
+    ld /= np.linalg.norm(ld, axis=1, keepdims=True)
+    own = rng.integers(0, landmarks, features)
+    fp = lp[own] + rng.normal(0, 3, (features, 2))
+    fd = ld[own] + rng.normal(0, 0.1, (features, 32)).astype(np.float32)
+    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
+    settings = AssociationSettings(max_ratio=ratio, max_descriptor_distance=0.7)
+    pairs = associate(fp, fd, lp, ld, settings, radius)
+    theirs = _associate_by_loops(fp, fd, lp, ld, settings, radius)
+    assert len(theirs) > 50
+    assert list(zip(pairs.feature.tolist(), pairs.candidate.tolist(), strict=True)) == theirs
+    assert len(set(pairs.candidate.tolist())) == len(pairs)
+
+
+def test_association_of_nothing_is_nothing():
+    none, rows = np.empty((0, 2)), np.empty((0, 8), np.float32)
+    some = np.zeros((1, 2)), np.eye(1, 8, dtype=np.float32)
+    assert len(associate(none, rows, *some, AssociationSettings())) == 0
+    assert len(associate(*some, none, rows, AssociationSettings())) == 0
+
+
+def _keys(kind, prefix=""):
+    for field in dataclasses.fields(kind):
+        inner = field.default_factory
+        if isinstance(inner, type) and dataclasses.is_dataclass(inner):
+            yield from _keys(inner, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name
+
+
+def _flat(document, prefix=""):
+    for name, value in document.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_shipped_preset_names_every_key_with_its_comment(preset):
+    file = resources.files("ground_station.localization") / "presets" / f"{preset}.toml"
+    text = file.read_text()
+    assert sorted(_flat(tomllib.loads(text))) == sorted(_keys(LocalizerSettings))
+    lines = text.splitlines()
+    for above, line in itertools.pairwise(lines):
+        if " = " in line and not line.startswith("#"):
+            assert above.startswith("# "), line
+    assert load_preset(preset) == config.from_mapping(tomllib.loads(text), LocalizerSettings)
+
+
+def test_the_thesis_preset_has_the_values_of_the_thesis():
+    thesis = load_preset("thesis")
+    assert thesis.gate.min_entropy_bits == 7.0
+    assert thesis.motion.model == "constant_velocity"
+    assert thesis.association.max_descriptor_distance == 0.7
+    pose = thesis.pose
+    assert (pose.solver, pose.sigma_px, pose.huber_k) == ("graph", 5.0, 1.345)
+    assert pose.landmark_sigma_m == 0.01
+    assert not thesis.recovery.relocalize
+    assert load_preset("default").gate.min_entropy_bits == 0.0
+
+
+def test_a_bad_preset_or_value_is_refused_by_name():
+    with pytest.raises(ConfigError, match="there is no 'fast'"):
+        load_preset("fast")
+    with pytest.raises(ConfigError, match=r"association\.radius_px.*1 to 500 px"):
+        config.from_mapping({"association": {"radius_px": 0.5}}, LocalizerSettings)

@@ -1,0 +1,200 @@
+"""`blimp localize` from arguments to files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ground_station import cli
+from ground_station.errors import InputError
+from ground_station.features.extractor import create
+from ground_station.geometry import poses
+from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
+from ground_station.localization import command
+from ground_station.localization.localizer import LocalizationError
+from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo, save_tables
+from pi_firmware.wire.errors import BlimpError, ConfigError
+
+
+def _texture(rng: np.random.Generator) -> np.ndarray:
+    """A grey picture of 900x700 with corners at several scales."""
+    image = np.zeros((700, 900), np.float32)
+    for size, weight in ((9, 0.3), (23, 0.5), (60, 1.0)):
+        cells = rng.normal(size=(700 // size + 2, 900 // size + 2)).astype(np.float32)
+        image += weight * cv2.resize(cells, (900, 700), interpolation=cv2.INTER_CUBIC)
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory) -> Path:
+    """Six pictures of a textured plane 2 m ahead and a map of it, with the true trajectory.
+
+    The camera slides 1 cm a frame to the right: the picture moves by 2.5 px.
+    """
+    folder = tmp_path_factory.mktemp("flight")
+    rng = np.random.default_rng(5)
+    wall = _texture(rng)
+    frames = folder / "frames"
+    frames.mkdir()
+    shifts = [2.5 * k for k in range(6)]
+    for k, shift in enumerate(shifts):
+        move = np.array([[1.0, 0, -100 - shift], [0, 1, -100]])
+        cv2.imwrite(str(frames / f"{k:03d}.png"), cv2.warpAffine(wall, move, (640, 480)))
+    from ground_station.geometry.camera import Camera
+
+    camera = Camera(fx_px=500, fy_px=500, cx_px=320, cy_px=240)
+    extractor = create("rootsift", 800)
+    image = cv2.imread(str(frames / "000.png"), cv2.IMREAD_GRAYSCALE)
+    features = extractor.extract(image)
+    count = len(features)
+    points = np.c_[(features.keypoints_px - [320, 240]) / 500 * 2.0, np.full(count, 2.0)]
+    towards = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    landmarks = Landmarks(
+        id=np.arange(count, dtype=np.int64),
+        position_m=points.astype(np.float64),
+        covariance_m2=np.tile(np.eye(3, dtype=np.float32) * 1e-6, (count, 1, 1)),
+        descriptor=features.descriptors,
+        spread=np.zeros(count, np.float32),
+        view_direction=towards.astype(np.float32),
+        view_cos=np.ones(count, np.float32),
+        distance_m=np.full((count, 2), 2.0, np.float32),
+        observations=np.ones(count, np.int32),
+    )
+    keyframes = Keyframes(
+        ["000.png"],
+        np.zeros(1, np.int64),
+        np.eye(4)[None],
+        np.array([0, count]),
+        np.arange(count, dtype=np.int32),
+        features.keypoints_px,
+    )
+    info = MapInfo("rootsift", extractor.sha256, 128, camera, name="wall", frame="world", units="m")
+    (folder / "map").mkdir()
+    save_tables(folder / "map", Map(info, landmarks, keyframes))
+    truth = np.stack([poses.pose(np.eye(3), [0.01 * k, 0, 0]) for k in range(6)])
+    times = np.array([round(k / 30 * 1e9) for k in range(6)])
+    write_tum(folder / "truth.txt", Trajectory.from_poses(times, truth))
+    return folder
+
+
+def _args(flight, tmp_path, *more) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    base = [str(flight / "frames"), "--map", str(flight / "map")]
+    return parser.parse_args([*base, "--out", str(tmp_path / "est.txt"), *more])
+
+
+@pytest.mark.parametrize("preset", ["default", "thesis"])
+def test_a_folder_becomes_a_trajectory_and_figures(flight, tmp_path, preset):
+    out = tmp_path / "est.json"
+    first = ["--init", str(flight / "truth.txt")]
+    more = ["--preset", preset, "--min-entropy-bits", "0", "--json", str(out), *first]
+    assert command.run(_args(flight, tmp_path, *more)) == 0
+    estimate, truth = read_tum(tmp_path / "est.txt"), read_tum(flight / "truth.txt")
+    assert estimate.time_ns.tolist() == truth.time_ns.tolist()
+    assert np.abs(estimate.position_m - truth.position_m).max() < 0.01
+    figures = json.loads(out.read_text())
+    assert figures["frames"] == {"captured": 6, "gated": 0, "received": 6, "localized": 6}
+    assert figures["states"]["TRACKING"] == 6 and figures["seed"] == 0
+    assert set(figures["latency_ms"]) == {"p50", "p99"}
+    assert {"features", "projection", "association", "pose", "total"} <= set(figures["stage_ms"])
+    assert figures["preset"] == preset and figures["frame"] == "world"
+
+
+def test_without_a_first_pose_the_default_finds_it_in_the_map(flight, tmp_path):
+    assert command.run(_args(flight, tmp_path, "--range", "1:4")) == 0
+    estimate = read_tum(tmp_path / "est.txt")
+    assert np.allclose(estimate.position_m[:, 0], [0.01, 0.02, 0.03], atol=0.01)
+    assert estimate.time_ns.tolist() == [33_333_333, 66_666_667, 100_000_000]
+
+
+def test_the_thesis_preset_asks_for_a_first_pose(flight, tmp_path):
+    with pytest.raises(LocalizationError, match="--init"):
+        command.run(_args(flight, tmp_path, "--preset", "thesis"))
+
+
+def test_gated_frames_are_counted_and_have_no_poses(flight, tmp_path):
+    out = tmp_path / "est.json"
+    more = ["--min-entropy-bits", "8", "--json", str(out)]
+    assert command.run(_args(flight, tmp_path, *more)) == 1
+    figures = json.loads(out.read_text())
+    assert figures["frames"] == {"captured": 6, "gated": 6, "received": 6, "localized": 0}
+    assert figures["latency_ms"] == {}
+
+
+def test_an_interrupted_run_writes_what_was_finished(flight, tmp_path, monkeypatch):
+    from ground_station.localization.localizer import Localizer
+
+    process = Localizer.process
+
+    def interrupted(self, time_ns, image, index=0):
+        if index == 3:
+            raise KeyboardInterrupt
+        return process(self, time_ns, image, index)
+
+    monkeypatch.setattr(Localizer, "process", interrupted)
+    out = tmp_path / "est.json"
+    assert command.run(_args(flight, tmp_path, "--json", str(out))) == 130
+    assert len(read_tum(tmp_path / "est.txt")) == 3
+    assert json.loads(out.read_text())["interrupted"] is True
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        (["--min-entropy-bits", "9"], "min_entropy_bits"),
+        (["--init", "absent.txt"], "absent.txt"),
+        (["--map", "absent"], "absent"),
+        (["--range", "90:95"], "90:95"),
+        (["--settings", "absent.toml"], "absent.toml"),
+    ],
+)
+def test_bad_arguments_are_one_line_that_names_them(flight, tmp_path, more, text):
+    with pytest.raises(BlimpError, match=text) as caught:
+        command.run(_args(flight, tmp_path, *more))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "est.txt").exists()
+
+
+def test_an_output_folder_that_is_missing_is_said_before_the_work(flight, tmp_path):
+    args = _args(flight, tmp_path)
+    args.out = str(tmp_path / "absent" / "est.txt")
+    with pytest.raises(InputError, match="folder does not exist"):
+        command.run(args)
+
+
+def test_settings_from_a_file_are_checked(flight, tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text("[association]\nradius = 3\n")
+    with pytest.raises(ConfigError, match=r"association\.radius"):
+        command.run(_args(flight, tmp_path, "--settings", str(file)))
+
+
+def test_a_map_of_other_features_ends_the_command_with_status_2(flight, tmp_path, capsys):
+    from shutil import copytree
+
+    other = tmp_path / "map"
+    copytree(flight / "map", other)
+    text = (other / "map.toml").read_text()
+    (other / "map.toml").write_text(text.replace('name = "rootsift"', 'name = "superpoint"'))
+    args = [str(flight / "frames"), "--map", str(other), "--out", str(tmp_path / "e.txt")]
+    assert cli.main(["localize", *args]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and "superpoint" in lines[0] and "rootsift" in lines[0]
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import argparse, sys; from ground_station.localization import command;"
+        "command.add_arguments(argparse.ArgumentParser());"
+        "print([m for m in ('numpy', 'cv2', 'gtsam', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

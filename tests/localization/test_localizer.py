@@ -1,0 +1,227 @@
+"""The localizer over sequences of a synthetic room: what it says, and when it says it is lost."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ground_station.errors import InputError, MapError
+from ground_station.features.extractor import Features
+from ground_station.geometry import poses
+from ground_station.localization.estimate import State
+from ground_station.localization.localizer import LocalizationError, Localizer
+from ground_station.localization.settings import GateSettings, load_preset
+
+NOTHING = Features(
+    np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 64), np.float32)
+)
+
+
+def make(room, extractor, preset="default", **tables):
+    settings = load_preset(preset)
+    for table, changes in tables.items():
+        changed = dataclasses.replace(getattr(settings, table), **changes)
+        settings = dataclasses.replace(settings, **{table: changed})
+    return Localizer(room.map, room.camera, extractor, settings)
+
+
+def errors(estimate, truth):
+    apart = poses.log(poses.inverse(truth) @ estimate.wTc)
+    return np.linalg.norm(apart[3:]), np.rad2deg(np.linalg.norm(apart[:3]))
+
+
+@pytest.mark.parametrize("preset", ["default", "thesis"])
+def test_a_sequence_is_tracked_within_centimetres(room, extractor, preset):
+    localizer = make(room, extractor, preset)
+    times, path = room.path(45)
+    guess = path[0] @ poses.exp([0.01, -0.01, 0.0, 0.03, 0.0, 0.02])
+    localizer.set_initial_pose(guess, int(times[0]))
+    off = []
+    for time_ns, wTc in zip(times.tolist(), path, strict=True):
+        estimate = localizer.process_features(time_ns, room.features(wTc))
+        assert estimate.state is State.TRACKING, estimate.reason
+        off.append(errors(estimate, wTc))
+        assert estimate.counts.inliers == estimate.observations.inlier.sum()
+        assert estimate.counts.associated >= len(estimate.observations)
+        assert {"projection", "association", "pose", "total"} <= set(estimate.stage_ms)
+        assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
+    assert np.max(off, axis=0)[0] < 0.03 and np.max(off, axis=0)[1] < 0.5
+    rms = np.sqrt(np.square(off).mean(axis=0))
+    assert rms[0] < 0.015 and rms[1] < 0.2
+
+
+def test_the_given_first_pose_is_a_prediction_and_no_result(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(2)
+    guess = path[0] @ poses.exp([0, 0, 0, 0.05, 0.0, 0.0])
+    localizer.set_initial_pose(guess, int(times[0]))
+    estimate = localizer.process_features(int(times[0]), room.features(path[0]))
+    assert errors(estimate, path[0])[0] < 0.02
+    assert np.allclose(estimate.predicted_wTc, guess)
+
+
+def test_without_a_first_pose_it_finds_itself_and_waits_for_confirmation(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(3)
+    first = localizer.process_features(int(times[0]), room.features(path[0]))
+    assert first.localized and first.relocalized and first.state is State.DEGRADED
+    assert "confirm" in first.reason
+    second = localizer.process_features(int(times[1]), room.features(path[1]))
+    assert second.state is State.TRACKING and not second.relocalized
+    assert errors(second, path[1])[0] < 0.02
+
+
+def test_the_thesis_preset_never_finds_itself(room, extractor):
+    localizer = make(room, extractor, "thesis")
+    times, path = room.path(2)
+    for time_ns, wTc in zip(times.tolist(), path, strict=True):
+        estimate = localizer.process_features(time_ns, room.features(wTc))
+        assert not estimate.localized and estimate.state is State.INITIALIZING
+        assert estimate.reason == "no first pose"
+
+
+def test_a_blackout_ends_in_lost_and_the_default_comes_back_elsewhere(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(300)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    for k in range(3):
+        localizer.process_features(int(times[k]), room.features(path[k]))
+    states = [localizer.process_features(int(times[k]), NOTHING).state for k in range(3, 30)]
+    assert states[0] is State.DEGRADED and states[-1] is State.LOST
+    lost_from = states.index(State.LOST)
+    assert all(state is State.LOST for state in states[lost_from:])
+    assert (times[3 + lost_from] - times[2]) / 1e9 == pytest.approx(0.3, abs=0.05)
+    back = localizer.process_features(int(times[250]), room.features(path[250]))
+    assert back.relocalized and back.state is State.DEGRADED
+    after = localizer.process_features(int(times[251]), room.features(path[251]))
+    assert after.state is State.TRACKING and errors(after, path[251])[0] < 0.02
+
+
+def test_the_thesis_preset_is_lost_at_the_first_failure_and_says_so(room, extractor):
+    localizer = make(room, extractor, "thesis")
+    times, path = room.path(200)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    assert localizer.process_features(int(times[0]), room.features(path[0])).localized
+    failed = localizer.process_features(int(times[1]), NOTHING)
+    assert failed.state is State.LOST and failed.wTc is None and failed.covariance is None
+    assert failed.reason == "0 observations"
+    elsewhere = localizer.process_features(int(times[199]), room.features(path[199]))
+    assert elsewhere.state is State.LOST and not elsewhere.localized
+
+
+@pytest.mark.parametrize("preset", ["default", "thesis"])
+def test_frames_of_another_building_are_never_tracked(room, extractor, preset):
+    localizer = make(room, extractor, preset)
+    times, path = room.path(20)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    rng = np.random.default_rng(99)
+    for time_ns in times.tolist():
+        descriptors = rng.normal(size=(500, 64))
+        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        other = Features(
+            rng.uniform(0, [640, 480], (500, 2)).astype(np.float32),
+            np.ones(500, np.float32),
+            descriptors.astype(np.float32),
+        )
+        estimate = localizer.process_features(time_ns, other)
+        assert not estimate.localized and estimate.state is not State.TRACKING
+
+
+def test_a_believed_pose_needs_most_of_its_own_observations(room, extractor):
+    times, path = room.path(1)
+    for share, believed in ((0.35, True), (0.9, False)):
+        localizer = make(room, extractor, "thesis", pose={"min_inlier_share": share})
+        localizer.set_initial_pose(path[0], int(times[0]))
+        features = room.features(path[0], outliers=0.0)
+        features.keypoints_px[::3] += [18.0, 18.0]
+        estimate = localizer.process_features(int(times[0]), features)
+        assert estimate.localized == believed, estimate.reason
+    assert "inliers of" in estimate.reason and estimate.state is State.INITIALIZING
+    assert len(estimate.observations) == 0
+
+
+def test_features_that_are_not_finite_are_left_out(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(2)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    features = room.features(path[0])
+    features.keypoints_px[::5] = np.nan
+    features.descriptors[1::5] = np.inf
+    estimate = localizer.process_features(int(times[0]), features)
+    assert estimate.localized and errors(estimate, path[0])[0] < 0.02
+    assert estimate.counts.features == len(features) - len(features.keypoints_px[::5]) - len(
+        features.descriptors[1::5]
+    )
+    features.keypoints_px[:] = np.nan
+    assert not localizer.process_features(int(times[1]), features).localized
+
+
+def test_a_time_that_jumps_back_is_refused_and_changes_nothing(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(4)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    for k in (0, 1, 2):
+        localizer.process_features(int(times[k]), room.features(path[k]))
+    for time_ns in (int(times[1]), int(times[2])):
+        refused = localizer.process_features(time_ns, room.features(path[1]))
+        assert refused.reason.startswith("refused") and refused.wTc is None
+        assert refused.state is not State.TRACKING
+    estimate = localizer.process_features(int(times[3]), room.features(path[3]))
+    assert estimate.state is State.TRACKING
+    localizer.reset()
+    localizer.set_initial_pose(path[0], int(times[0]))
+    assert localizer.process_features(int(times[0]), room.features(path[0])).localized
+
+
+def test_a_late_frame_is_still_predicted(room, extractor):
+    localizer = make(room, extractor, "thesis")
+    times, path = room.path(20)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    for k in (0, 1, 2, 8, 14):
+        estimate = localizer.process_features(int(times[k]), room.features(path[k]))
+        assert estimate.state is State.TRACKING, estimate.reason
+
+
+def test_a_dull_frame_is_gated_and_degrades_before_it_is_lost(room, extractor):
+    localizer = make(room, extractor, "thesis")
+    times, path = room.path(30)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    localizer.process_features(int(times[0]), room.features(path[0]))
+    grey = np.full((480, 640), 128, np.uint8)
+    first = localizer.process(int(times[1]), grey, 1)
+    assert first.gated and first.wTc is None and first.state is State.DEGRADED
+    assert first.reason == "entropy 0.00 below 7 bits" and first.entropy_bits == 0.0
+    late = localizer.process(int(times[29]), grey, 29)
+    assert late.gated and late.state is State.LOST
+
+
+def test_a_frame_of_another_size_is_refused_by_name(room, extractor):
+    localizer = make(room, extractor)
+    with pytest.raises(InputError, match="frame 5 has 320x240 pixels, the camera 640x480"):
+        localizer.process(0, np.zeros((240, 320), np.uint8), 5)
+
+
+def test_a_map_of_other_features_is_refused_by_name(room, extractor):
+    room.map.info.features_sha256 = "1" * 64
+    with pytest.raises(MapError, match="built with 'synthetic'"):
+        make(room, extractor)
+
+
+def test_a_first_pose_that_is_no_rigid_motion_is_refused(room, extractor):
+    localizer = make(room, extractor)
+    for bad in (np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1]), np.diag([-1.0, 1, 1, 1])):
+        with pytest.raises(LocalizationError, match="initial pose"):
+            localizer.set_initial_pose(bad, 0)
+
+
+def test_an_empty_map_localizes_nothing(room, extractor):
+    landmarks = room.map.landmarks
+    for field in dataclasses.fields(landmarks):
+        setattr(landmarks, field.name, getattr(landmarks, field.name)[:0])
+    localizer = make(room, extractor)
+    localizer.set_initial_pose(np.eye(4), 0)
+    features = NOTHING
+    assert not localizer.process_features(1, features).localized
+    assert GateSettings().min_entropy_bits == 0.0
