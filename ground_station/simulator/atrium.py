@@ -315,7 +315,7 @@ class _Atrium:
             self.lamps.append(Lamp((x, 14.6, 3.2)))
 
     def outside(self) -> None:
-        """What the windows show: pavement, trees, a facade, the sky."""
+        """What the windows show: pavement, trees, the sky."""
         for k in range(8):
             x = 8.0 * k - 20
             self.b.rectangle(

@@ -18,7 +18,7 @@ from ground_station.simulator.plans import Reference
 
 Array = npt.NDArray[np.float64]
 
-AIR_KG_M3 = 1.204  # dry air, 20 °C, 101.3 kPa (ISO 2533)
+AIR_KG_M3 = 1.204  # dry air, 20 °C, 101.3 kPa, an ideal gas of 287.05 J/(kg K)
 HELIUM_KG_M3 = 0.170  # helium of 99 %, same state, slight overpressure
 GRAVITY_M_S2 = 9.81
 _STEP_S = 1 / 200
@@ -32,9 +32,9 @@ class Blimp:
     semi_width_m: float = 0.31
     mass_kg: float = 0.352
     """Hull, payload and trim, without the helium: neutral."""
-    added_axial: float = 0.13
-    """Added mass over displaced mass along the nose: spheroid of fineness 2.7 (Lamb)."""
-    added_lateral: float = 0.77
+    added_axial: float = 0.14
+    """Added mass over displaced mass along the nose: spheroid of fineness 2.74 (Lamb)."""
+    added_lateral: float = 0.78
     drag_axial: float = 0.30
     """On the frontal area; a hull with fins and gondola at Re of 5e4."""
     drag_lateral: float = 0.90

@@ -86,7 +86,6 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
     }
     if name not in plans:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
-    # Two thirds of the width: pillars stand along both long sides.
     centre = (scene.size_m[0] / 2, scene.size_m[1] / 2 - 0.1)
     shift = rng.uniform(-1, 1, 4)
     return plans[name](centre, shift)
@@ -128,7 +127,7 @@ def _small_circle(centre: tuple[float, float], shift: Array) -> Plan:
         angle = 2 * np.pi * s
         z = 2.8 + 0.15 * shift[0] + 0.25 * np.sin(angle + shift[1])
         r = 1.9 + 0.15 * shift[2]
-        yaw = angle + np.pi / 2 - 0.5 + 0.0 * s
+        yaw = angle + np.pi / 2 - 0.5
         return _ellipse(angle, (centre[0] + 0.2 * shift[3], centre[1]), r, r, z), yaw
 
     return Plan("small-circle", shape, 1.0, 0.5, False, 40.0)
@@ -139,7 +138,7 @@ def _fast(centre: tuple[float, float], shift: Array) -> Plan:
 
     def shape(s: Array) -> tuple[Array, Array]:
         angle = 2 * np.pi * s
-        z = 1.65 + 0.03 * shift[0] + 0.0 * angle
+        z = np.full_like(angle, 1.65 + 0.03 * shift[0])
         yaw = angle + np.pi / 2 + 0.25 * np.sin(3 * angle + shift[1]) + 0.15
         return _ellipse(angle, (centre[0], centre[1] - 0.15), 4.75, 4.75, z), yaw
 
