@@ -24,9 +24,13 @@ class RootSift:
         self.max_features = max_features
         # The model of a method without weights is its definition; a map made with another one
         # must be refused.
-        self.sha256 = hashlib.sha256(b"rootsift/1 opencv-sift 128 hellinger").hexdigest()
+        self.sha256 = hashlib.sha256(b"rootsift/2 opencv-sift 128 hellinger").hexdigest()
         self._sift = cv2.SIFT.create(
-            nfeatures=max_features, contrastThreshold=_CONTRAST_THRESHOLD, edgeThreshold=10
+            nfeatures=max_features,
+            contrastThreshold=_CONTRAST_THRESHOLD,
+            edgeThreshold=10,
+            # Without it every key point lies a quarter of a pixel too far right and down.
+            enable_precise_upscale=True,
         )
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:

@@ -1,0 +1,111 @@
+"""`blimp map`: help at once, one line for what is wrong, numbers for what was measured."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ground_station.errors import CameraError, GroundStationError, InputError, MapError
+from ground_station.mapping import command
+
+ROOT = Path(__file__).parents[2]
+
+
+def _run(*words: object) -> int:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args([str(word) for word in words]))
+
+
+@pytest.mark.parametrize("sub", ["build", "register", "info"])
+def test_help_shows_an_example_and_loads_nothing_heavy(sub):
+    script = (
+        "import argparse, sys; from ground_station.mapping import command\n"
+        "p = argparse.ArgumentParser(prog='blimp map'); command.add_arguments(p)\n"
+        "try: p.parse_args(sys.argv[1:])\n"
+        "finally: print([m for m in ('numpy', 'cv2', 'pycolmap', 'gtsam') if m in sys.modules])\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script, sub, "--help"],
+        capture_output=True, text=True, cwd=ROOT, check=True,
+    )  # fmt: skip
+    assert f"blimp map {sub} " in result.stdout.split("example")[1]
+    assert result.stdout.rstrip().endswith("[]")
+
+
+def test_info_says_what_a_map_holds(built, tmp_path, capsys):
+    assert _run("info", built.folder, "--json", tmp_path / "info.json") == 0
+    document = json.loads((tmp_path / "info.json").read_text())
+    assert document["images"] == 16 and document["landmarks"] == len(built.map.landmarks)
+    assert document["frame"] == "sfm" and document["registration"] == "none"
+    assert document["size_mb"] > 0 and 0 < document["reprojection_px"] < 1
+    printed = capsys.readouterr().out
+    for word in ("landmarks", "mean_track", "features", "camera", "units"):
+        assert word in printed
+
+
+def _images(folder: Path, count: int, size=(480, 640)) -> Path:
+    import cv2
+    import numpy as np
+
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), rng.integers(0, 256, size, dtype=np.uint8))
+    return folder
+
+
+@pytest.fixture
+def camera_file(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text(
+        "width_px = 640\nheight_px = 480\nfx_px = 500.0\nfy_px = 500.0\ncx_px = 320.0\n"
+        "cy_px = 240.0\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        (["nowhere"], InputError, "nowhere"),
+        (["empty"], InputError, "empty"),
+        (["one", "--camera", "camera.toml"], InputError, "the input has 1"),
+        (["two"], CameraError, "does not carry a camera"),
+        (["two", "--camera", "absent.toml"], CameraError, "absent.toml"),
+        (["small", "--camera", "camera.toml"], MapError, "is 320x240 pixels, the camera 640x480"),
+        (["two", "--camera", "camera.toml"], MapError, "no two of the 2 images overlap"),
+        (["two", "--camera", "camera.toml", "--range", "5"], InputError, "'5'"),
+        (["two", "--camera", "camera.toml", "--features", "surf"], GroundStationError, "'surf'"),
+        (["two", "b/two", "--camera", "camera.toml"], InputError, "two inputs are named 'two'"),
+    ],
+)
+def test_bad_input_gets_one_line(tmp_path, monkeypatch, camera_file, arguments, error, words):
+    _images(tmp_path / "empty", 0)
+    _images(tmp_path / "one", 1)
+    _images(tmp_path / "two", 2)
+    _images(tmp_path / "b" / "two", 2)
+    _images(tmp_path / "small", 2, (240, 320))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=words) as caught:
+        _run("build", *arguments, "--out", "map")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "map").exists() and not (tmp_path / "map.part").exists()
+
+
+def test_long_inputs_are_thinned_and_it_is_said(tmp_path, monkeypatch, camera_file, capsys):
+    _images(tmp_path / "many", 9, (480, 640))
+    settings = tmp_path / "mapping.toml"
+    settings.write_text("max_images = 4\nmax_features = 50\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MapError, match="no two of the 3 images"):
+        _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map")
+    assert "9 frames; every 3th is used" in capsys.readouterr().out
+    with pytest.raises(MapError, match="no two of the 9 images"):  # a step is meant as it stands
+        _run("build", "many", "--camera", camera_file, "--settings", settings,
+             "--out", "map", "--range", "::1")  # fmt: skip
