@@ -65,10 +65,12 @@ class ReplayResult:
     @property
     def estimate(self) -> Trajectory:
         """The localized frames' poses, by capture time."""
-        found = [frame.estimate for frame in self.live.frames if frame.estimate.wTc is not None]
-        return Trajectory.from_poses(
-            [estimate.time_ns for estimate in found], [estimate.wTc for estimate in found]
-        )
+        found = [
+            (frame.estimate.time_ns, frame.estimate.wTc)
+            for frame in self.live.frames
+            if frame.estimate.wTc is not None
+        ]
+        return Trajectory.from_poses([time for time, _ in found], np.array([T for _, T in found]))
 
     def stage_ms(self) -> dict[str, dict[str, float]]:
         """Median and 99th percentile of each stage that ran, milliseconds."""

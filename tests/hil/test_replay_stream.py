@@ -1,0 +1,118 @@
+"""A stretch of the sample flight through firmware, link and localizer, in the sample's map."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_station.evaluation import ate
+from ground_station.localization.settings import load_preset
+from ground_station.mapping import store
+from ground_station.recording.flight import trajectory_of
+from ground_station.service import flight_report
+from ground_station.service.replay import ReplayResult, ReplaySettings, replay
+
+SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
+BLIMP = Path(sys.executable).with_name("blimp")
+
+
+@pytest.fixture(scope="module")
+def flown() -> ReplayResult:
+    settings = ReplaySettings(
+        recording=SAMPLE / "flight.mcap",
+        rate_hz=5.0,
+        preset="thesis",
+        init="truth",
+        start_s=2.0,
+        duration_s=4.0,
+        queue_frames=64,
+    )
+    return replay(store.load(SAMPLE), load_preset("thesis"), settings)
+
+
+def test_every_frame_is_accounted_for(flown: ReplayResult) -> None:
+    accounts = flown.live.accounts()
+    assert flown.live.complete
+    assert accounts["captured"] == 20
+    assert accounts["captured"] == accounts["gated"] + accounts["sent"]
+    assert accounts["sent"] == accounts["received"] + accounts["lost"]
+    assert accounts["lost"] == accounts["dropped"] == 0
+    assert accounts["received"] == len(flown.live.frames)
+
+
+def test_capture_times_are_the_recordings_own(flown: ReplayResult) -> None:
+    """What the SEI carried past encoder and decoder is exact to the nanosecond."""
+    truth_ns = set(trajectory_of(SAMPLE / "flight.mcap").time_ns.tolist())
+    times = [frame.estimate.time_ns for frame in flown.live.frames]
+    assert set(times) <= truth_ns
+    assert np.diff(times).min() > 150e6
+
+
+def test_poses_are_where_the_truth_is(flown: ReplayResult) -> None:
+    accounts = flown.live.accounts()
+    assert accounts["localized"] >= 0.95 * accounts["sent"] > 0
+    assert flown.evaluation is not None
+    rmse = flown.evaluation.errors["none"].rmse()
+    assert rmse["position_m"] <= 0.10 and rmse["rotation_deg"] <= 0.6
+
+
+def test_latency_is_between_capture_and_now(flown: ReplayResult) -> None:
+    """The payload's clock at capture travels with the frame; on one host it is our clock."""
+    for frame in flown.live.frames:
+        assert frame.clock_ns < frame.arrival_ns < frame.done_ns
+        assert frame.done_ns - frame.clock_ns < 60e9
+
+
+def test_a_missed_bound_is_judged_so(flown: ReplayResult) -> None:
+    bounds = flight_report.judge(flown, {flight_report.POSITION: 0.10, flight_report.GATED: 5.0})
+    assert all(bound.met for bound in bounds)
+    missed = flight_report.judge(flown, {flight_report.POSITION: 1e-6})
+    assert not missed[0].met
+    assert "bounds missed" in flight_report.verdict(flown.live.accounts(), missed)[0]
+
+
+def test_the_command_writes_results_and_report(tmp_path: Path) -> None:
+    run = subprocess.run(
+        [BLIMP, "replay", SAMPLE / "flight.mcap", "--map", SAMPLE, "--out", tmp_path,
+         "--duration-s", "1", "--json", tmp_path / "copy.json"],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    results: dict[str, Any] = json.loads((tmp_path / "results.json").read_text())
+    assert results == json.loads((tmp_path / "copy.json").read_text())
+    assert {"captured", "gated", "sent", "received", "localized"} <= results["frames"].keys()
+    assert set(results["ate"]) == set(ate.ALIGNMENTS)
+    for values in results["ate"].values():
+        assert values is None or {"position_m", "rotation_deg"} <= values.keys()
+    assert results["latency_ms"].keys() == {"p50", "p99"}
+    assert results["stage_ms"]["features"]["p50"] > 0
+    page = (tmp_path / "report.html").read_text()
+    assert "simulated" in page.lower() and "<script" not in page
+
+
+def test_a_recording_without_truth_needs_a_first_pose(tmp_path: Path) -> None:
+    from pi_firmware.wire.recording import RecordingReader, RecordingWriter
+
+    bare = tmp_path / "bare.mcap"
+    reader = RecordingReader(SAMPLE / "flight.mcap")
+    calibration = reader.calibration()
+    assert calibration is not None
+    with RecordingWriter(bare) as writer:
+        writer.write_calibration(
+            0, width_px=calibration.width, height_px=calibration.height,
+            matrix=list(calibration.K), distortion=list(calibration.D),
+        )  # fmt: skip
+        for _, sample in zip(range(30), reader.video(), strict=False):
+            writer.write_video(sample.time_ns, sample.data)
+    run = subprocess.run(
+        [BLIMP, "replay", bare, "--map", SAMPLE, "--out", tmp_path / "out"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert run.returncode == 2
+    assert "--init truth: the recording has no true poses" in run.stderr
