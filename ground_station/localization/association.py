@@ -59,23 +59,28 @@ def associate(
     )
     feature, candidate = pairs["i"], pairs["j"]
     distance = _distances(feature_descriptors, candidate_descriptors, feature, candidate)
-    order = np.lexsort((candidate, distance, feature))
-    feature, candidate, distance = feature[order], candidate[order], distance[order]
-    first = np.ones(len(feature), bool)
-    first[1:] = feature[1:] != feature[:-1]
-    rows = np.flatnonzero(first)
-    good = distance[rows] < settings.max_descriptor_distance
+    nearest = np.full(len(feature_px), np.inf, np.float32)
+    np.minimum.at(nearest, feature, distance)
+    wins = (distance == nearest[feature]) & (distance < settings.max_descriptor_distance)
+    rows = _first_of_each(feature, candidate, np.flatnonzero(wins))
     if settings.max_ratio < 1.0:
-        following = np.minimum(rows + 1, len(feature) - 1)
-        alone = (following == rows) | (feature[following] != feature[rows])
-        good &= alone | (distance[rows] <= settings.max_ratio * distance[following])
-    rows = rows[good]
-    feature, candidate, distance = feature[rows], candidate[rows], distance[rows]
-    order = np.lexsort((feature, distance, candidate))
-    kept = np.ones(len(order), bool)
-    kept[1:] = candidate[order][1:] != candidate[order][:-1]
-    rows = np.sort(order[kept])
+        others = np.ones(len(feature), bool)
+        others[rows] = False
+        second = np.full(len(feature_px), np.inf, np.float32)
+        np.minimum.at(second, feature[others], distance[others])
+        rows = rows[distance[rows] <= settings.max_ratio * second[feature[rows]]]
+    rows = rows[np.argsort(distance[rows], kind="stable")]
+    _, kept = np.unique(candidate[rows], return_index=True)
+    rows = rows[kept]
+    rows = rows[np.argsort(feature[rows])]
     return Associations(feature[rows], candidate[rows], distance[rows])
+
+
+def _first_of_each(feature: Indices, candidate: Indices, rows: Indices) -> Indices:
+    """Of rows, one for each feature, sorted by feature: that of the lowest candidate in a tie."""
+    rows = rows[np.lexsort((candidate[rows], feature[rows]))]
+    _, first = np.unique(feature[rows], return_index=True)
+    return rows[first]
 
 
 def _distances(a: F32, b: F32, i: Indices, j: Indices) -> F32:

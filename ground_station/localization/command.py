@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -97,8 +98,6 @@ def run(args: argparse.Namespace) -> int:
     extractor = create(settings.features.extractor, settings.features.max_features)
     localizer = Localizer(map_, camera, extractor, settings)
     estimates: list[PoseEstimate] = []
-    from time import monotonic
-
     start_s = monotonic()
     interrupted = False
     try:

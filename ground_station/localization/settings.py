@@ -38,10 +38,14 @@ class MotionSettings:
         choices=["static", "constant_velocity"],
     )
     max_step_s: float = config.key(
-        0.5, "two solved frames further apart give no velocity", unit="s", low=0.001, high=10
+        1.0, "two solved frames further apart give no velocity", unit="s", low=0.001, high=10
     )
     coast_s: float = config.key(
-        0.2, "the velocity is carried on for this long, then the pose is held", unit="s", high=10
+        0.5,
+        "the velocity is carried on for this long, then the pose is held",
+        unit="s",
+        low=0,
+        high=10,
     )
 
 
@@ -118,7 +122,11 @@ class StateSettings:
     """When a localizer calls itself degraded or lost."""
 
     lost_after_s: float = config.key(
-        0.0, "without a solved frame for longer: LOST, before that DEGRADED", unit="s", high=60
+        0.0,
+        "without a solved frame for longer: LOST, before that DEGRADED",
+        unit="s",
+        low=0,
+        high=60,
     )
     good_inliers: int = config.key(25, "fewer inliers: DEGRADED", low=4, high=1000)
     good_spread: float = config.key(
