@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 import threading
 import time
 from collections import deque
@@ -117,7 +118,7 @@ def build_map(
         }
         colmap.write(reconstruction, folder / "sparse")
         store.save_tables(folder, map_, quantise=settings.quantise)
-        _remove_tree(work)
+        shutil.rmtree(work)
     map_.folder = out
     return map_
 
@@ -348,9 +349,3 @@ def _drop_implausible(
     )
     colmap.drop_images(reconstruction, model.image_id[~keep].tolist())
     return [name for name, kept in zip(model.names, keep, strict=True) if not kept]
-
-
-def _remove_tree(folder: Path) -> None:
-    import shutil
-
-    shutil.rmtree(folder)

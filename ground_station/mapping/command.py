@@ -139,7 +139,7 @@ def _open(
     if step > 1:
         thinned = dataclasses.replace(wanted or ALL_FRAMES, step=step)
         sources = [open_input(path, args.rate_hz, thinned) for path in args.inputs]
-        print(f"{total} frames; every {step}th is used (max_images is {max_images})")
+        print(f"{total} frames; one in {step} is used (max_images is {max_images})")
     return sources, step, -(-total // step)
 
 

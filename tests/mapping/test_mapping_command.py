@@ -105,7 +105,7 @@ def test_long_inputs_are_thinned_and_it_is_said(tmp_path, monkeypatch, camera_fi
     monkeypatch.chdir(tmp_path)
     with pytest.raises(MapError, match="no two of the 3 images"):
         _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map")
-    assert "9 frames; every 3th is used" in capsys.readouterr().out
+    assert "9 frames; one in 3 is used" in capsys.readouterr().out
     with pytest.raises(MapError, match="no two of the 9 images"):  # a step is meant as it stands
         _run("build", "many", "--camera", camera_file, "--settings", settings,
              "--out", "map", "--range", "::1")  # fmt: skip
