@@ -116,7 +116,7 @@ def build_map(
             "stage_s": {name: round(value, 3) for name, value in stage_s.items()},
             "settings": asdict(settings),
         }
-        colmap.write(reconstruction, folder / "sparse")
+        colmap.write(colmap.compact(reconstruction), folder / "sparse")
         store.save_tables(folder, map_, quantise=settings.quantise)
         shutil.rmtree(work)
     map_.folder = out
