@@ -1,4 +1,4 @@
-"""The `blimp` command: one parser over the rooms; heavy modules are imported when a command runs."""
+"""The `blimp` command over the rooms; heavy modules are imported only when a command runs."""
 
 from __future__ import annotations
 
@@ -45,6 +45,9 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; the exit status is 0, 1 (a bound was missed) or 2 (bad input)."""
     args = parser().parse_args(arguments)
+    # Threads are ours to schedule: BLAS's own would spin against them on a small machine. It reads
+    # this once, when numpy is first imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         return int(importlib.import_module(args.module).run(args))
     except BlimpError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -76,10 +75,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
-    # Before numpy is loaded: matching runs on a thread a core, and a BLAS with threads of its own
-    # would have them wait for each other, spinning, whenever the machine has other work.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
     import dataclasses
 
     from ground_station.geometry.camera import load_camera
