@@ -1,0 +1,1 @@
+"""The presets that ship: settings files of the localizer."""
