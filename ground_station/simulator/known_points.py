@@ -19,10 +19,10 @@ Array = npt.NDArray[np.float64]
 
 _CLICK_NOISE_PX = 0.3
 _EDGE_PX = 20.0
-_RANGE_M = (1.0, 13.0)
-_FLOW_LIMIT_PX_S = 160.0  # times 10 ms of exposure: 1.6 px of blur
+_RANGE_M = (1.0, 12.0)
+_FLOW_LIMIT_PX_S = 90.0  # over half a readout of 10 ms: within a pixel of a global shutter
 _MIN_FACING = 0.3  # cosine of the angle between view and normal
-_MIN_PARALLAX_DEG = 8.0
+_MIN_PARALLAX_DEG = 13.0
 
 
 def frame_name(index: int) -> str:
