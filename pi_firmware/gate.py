@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pi_firmware.settings import GateSettings
+from pi_firmware.wire.entropy import entropy_bits
 
 LOW_RESOLUTION_PX = 160
 """Entropy is measured on about this many columns: every n-th pixel of every n-th row. Picking
@@ -25,13 +26,6 @@ class Measure:
 
     entropy_bits: float
     sharpness: float
-
-
-def shannon_entropy_bits(luma: NDArray[np.uint8]) -> float:
-    """Shannon entropy -sum(p log2 p) of the 256-bin histogram of `luma` (any shape), in bits."""
-    counts = np.bincount(luma.ravel(), minlength=256)
-    p = counts[counts > 0] / luma.size
-    return float(max(0.0, -(p * np.log2(p)).sum()))
 
 
 def gradient_energy(luma: NDArray[np.uint8], step: int = 1) -> float:
@@ -49,7 +43,7 @@ def gradient_energy(luma: NDArray[np.uint8], step: int = 1) -> float:
 def measure(luma: NDArray[np.uint8]) -> Measure:
     """What the gate looks at, from the luma plane (H, W) as it goes to the encoder."""
     step = max(1, luma.shape[1] // LOW_RESOLUTION_PX)
-    return Measure(shannon_entropy_bits(luma[::step, ::step]), gradient_energy(luma, step))
+    return Measure(entropy_bits(luma[::step, ::step]), gradient_energy(luma, step))
 
 
 class Decision(enum.Enum):

@@ -11,7 +11,6 @@ from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
 from ground_station.localization.association import associate
-from ground_station.localization.entropy import entropy_bits
 from ground_station.localization.estimate import (
     Counts,
     Observations,
@@ -26,6 +25,7 @@ from ground_station.localization.projection import Lens, project
 from ground_station.localization.relocalization import relocalize, spread
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.store import Map, check_features
+from pi_firmware.wire.entropy import entropy_bits
 
 Array = npt.NDArray[np.float64]
 

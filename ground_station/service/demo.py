@@ -39,7 +39,7 @@ LIMITS = {
 def run(out: Path, *, preset: str, init: str, sample: Path = SAMPLE) -> int:
     """Builds, flies, writes results.json and report.html to `out`; 1 when a bound is missed."""
     mapping, flight = sample / "mapping.mcap", sample / "flight.mcap"
-    for path in (mapping, flight, sample / "PAIRS.csv"):
+    for path in (mapping, flight, sample / "mapping.toml", sample / "PAIRS.csv"):
         if not path.is_file():
             raise InputError(f"{path}: the sample is incomplete; `make sample` makes it anew")
     out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +83,7 @@ def run(out: Path, *, preset: str, init: str, sample: Path = SAMPLE) -> int:
 
 def build(mapping: Path, sample: Path, folder: Path) -> Map:
     """The registered map of the sample's mapping flight, every frame of which is an image."""
-    settings = load_settings()
+    settings = load_settings(sample / "mapping.toml")
     source = open_input(mapping)
     total = source.count()
     step = max(1, -(-(total or 1) // settings.max_images))

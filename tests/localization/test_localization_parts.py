@@ -15,7 +15,6 @@ from skimage.measure import shannon_entropy
 
 from ground_station.geometry import poses
 from ground_station.localization.association import associate
-from ground_station.localization.entropy import entropy_bits
 from ground_station.localization.motion import MotionModel, constant_velocity
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import (
@@ -27,6 +26,7 @@ from ground_station.localization.settings import (
     load_preset,
 )
 from pi_firmware.wire import config
+from pi_firmware.wire.entropy import entropy_bits
 from pi_firmware.wire.errors import ConfigError
 
 

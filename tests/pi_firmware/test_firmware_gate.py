@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from skimage.measure import shannon_entropy
 
-from pi_firmware.gate import Decision, Gate, gradient_energy, measure, shannon_entropy_bits
+from pi_firmware.gate import Decision, Gate, gradient_energy, measure
 from pi_firmware.settings import GateSettings
+from pi_firmware.wire.entropy import entropy_bits
 
 FRAME_NS = 33_333_333
 
@@ -16,13 +17,13 @@ FRAME_NS = 33_333_333
 @settings(deadline=None, max_examples=60)
 @given(arrays(np.uint8, st.tuples(st.integers(1, 40), st.integers(1, 40))))
 def test_entropy_equals_scikit_images(luma: np.ndarray) -> None:
-    assert shannon_entropy_bits(luma) == pytest.approx(shannon_entropy(luma, base=2), abs=1e-9)
+    assert entropy_bits(luma) == pytest.approx(shannon_entropy(luma, base=2), abs=1e-9)
 
 
 def test_entropy_of_every_grey_level_alike_is_eight_bits() -> None:
     levels = np.arange(256, dtype=np.uint8)
-    assert shannon_entropy_bits(np.tile(levels, (8, 1))) == pytest.approx(8.0)
-    assert shannon_entropy_bits(np.full((48, 64), 17, np.uint8)) == 0.0
+    assert entropy_bits(np.tile(levels, (8, 1))) == pytest.approx(8.0)
+    assert entropy_bits(np.full((48, 64), 17, np.uint8)) == 0.0
 
 
 def test_low_resolution_keeps_the_entropy_of_the_whole_picture() -> None:
