@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -51,25 +50,3 @@ def check_image(image: npt.NDArray[np.uint8]) -> None:
             f"features: a grey uint8 image of at least 16x16 is needed, not "
             f"{'x'.join(map(str, image.shape))} {image.dtype}"
         )
-
-
-def create(name: str, max_features: int = 1500) -> Extractor:
-    """The extractor of that name, keeping at most `max_features` key points an image."""
-    if name not in _EXTRACTORS:
-        known = ", ".join(sorted(_EXTRACTORS))
-        raise FeatureError(f"features: there is no extractor '{name}' (known: {known})")
-    return _EXTRACTORS[name](max_features)
-
-
-def names() -> list[str]:
-    """The names that `create` knows."""
-    return sorted(_EXTRACTORS)
-
-
-def _rootsift(max_features: int) -> Extractor:
-    from ground_station.features.rootsift import RootSift
-
-    return RootSift(max_features)
-
-
-_EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": _rootsift}

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ground_station.errors import InputError
-    from ground_station.features.extractor import create
+    from ground_station.features.extractors import create
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.trajectory import read_tum
     from ground_station.localization.localizer import LocalizationError, Localizer

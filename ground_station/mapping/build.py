@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import InputError, MapError
-from ground_station.features import extractor
+from ground_station.features import extractors
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import colmap, landmarks, store
@@ -146,7 +146,7 @@ def extract(
                 f"the camera {camera.width_px}x{camera.height_px}"
             )
         if not hasattr(local, "extractor"):  # an extractor of its own for each thread
-            local.extractor = extractor.create(settings.features, settings.max_features)
+            local.extractor = extractors.create(settings.features, settings.max_features)
         return frame.name, frame.time_ns, local.extractor.extract(frame.image)
 
     rows: list[tuple[str, int, Features]] = []
@@ -262,7 +262,7 @@ def assemble(
     model: colmap.Model, images: Images, camera: Camera, settings: MappingSettings, name: str
 ) -> store.Map:
     """The map in memory from a refined model and the features it was made of."""
-    extracted = extractor.create(settings.features, settings.max_features)
+    extracted = extractors.create(settings.features, settings.max_features)
     source = model.image_id[model.image] - 1  # images have id = index + 1 in the database
     pick = [
         (images.features[i], f)

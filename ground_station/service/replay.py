@@ -12,7 +12,7 @@ import numpy as np
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
-from ground_station.features import extractor
+from ground_station.features import extractors
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.localizer import Localizer
@@ -134,14 +134,14 @@ def replay(
     if camera is None:
         raise InputError(f"{settings.recording}: it carries no camera calibration")
     features = localizer_settings.features
-    extract = extractor.create(features.extractor, features.max_features)
+    extract = extractors.create(features.extractor, features.max_features)
     localizer = Localizer(map_, camera, extract, localizer_settings)
     truth = None
     if TRUTH_TOPIC in reader.topics():
         truth = trajectory_of(settings.recording)
     start = first_pose(settings.init, truth)
     expected = _expected_frames(reader, settings)
-    every = max(1, expected // (settings.pictures + 1))
+    every = max(1, expected // settings.pictures)
 
     def set_start(time_ns: int) -> None:
         if start is not None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.simulator.scenes import Footprint, KnownPoint, Lamp, Scene
+from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
 from ground_station.simulator.surfaces import SceneBuilder, Surface
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 24.0, 16.0, 9.0

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs it; raises `SimulatorError` on what a person can mend. 130 after Ctrl-C."""
-    from ground_station.simulator.scenes import SimulatorError
+    from ground_station.simulator.scene import SimulatorError
 
     if args.sample is not None:
         from ground_station.simulator.sample import make_sample
@@ -85,7 +85,7 @@ def settings_from(args: argparse.Namespace) -> SimulationSettings:
 
 def write_json(path: Path, document: dict[str, object]) -> None:
     """Writes JSON, beside and renamed; raises `SimulatorError`."""
-    from ground_station.simulator.scenes import SimulatorError
+    from ground_station.simulator.scene import SimulatorError
 
     part = path.with_name(path.name + ".part")
     try:

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.simulator.scenes import SimulatorError
+from ground_station.simulator.scene import SimulatorError
 
 
 class H264Encoder:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from ground_station.simulator.scenes import Footprint, Scene, SimulatorError
+from ground_station.simulator.scene import Footprint, Scene, SimulatorError
 
 _RESOLUTION_M = 0.025
 _MARGIN_M = 0.75

@@ -13,7 +13,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-from ground_station.simulator.scenes import KnownPoint, SimulatorError
+from ground_station.simulator.scene import KnownPoint, SimulatorError
 
 Array = npt.NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from ground_station.simulator import scenes
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-from ground_station.simulator.scenes import Scene, SimulatorError
+from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.surfaces import Surface
 from ground_station.simulator.textures import MATERIALS, Image, TextureBank
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from ground_station.simulator.scenes import Scene, SimulatorError
+from ground_station.simulator.scene import Scene, SimulatorError
 
 Array = npt.NDArray[np.float64]
 

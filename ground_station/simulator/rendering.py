@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.simulator.scenes import SimulatorError
+from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.surfaces import Surface
 
 Array = npt.NDArray[np.float64]

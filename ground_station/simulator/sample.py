@@ -9,6 +9,7 @@ from typing import Any
 
 from ground_station.simulator import scenes
 from ground_station.simulator.floorplan import write_floorplan
+from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, simulate
 
 MAX_FILE_BYTES = 6_000_000
@@ -42,9 +43,9 @@ def make_sample(
         with reporter(settings.out.name) as report:
             result = simulate(settings, report)
         if result.interrupted:
-            raise scenes.SimulatorError(f"interrupted: {settings.out} is shorter than the sample's")
+            raise SimulatorError(f"interrupted: {settings.out} is shorter than the sample's")
         if result.bytes > MAX_FILE_BYTES:
-            raise scenes.SimulatorError(
+            raise SimulatorError(
                 f"{settings.out} has {result.bytes} bytes; allowed: {MAX_FILE_BYTES}"
             )
         made.append(settings.out)

@@ -28,7 +28,7 @@ from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
 from ground_station.simulator.rendering import SceneRenderer
-from ground_station.simulator.scenes import Scene, SimulatorError
+from ground_station.simulator.scene import Scene, SimulatorError
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 FIRST_FRAME_S = 1.0

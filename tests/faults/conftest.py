@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_station.features import extractor
+from ground_station.features import extractors
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping import store
 
@@ -13,7 +13,7 @@ from ground_station.mapping import store
 @pytest.fixture
 def small_map(tmp_path: Path) -> Path:
     draw = np.random.default_rng(7)
-    m, rootsift = 50, extractor.create("rootsift")
+    m, rootsift = 50, extractors.create("rootsift")
     landmarks = store.Landmarks(
         id=np.arange(1, m + 1),
         position_m=draw.uniform(-3, 3, (m, 3)),

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ground_station.features import extractor
+from ground_station.features import extractors
 from ground_station.features.extractor import FeatureError
 from ground_station.features.rootsift import hellinger
 
@@ -19,7 +19,7 @@ def picture():
 
 
 def test_descriptors_are_the_square_roots_of_opencvs_normalised_histograms(picture):
-    found = extractor.create("rootsift", 300).extract(picture)
+    found = extractors.create("rootsift", 300).extract(picture)
     sift = cv2.SIFT.create(
         nfeatures=300, contrastThreshold=0.02, edgeThreshold=10, enable_precise_upscale=True
     )
@@ -35,7 +35,7 @@ def test_descriptors_are_the_square_roots_of_opencvs_normalised_histograms(pictu
 
 
 def test_descriptors_have_unit_norm_and_the_strongest_come_first(picture):
-    found = extractor.create("rootsift", 200).extract(picture)
+    found = extractors.create("rootsift", 200).extract(picture)
     assert found.descriptors.shape == (len(found), 128)
     assert found.descriptors.dtype == found.keypoints_px.dtype == np.float32
     assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-5)
@@ -43,7 +43,7 @@ def test_descriptors_have_unit_norm_and_the_strongest_come_first(picture):
 
 
 def test_the_same_picture_gives_the_same_features(picture):
-    first, second = (extractor.create("rootsift", 200).extract(picture) for _ in range(2))
+    first, second = (extractors.create("rootsift", 200).extract(picture) for _ in range(2))
     assert np.array_equal(first.keypoints_px, second.keypoints_px)
     assert np.array_equal(first.descriptors, second.descriptors)
 
@@ -51,12 +51,12 @@ def test_the_same_picture_gives_the_same_features(picture):
 def test_key_points_count_from_the_centre_of_the_first_pixel():
     image = np.zeros((101, 101), np.uint8)
     cv2.circle(image, (50, 50), 8, 255, -1)
-    found = extractor.create("rootsift", 10).extract(cv2.GaussianBlur(image, None, 1.5))
+    found = extractors.create("rootsift", 10).extract(cv2.GaussianBlur(image, None, 1.5))
     assert np.linalg.norm(found.keypoints_px[0] - [50, 50]) < 0.1
 
 
 def test_a_picture_without_texture_has_no_features():
-    found = extractor.create("rootsift").extract(np.full((480, 640), 128, np.uint8))
+    found = extractors.create("rootsift").extract(np.full((480, 640), 128, np.uint8))
     assert len(found) == 0 and found.descriptors.shape == (0, 128)
 
 
@@ -75,16 +75,16 @@ def test_an_empty_histogram_stays_finite():
 )
 def test_images_of_another_kind_are_refused(image):
     with pytest.raises(FeatureError, match="grey uint8 image"):
-        extractor.create("rootsift").extract(image)
+        extractors.create("rootsift").extract(image)
 
 
 def test_unknown_extractors_are_refused_by_name_with_the_known_ones():
     with pytest.raises(FeatureError, match=r"'surf' \(known: .*rootsift"):
-        extractor.create("surf")
-    assert "rootsift" in extractor.names()
+        extractors.create("surf")
+    assert "rootsift" in extractors.names()
 
 
 def test_the_model_is_told_apart_by_its_hash():
-    first = extractor.create("rootsift", 100)
-    assert first.sha256 == extractor.create("rootsift", 200).sha256
+    first = extractors.create("rootsift", 100)
+    assert first.sha256 == extractors.create("rootsift", 200).sha256
     assert len(first.sha256) == 64 and first.dimension == 128

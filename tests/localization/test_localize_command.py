@@ -14,7 +14,7 @@ import pytest
 
 from ground_station import cli
 from ground_station.errors import InputError
-from ground_station.features.extractor import create
+from ground_station.features.extractors import create
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
 from ground_station.localization import command

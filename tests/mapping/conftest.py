@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from ground_station.features import extractor
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
@@ -125,7 +124,7 @@ def use_scene(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     """Registers an extractor that gives the features of a scene."""
 
     def use(scene: Scene) -> None:
-        monkeypatch.setitem(extractor._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
+        monkeypatch.setitem(extractors._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
 
     return use
 
@@ -136,6 +135,6 @@ def built(tmp_path_factory: pytest.TempPathFactory, scene_settings: MappingSetti
     scene = make_scene()
     folder = tmp_path_factory.mktemp("built") / "room"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(extractor._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
+        patch.setitem(extractors._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
         map_ = build.build_map(scene.frames(), scene.camera, scene_settings, folder)
     return Built(scene, scene_settings, map_, folder)

@@ -11,7 +11,7 @@ from ground_station.simulator import scenes
 from ground_station.simulator.dynamics import GRAVITY_M_S2, Blimp, BlimpState, fly, step
 from ground_station.simulator.handheld import carry
 from ground_station.simulator.plans import Plan, Reference, plan_named
-from ground_station.simulator.scenes import Scene, SimulatorError
+from ground_station.simulator.scene import Scene, SimulatorError
 
 DT_S = 1 / 200
 
