@@ -7,7 +7,6 @@ import sys
 import threading
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import tomli_w
@@ -67,12 +66,7 @@ class FirmwareProcess:
             said = next((line for line in reversed(self._lines) if line), "nothing")
             raise FirmwareError(f"the firmware ended with status {status}: {said}")
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         assert self._process is not None and self._reader is not None
         if self._process.poll() is None:
             self._process.terminate()

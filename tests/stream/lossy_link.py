@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import socket
 import threading
-from types import TracebackType
 
 
 class LossyLink:
@@ -28,12 +27,7 @@ class LossyLink:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closing.set()
         self._thread.join()
         self._socket.close()
