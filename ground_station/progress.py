@@ -19,9 +19,13 @@ class Progress:
         terminal = sys.stderr.isatty()
         self._bar = tqdm(total=total, desc=label, leave=False) if terminal else None
 
-    def step(self) -> None:
-        """One more is done."""
+    def step(self, total: int | None = None) -> None:
+        """One more is done; `total` where it is known only now."""
         self._done += 1
+        if total is not None and self._total is None:
+            self._total = total
+            if self._bar is not None:
+                self._bar.total = total
         if self._bar is not None:
             self._bar.update()
         elif time.monotonic() - self._said_s >= _LINE_EVERY_S:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +62,9 @@ def run(args: argparse.Namespace) -> int:
     print(_heading(result, len(estimate), len(truth), args))
     print(table(result, [args.align] if args.align else list(ate.ALIGNMENTS)))
     if args.json:
-        _write_text(args.json, json.dumps(_document(result, estimate, truth, args), indent=2))
+        from ground_station.files import write_json
+
+        write_json(args.json, _document(result, estimate, truth, args))
     if args.plot:
         from ground_station.evaluation import plots
 
@@ -146,14 +147,3 @@ def _document(
             for (metres, degrees), share in zip(ate.THRESHOLDS, within, strict=True)
         ],
     }
-
-
-def _write_text(path: Path, text: str) -> None:
-    from ground_station.errors import GroundStationError
-
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None

@@ -18,9 +18,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
-from ground_station.errors import GroundStationError
 from ground_station.evaluation.ate import Evaluation
 from ground_station.evaluation.floorplan import FloorPlan
+from ground_station.files import write_bytes
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 
@@ -171,13 +171,7 @@ def png(figure: Figure) -> bytes:
 
 def write_png(figure: Figure, path: str | Path) -> None:
     """Writes the figure as a PNG file, beside and renamed."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(png(figure))
-        part.replace(path)
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None
+    write_bytes(path, png(figure))
 
 
 def _figure(rows: int, size_inches: tuple[float, float], dress: Dress) -> tuple[Figure, list[Axes]]:

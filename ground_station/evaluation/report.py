@@ -21,6 +21,7 @@ from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
 from ground_station.evaluation.floorplan import load_floorplan
 from ground_station.evaluation.text import columns
+from ground_station.files import write_text
 from ground_station.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -152,12 +153,7 @@ def write_report(path: str | Path, data: ReportData) -> None:
         settings=_flat(data.settings),
         legend=_LEGEND,
     )
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None
+    write_text(path, page)
 
 
 def summary_table(data: ReportData) -> str:

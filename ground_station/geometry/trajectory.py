@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import GeometryError
+from ground_station.files import write_text
 from ground_station.geometry import poses
 
 Array = npt.NDArray[np.float64]
@@ -117,20 +118,14 @@ def read_tum(path: str | Path) -> Trajectory:
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Writes a TUM text file, beside and renamed."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("w", encoding="ascii") as file:
-            file.write("# timestamp tx ty tz qx qy qz qw\n")
-            for time_ns, p, q in zip(
-                trajectory.time_ns.tolist(),
-                trajectory.position_m,
-                trajectory.quaternion_xyzw,
-                strict=True,
-            ):
-                sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
-                numbers = " ".join(f"{value:.9f}" for value in (*p, *q))
-                file.write(f"{sign}{s}.{ns:09d} {numbers}\n")
-        part.replace(path)
-    except OSError as error:
-        raise GeometryError(f"{path}: {error.strerror or error}") from None
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time_ns, p, q in zip(
+        trajectory.time_ns.tolist(),
+        trajectory.position_m,
+        trajectory.quaternion_xyzw,
+        strict=True,
+    ):
+        sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
+        numbers = " ".join(f"{value:.9f}" for value in (*p, *q))
+        lines.append(f"{sign}{s}.{ns:09d} {numbers}")
+    write_text(path, "\n".join(lines) + "\n")

@@ -74,10 +74,11 @@ def run(args: argparse.Namespace) -> int:
 
     from ground_station.errors import InputError
     from ground_station.features.extractors import create
+    from ground_station.files import write_json
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.trajectory import read_tum
     from ground_station.localization.localizer import LocalizationError, Localizer
-    from ground_station.localization.results import write_estimates, write_json
+    from ground_station.localization.results import summary, write_estimates
     from ground_station.mapping import store
     from ground_station.recording.open import open_input, parse_range
 
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
             "preset": "" if args.settings else args.preset,
             "interrupted": interrupted,
         }
-        write_json(args.json, estimates, elapsed_s, settings, about)
+        write_json(args.json, about | summary(estimates, elapsed_s, settings))
     localized = sum(estimate.localized for estimate in estimates)
     gated = sum(estimate.gated for estimate in estimates)
     print(

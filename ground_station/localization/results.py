@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ground_station.errors import InputError
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.settings import LocalizerSettings
@@ -44,7 +42,7 @@ def summary(
     percentile; `latency_ms` is a frame's time from picture to pose, gated frames aside.
     """
     worked = [e for e in estimates if not e.gated]
-    stages = sorted({stage for e in estimates for stage in e.stage_ms})
+    stages = dict.fromkeys(stage for e in estimates for stage in e.stage_ms)
     spans = {s: percentiles([e.stage_ms[s] for e in worked if s in e.stage_ms]) for s in stages}
     return {
         "frames": {
@@ -62,21 +60,3 @@ def summary(
         "seed": settings.seed,
         "settings": asdict(settings),
     }
-
-
-def write_json(
-    path: str | Path,
-    estimates: Sequence[PoseEstimate],
-    elapsed_s: float,
-    settings: LocalizerSettings,
-    about: Mapping[str, Any],
-) -> None:
-    """Writes `about` and the `summary`, beside and renamed; raises `InputError` with one line."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    document = {**about, **summary(estimates, elapsed_s, settings)}
-    try:
-        part.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ground_station.errors import CameraError, InputError, MapError
+from ground_station.files import write_json
 
 if TYPE_CHECKING:
     from ground_station.geometry.camera import Camera
@@ -107,7 +107,8 @@ def _build(args: argparse.Namespace) -> int:
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)
     _print_table(_describe(map_))
-    _write_json(args.json, _describe(map_))
+    if args.json:
+        write_json(args.json, _describe(map_))
     return 0
 
 
@@ -196,7 +197,8 @@ def _register(args: argparse.Namespace) -> int:
         print(f"\n{'point':<24} {'residual_m':>10} {'held out_m':>10}")
         for name, residual, left in rows:
             print(f"{name:<24} {residual:>10.4f} {left:>10.4f}")
-    _write_json(args.json, found.report)
+    if args.json:
+        write_json(args.json, found.report)
     return 0
 
 
@@ -205,7 +207,8 @@ def _info(args: argparse.Namespace) -> int:
 
     document = _describe(load(args.map))
     _print_table(document)
-    _write_json(args.json, document)
+    if args.json:
+        write_json(args.json, document)
     return 0
 
 
@@ -252,15 +255,3 @@ def _print_table(document: dict[str, Any]) -> None:
         elif isinstance(value, list):
             value = ", ".join(map(str, value))
         print(f"{name:<28} {value}")
-
-
-def _write_json(path: str | None, document: dict[str, Any]) -> None:
-    if path is None:
-        return
-    target = Path(path)
-    part = target.with_name(target.name + ".part")
-    try:
-        part.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-        part.replace(target)
-    except OSError as error:
-        raise MapError(f"{path}: {error.strerror or error}") from None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ground_station.errors import InputError
 from ground_station.evaluation.report import summary_table, write_report
+from ground_station.files import write_json
 from ground_station.localization.settings import load_preset
 from ground_station.mapping.build import build_map
 from ground_station.mapping.register import register_map
@@ -74,7 +75,7 @@ def run(out: Path, *, preset: str, init: str, sample: Path = SAMPLE) -> int:
         "bounds": [asdict(bound) | {"met": bound.met} for bound in data.bounds],
         "simulated": True,
     }
-    flight_report.write_results(out / "results.json", document)
+    write_json(out / "results.json", document)
     write_report(out / "report.html", data)
     print(summary_table(data))
     print(f"\n{out / 'report.html'}\n{out / 'results.json'}")

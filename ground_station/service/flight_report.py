@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.errors import GroundStationError
 from ground_station.evaluation.report import Bound, MatchPicture, ReportData, draw_matches
 from ground_station.geometry import poses
 from ground_station.mapping.store import Map
@@ -45,7 +42,10 @@ def report_data(
         bounds=list(bounds),
         frames=accounts,
         ate=document["ate"] or {},
-        stage_ms=document["stage_ms"],
+        stage_ms={
+            stage: {"p50": p50, "p99": document["stage_p99_ms"][stage]}
+            for stage, p50 in document["stage_ms"].items()
+        },
         latency_ms=document["latency_ms"] or None,
         rate_hz=document["rate_hz"],
         truth=_within(result),
@@ -107,24 +107,6 @@ def judge(result: ReplayResult, limits: dict[str, float]) -> list[Bound]:
     return [
         Bound(name, values[name][0], limit, *values[name][1:]) for name, limit in limits.items()
     ]
-
-
-def write_results(path: Path, document: dict[str, Any]) -> None:
-    """Writes results.json, beside and renamed; a number that is not finite becomes null."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(json.dumps(_finite(document), indent=2) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _within(result: ReplayResult) -> Any:

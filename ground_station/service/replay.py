@@ -8,13 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
 from ground_station.features import extractors
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization import results
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping import store
@@ -65,20 +64,7 @@ class ReplayResult:
     @property
     def estimate(self) -> Trajectory:
         """The localized frames' poses, by capture time."""
-        found = [
-            (frame.estimate.time_ns, frame.estimate.wTc)
-            for frame in self.live.frames
-            if frame.estimate.wTc is not None
-        ]
-        return Trajectory.from_poses([time for time, _ in found], np.array([T for _, T in found]))
-
-    def stage_ms(self) -> dict[str, dict[str, float]]:
-        """Median and 99th percentile of each stage that ran, milliseconds."""
-        stages: dict[str, list[float]] = {}
-        for frame in self.live.frames:
-            for name, value in frame.estimate.stage_ms.items():
-                stages.setdefault(name, []).append(value)
-        return {name: percentiles(values) for name, values in stages.items()}
+        return results.trajectory([frame.estimate for frame in self.live.frames])
 
     def document(self) -> dict[str, Any]:
         """The result as results.json holds it."""
@@ -92,33 +78,20 @@ class ReplayResult:
                 {"position_m": m, "rotation_deg": deg, "share": share}
                 for (m, deg), share in zip(ate.THRESHOLDS, shares, strict=True)
             ]
-        states: dict[str, int] = {}
-        for frame in self.live.frames:
-            name = frame.estimate.state.value
-            states[name] = states.get(name, 0) + 1
+        estimates = [frame.estimate for frame in self.live.frames]
         return {
             "recording": self.settings.recording.name,
-            "frames": self.live.accounts(),
-            "complete": self.live.complete,
-            "states": states,
-            "ate": self.evaluation.ate() if self.evaluation else None,
-            "shares": within,
-            "stage_ms": self.stage_ms(),
-            "latency_ms": percentiles(latency.tolist()),
-            "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,
-            "stream": asdict(self.live.stream),
             "preset": self.settings.preset,
             "init": self.settings.init,
-            "seed": self.localizer.seed,
-            "settings": asdict(self.localizer),
+            **results.summary(estimates, span_s, self.localizer),
+            "frames": self.live.accounts(),
+            "complete": self.live.complete,
+            "ate": self.evaluation.ate() if self.evaluation else None,
+            "shares": within,
+            "latency_ms": results.percentiles(latency.tolist()),
+            "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,
+            "stream": asdict(self.live.stream),
         }
-
-
-def percentiles(values: list[float]) -> dict[str, float]:
-    """`p50` and `p99` of some numbers; an empty list gives an empty table."""
-    if not values:
-        return {}
-    return {"p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99))}
 
 
 def replay(

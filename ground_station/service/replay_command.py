@@ -63,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     from ground_station.evaluation.report import summary_table, write_report
+    from ground_station.files import write_json
     from ground_station.localization.settings import load_preset
     from ground_station.mapping import store
     from ground_station.service import flight_report
@@ -91,9 +92,9 @@ def _replay(args: argparse.Namespace) -> int:
         floorplan=plan if plan.is_file() else None,
         seeds={"localizer": result.localizer.seed},
     )
-    flight_report.write_results(args.out / "results.json", result.document())
+    write_json(args.out / "results.json", result.document())
     if args.json:
-        flight_report.write_results(args.json, result.document())
+        write_json(args.json, result.document())
     write_report(args.out / "report.html", data)
     print(summary_table(data))
     print(f"\n{args.out / 'report.html'}")

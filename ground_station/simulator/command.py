@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,19 +44,22 @@ def run(args: argparse.Namespace) -> int:
     if args.sample is not None:
         from ground_station.simulator.sample import make_sample
 
-        made = make_sample(args.sample, Reporter)
+        made = make_sample(args.sample)
         for path in made:
             print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
         return 0
     if args.out is None:
         raise SimulatorError("--out is missing: the recording to write, such as out/flight.mcap")
 
+    from ground_station.progress import Progress
     from ground_station.simulator.simulate import simulate
 
     settings = settings_from(args)
-    with Reporter(args.out.name) as report:
-        result = simulate(settings, report)
+    with Progress(f"{args.out.name}, frames", None) as progress:
+        result = simulate(settings, lambda done, total: progress.step(total))
     if args.json is not None:
+        from ground_station.files import write_json
+
         write_json(args.json, result.as_dict())
     print(
         f"{result.out}: {result.frames} frames, {result.duration_s:g} s,"
@@ -81,41 +81,3 @@ def settings_from(args: argparse.Namespace) -> SimulationSettings:
         duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
         bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points,
     )  # fmt: skip
-
-
-def write_json(path: Path, document: dict[str, object]) -> None:
-    """Writes JSON, beside and renamed; raises `SimulatorError`."""
-    from ground_station.simulator.scene import SimulatorError
-
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise SimulatorError(f"{path}: {error.strerror or error}") from None
-
-
-class Reporter:
-    """Progress on standard error: a bar on a terminal, else a line every ten seconds."""
-
-    def __init__(self, title: str) -> None:
-        from tqdm import tqdm
-
-        self._title, self._last = title, time.monotonic()
-        self._bar = tqdm(desc=title, unit="frame", disable=None) if sys.stderr.isatty() else None
-
-    def __enter__(self) -> Reporter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, done: int, total: int) -> None:
-        """Says that `done` of `total` frames are taken."""
-        if self._bar is not None:
-            self._bar.total = total
-            self._bar.update(done - self._bar.n)
-        elif done == total or time.monotonic() - self._last >= 10:
-            self._last = time.monotonic()
-            print(f"{self._title}: {done} of {total} frames", file=sys.stderr, flush=True)

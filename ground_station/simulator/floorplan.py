@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from ground_station.files import write_bytes
 from ground_station.simulator.scene import Footprint, Scene, SimulatorError
 
 _RESOLUTION_M = 0.025
@@ -80,9 +81,8 @@ def write_floorplan(folder: str | Path, scene: Scene) -> list[Path]:
             ("floorplan.png", png.tobytes()),
             ("floorplan.yaml", yaml.safe_dump(document, sort_keys=False).encode()),
         ):
-            part = folder / (name + ".part")
-            part.write_bytes(data)
-            made.append(part.replace(folder / name))
+            write_bytes(folder / name, data)
+            made.append(folder / name)
     except OSError as error:
         raise SimulatorError(f"{folder}: {error.strerror or error}") from None
     return made

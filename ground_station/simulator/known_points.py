@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.files import write_text
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.simulator.motion import Motion
@@ -170,7 +171,7 @@ def _spread(candidates: list[int], position: Array, count: int) -> list[int]:
 
 
 def write_pairs(path: Path, sights: Sequence[Sight]) -> None:
-    """Writes PAIRS.csv, beside and renamed; raises `SimulatorError`."""
+    """Writes PAIRS.csv, beside and renamed."""
     lines = ["point,image,u_px,v_px,x_m,y_m,z_m"]
     for s in sights:
         x, y, z = s.point.position_m
@@ -178,9 +179,4 @@ def write_pairs(path: Path, sights: Sequence[Sight]) -> None:
         lines.append(
             f"{s.point.name},{frame_name(s.frame)},{u:.2f},{v:.2f},{x:.4f},{y:.4f},{z:.4f}"
         )
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text("\n".join(lines) + "\n", encoding="ascii")
-        part.replace(path)
-    except OSError as error:
-        raise SimulatorError(f"{path}: {error.strerror or error}") from None
+    write_text(path, "\n".join(lines) + "\n")

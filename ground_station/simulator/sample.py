@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
+from ground_station.progress import Progress
 from ground_station.simulator import scenes
 from ground_station.simulator.floorplan import write_floorplan
 from ground_station.simulator.scene import SimulatorError
@@ -29,19 +27,17 @@ def sample_settings(folder: Path) -> tuple[SimulationSettings, SimulationSetting
     return mapping, flight
 
 
-def make_sample(
-    folder: str | Path, reporter: Callable[[str], AbstractContextManager[Any]]
-) -> list[Path]:
+def make_sample(folder: str | Path) -> list[Path]:
     """Writes the sample into a folder from fixed seeds; returns the files.
 
-    `reporter` opens a progress report for a file's name. Raises `SimulatorError` when a flight was
+    Raises `SimulatorError` when a flight was
     interrupted or a file is larger than what the repository takes.
     """
     folder = Path(folder)
     made = []
     for settings in sample_settings(folder):
-        with reporter(settings.out.name) as report:
-            result = simulate(settings, report)
+        with Progress(f"{settings.out.name}, frames", None) as progress:
+            result = simulate(settings, lambda done, total: progress.step(total))
         if result.interrupted:
             raise SimulatorError(f"interrupted: {settings.out} is shorter than the sample's")
         if result.bytes > MAX_FILE_BYTES:

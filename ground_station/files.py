@@ -1,0 +1,39 @@
+"""Writing files so that a killed program leaves the old one whole: beside, then renamed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import GroundStationError
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(data)
+        part.replace(path)
+    except OSError as error:
+        raise GroundStationError(f"{path}: {error.strerror or error}") from None
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file in UTF-8, as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: str | Path, document: Any) -> None:
+    """Writes a document as JSON; a number that is not finite becomes null, which JSON can say."""
+    write_text(path, json.dumps(_finite(document), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
