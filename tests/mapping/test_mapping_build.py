@@ -184,7 +184,9 @@ def test_recordings_beside_a_map_outlive_its_rebuilding(built, use_scene, tmp_pa
 
 
 _BLOCKED = """
-import sys
+import signal, sys
+# A suite that runs in the background inherits an ignored SIGINT; a person's shell does not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from pathlib import Path
 import numpy as np
 from ground_station.geometry.camera import Camera
