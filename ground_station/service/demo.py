@@ -70,7 +70,7 @@ def run(out: Path, *, preset: str, init: str, sample: Path = SAMPLE) -> int:
         seeds=seeds,
     )
     document = result.document() | {
-        "seed": seeds,
+        "seeds": seeds,
         "map": {"build_s": map_s, **map_.info.built, "registration": map_.info.registration},
         "bounds": [asdict(bound) | {"met": bound.met} for bound in data.bounds],
         "simulated": True,
