@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from ground_station.localization.settings import AssociationSettings
 
@@ -14,11 +14,17 @@ Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.intp]
 
-_DENSE_SHARE = 0.006
-"""Above this share of all pairs a matrix product is cheaper than gathering rows (measured)."""
+_BAND_PX = 40.0
+"""Least height of a band of features; with twice the radius, where that is more (measured)."""
 
-_BLOCK = 4_000_000
-"""Numbers in one block of that product: 16 MB."""
+_CHUNK = 32
+"""Features of a band in one product with the landmarks around them (measured)."""
+
+_PREFIX = 128
+"""Components that are compared before all are: half the work with descriptors of 256."""
+
+_SLACK = 1e-4
+"""Of the bound on the cosine, for float32's rounding."""
 
 
 @dataclass(frozen=True)
@@ -54,43 +60,86 @@ def associate(
     empty = np.empty(0, np.intp)
     if not len(feature_px) or not len(candidate_px):
         return Associations(empty, empty, np.empty(0, np.float32))
-    pairs = cKDTree(feature_px).sparse_distance_matrix(
-        cKDTree(candidate_px), radius, output_type="ndarray"
+    # A second landmark farther off than this can neither win nor spoil a winner's ratio.
+    farthest = min(settings.max_descriptor_distance / settings.max_ratio, 2.0)
+    feature, candidate = _near_in_both(
+        feature_px,
+        _bounding(feature_descriptors),
+        candidate_px,
+        _bounding(candidate_descriptors),
+        radius,
+        1.0 - 0.5 * farthest**2 - _SLACK,
     )
-    feature, candidate = pairs["i"], pairs["j"]
-    distance = _distances(feature_descriptors, candidate_descriptors, feature, candidate)
-    nearest = np.full(len(feature_px), np.inf, np.float32)
-    np.minimum.at(nearest, feature, distance)
-    wins = (distance == nearest[feature]) & (distance < settings.max_descriptor_distance)
-    rows = _first_of_each(feature, candidate, np.flatnonzero(wins))
+    apart = feature_descriptors[feature] - candidate_descriptors[candidate]
+    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart)).astype(np.float32)
+    order = np.lexsort((candidate, distance, feature))
+    feature, candidate, distance = feature[order], candidate[order], distance[order]
+    new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
+    wins = new & (distance < settings.max_descriptor_distance)
     if settings.max_ratio < 1.0:
-        others = np.ones(len(feature), bool)
-        others[rows] = False
-        second = np.full(len(feature_px), np.inf, np.float32)
-        np.minimum.at(second, feature[others], distance[others])
-        rows = rows[distance[rows] <= settings.max_ratio * second[feature[rows]]]
+        second = np.full(len(distance), np.inf, np.float32)
+        second[:-1] = np.where(new[1:], np.inf, distance[1:])
+        wins &= distance <= settings.max_ratio * second
+    rows = np.flatnonzero(wins)
     rows = rows[np.argsort(distance[rows], kind="stable")]
     _, kept = np.unique(candidate[rows], return_index=True)
-    rows = rows[kept]
-    rows = rows[np.argsort(feature[rows])]
+    rows = np.sort(rows[kept])
     return Associations(feature[rows], candidate[rows], distance[rows])
 
 
-def _first_of_each(feature: Indices, candidate: Indices, rows: Indices) -> Indices:
-    """Of rows, one for each feature, sorted by feature: that of the lowest candidate in a tie."""
-    rows = rows[np.lexsort((candidate[rows], feature[rows]))]
-    _, first = np.unique(feature[rows], return_index=True)
-    return rows[first]
+def _bounding(descriptors: F32) -> F32:
+    """Shorter rows whose products are no smaller than those of the descriptors (N, D) themselves.
+
+    The first components, then the norm of those left out: what these add to a product is at most
+    the product of their norms (Cauchy and Schwarz).
+    """
+    rows = np.asarray(descriptors, np.float32)
+    if rows.shape[1] <= _PREFIX:
+        return rows
+    rest = rows[:, _PREFIX:]
+    norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
+    return np.concatenate([rows[:, :_PREFIX], norm[:, None]], axis=1)
 
 
-def _distances(a: F32, b: F32, i: Indices, j: Indices) -> F32:
-    """L2 distances of unit rows a[i] and b[j], (N,): ‖a − b‖² = 2 − 2 a·b."""
-    if len(i) > _DENSE_SHARE * len(a) * len(b):
-        cosine = np.empty(len(i), np.float32)
-        rows = max(1, _BLOCK // len(b))
-        for start in range(0, len(a), rows):
-            here = np.flatnonzero((i >= start) & (i < start + rows))
-            cosine[here] = (a[start : start + rows] @ b.T)[i[here] - start, j[here]]
-    else:
-        cosine = np.einsum("ij,ij->i", a[i], b[j])
-    return np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).astype(np.float32)
+def _near_in_both(
+    feature_px: Array,
+    feature_rows: F32,
+    candidate_px: Array,
+    candidate_rows: F32,
+    radius_px: float,
+    least_product: float,
+) -> tuple[Indices, Indices]:
+    """The pairs within a radius whose rows' product is large enough, in no order.
+
+    Features are cut into bands of y and chunks of x. The landmarks around a chunk are consecutive
+    in its band's order of x, so that each chunk is one small matrix product: far cheaper than all
+    products, and than gathering two rows for each pair.
+    """
+    height = max(2 * radius_px, _BAND_PX)
+    band = np.floor(feature_px[:, 1] / height)
+    features = np.lexsort((feature_px[:, 0], band))
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(band[features])) + 1, [len(features)]])
+    by_x = np.argsort(candidate_px[:, 0])
+    y = candidate_px[by_x, 1]
+    pairs: list[tuple[Indices, Indices]] = []
+    for begin, end in itertools.pairwise(edges.tolist()):
+        top = band[features[begin]] * height
+        around = by_x[(y >= top - radius_px) & (y <= top + height + radius_px)]
+        mine = features[begin:end]
+        x, xs = feature_px[mine, 0], candidate_px[around, 0]
+        A, B = feature_rows[mine], candidate_rows[around]
+        starts = np.arange(0, len(mine), _CHUNK)
+        stops = np.minimum(starts + _CHUNK, len(mine))
+        lefts = np.searchsorted(xs, x[starts] - radius_px, "left")
+        rights = np.searchsorted(xs, x[stops - 1] + radius_px, "right")
+        for start, stop, left, right in zip(
+            starts.tolist(), stops.tolist(), lefts.tolist(), rights.tolist(), strict=True
+        ):
+            product = B[left:right] @ A[start:stop].T
+            flat = np.flatnonzero(product >= least_product)
+            row, column = np.divmod(flat, stop - start)
+            pairs.append((mine[start + column], around[left + row]))
+    feature, candidate = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    offset = feature_px[feature] - candidate_px[candidate]
+    near = np.einsum("ij,ij->i", offset, offset) <= radius_px**2
+    return feature[near], candidate[near]

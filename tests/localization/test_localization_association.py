@@ -1,0 +1,100 @@
+"""Association on bands and chunks finds what comparing everything with everything finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ground_station.localization.association import associate
+from ground_station.localization.settings import AssociationSettings
+
+
+def _unit(rng, count, dimension, lean=0.0):
+    rows = rng.normal(size=(count, dimension)) + lean
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _by_brute_force(fp, fd, lp, ld, options, radius):
+    """Every distance in double precision; of equals the lowest index wins."""
+    apart = np.sqrt(((fp[:, None] - lp[None]) ** 2).sum(axis=2))
+    distance = np.sqrt(((fd[:, None].astype(float) - ld[None]) ** 2).sum(axis=2))
+    distance[apart > radius] = np.inf
+    best = {}
+    for i, row in enumerate(distance):
+        j = int(np.argmin(row))
+        if row[j] >= options.max_descriptor_distance:
+            continue
+        if options.max_ratio < 1 and row[j] > options.max_ratio * np.delete(row, j).min(initial=9):
+            continue
+        if j not in best or row[j] < best[j][0]:
+            best[j] = (row[j], i)
+    return sorted((i, j) for j, (_, i) in best.items())
+
+
+def _pairs(found):
+    return list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 10_000),
+    features=st.integers(1, 120),
+    landmarks=st.integers(1, 200),
+    dimension=st.sampled_from([16, 128, 256]),
+    radius=st.sampled_from([3.0, 40.0, 150.0, 2000.0]),
+    ratio=st.sampled_from([1.0, 0.9, 0.5]),
+    lean=st.sampled_from([0.0, 1.0]),
+)
+def test_the_pairs_are_those_of_all_distances(
+    seed, features, landmarks, dimension, radius, ratio, lean
+):
+    rng = np.random.default_rng(seed)
+    lp = rng.uniform(-100, 700, (landmarks, 2))
+    # Some features have no landmark at all; some landmarks are wanted by several features.
+    ld = _unit(rng, landmarks, dimension, lean)
+    own = rng.integers(0, landmarks, features)
+    fp = lp[own] + rng.normal(0, 0.5 * radius, (features, 2))
+    fd = ld[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (features, dimension))
+    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
+    options = AssociationSettings(max_ratio=ratio)
+    found = associate(fp, fd, lp, ld, options, radius)
+    assert _pairs(found) == _by_brute_force(fp, fd, lp, ld, options, radius)
+    if len(found):
+        apart = np.linalg.norm(fd[found.feature] - ld[found.candidate], axis=1)
+        assert np.allclose(found.distance, apart, atol=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [32, 256])
+def test_of_equal_landmarks_the_first_is_taken_and_none_stands_out(dimension):
+    rng = np.random.default_rng(5)
+    row = _unit(rng, 1, dimension)
+    lp = np.array([[300.0, 200.0], [310.0, 210.0], [290.0, 190.0], [600.0, 20.0]])
+    ld = np.repeat(row, 4, axis=0)
+    fp, fd = np.array([[301.0, 201.0]]), row.copy()
+    assert _pairs(associate(fp, fd, lp, ld, AssociationSettings())) == [(0, 0)]
+    assert _pairs(associate(fp, fd, lp[::-1], ld, AssociationSettings())) == [(0, 1)]
+    assert len(associate(fp, fd + 0.01, lp, ld, AssociationSettings(max_ratio=0.9))) == 0
+
+
+def test_of_equal_features_the_first_keeps_the_landmark():
+    rng = np.random.default_rng(6)
+    row = _unit(rng, 1, 256)
+    fp, fd = np.array([[10.0, 10.0], [20.0, 90.0], [0.0, 0.0]]), np.repeat(row, 3, axis=0)
+    found = associate(fp, fd, np.array([[12.0, 40.0]]), row, AssociationSettings(), 100.0)
+    assert _pairs(found) == [(0, 0)]
+
+
+def test_a_landmark_at_the_radius_is_within_it_and_one_beyond_is_not():
+    row = np.eye(1, 8, dtype=np.float32)
+    at, beyond = np.array([[40.0, 0.0]]), np.array([[40.0 + 1e-9, 0.0]])
+    assert len(associate(np.zeros((1, 2)), row, at, row, AssociationSettings(), 40.0)) == 1
+    assert len(associate(np.zeros((1, 2)), row, beyond, row, AssociationSettings(), 40.0)) == 0
+
+
+def test_nothing_near_and_nothing_alike_are_no_pairs():
+    rows = np.eye(2, 200, dtype=np.float32)
+    here, there = np.zeros((1, 2)), np.full((1, 2), 400.0)
+    assert len(associate(here, rows[:1], there, rows[:1], AssociationSettings())) == 0
+    assert len(associate(here, rows[:1], here, rows[1:], AssociationSettings())) == 0
