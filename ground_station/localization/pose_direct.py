@@ -12,7 +12,7 @@ from ground_station.localization.settings import PoseSettings
 
 Array = npt.NDArray[np.float64]
 
-_STEP = 1e-6
+_STEP = 1e-5
 """Converged when the tangent step (rad, m) is shorter: far below any pose's own uncertainty."""
 
 _NEAREST_M = 1e-3
@@ -28,8 +28,9 @@ def solve_direct(
     """The pose that explains undistorted pixels (N, 2) of landmarks (N, 3), from a guess (4, 4).
 
     Each landmark's prior is marginalised to first order into the variance of its observation,
-    sigma² + (f·σ_landmark/z)². Huber's loss by reweighting, Levenberg's damping when a step would
-    raise the cost. With `reject_outliers` it is solved once more from the inliers alone.
+    sigma² + (f·σ_landmark/z)², and into the reach of Huber's loss, which is minimised by
+    reweighting; Levenberg's damping when a step would raise the cost. With `reject_outliers` it is
+    solved once more from the inliers alone.
     """
     inlier = np.ones(len(points_w), bool)
     iterations = 0
@@ -61,7 +62,7 @@ def _descend(
     depth = np.maximum(((points_w - wTc[:3, 3]) @ wTc[:3, :3])[:, 2], _NEAREST_M)
     variance = settings.sigma_px**2 + (camera.fx_px * settings.landmark_sigma_m / depth) ** 2
     observed = (points_w, pinhole_px, variance)
-    information, gradient, cost = _linearize(wTc, *observed, camera, settings.huber_k)
+    information, gradient, cost = _linearize(wTc, *observed, camera, settings)
     for iteration in range(1, settings.max_iterations + 1):
         try:
             damped = information + damping * np.diag(np.diag(information))
@@ -71,7 +72,7 @@ def _descend(
         if not np.isfinite(step).all():
             return None, information, iteration, "not finite"
         candidate = wTc @ poses.exp(step)
-        linear = _linearize(candidate, *observed, camera, settings.huber_k)
+        linear = _linearize(candidate, *observed, camera, settings)
         if linear[2] > cost * (1 + 1e-12):
             damping = max(10 * damping, 1e-4)
             if damping > 1e8:
@@ -95,27 +96,39 @@ def _linearize(
     pinhole_px: Array,
     variance_px2: Array,
     camera: Camera,
-    huber_k: float,
+    settings: PoseSettings,
 ) -> tuple[Array, Array, float]:
     """Information (6, 6), gradient (6,) and Huber cost at a pose, right tangent, rotation first."""
-    points = (points_w - wTc[:3, 3]) @ wTc[:3, :3]
-    front = points[:, 2] > _NEAREST_M
-    x, y, z = points[front].T
-    variance = variance_px2[front]
+    huber_k, sigma_px = settings.huber_k, settings.sigma_px
+    points = wTc[:3, :3].T @ (points_w - wTc[:3, 3]).T
+    observed, variance, behind = pinhole_px.T, variance_px2, 0
+    front = points[2] > _NEAREST_M
+    if not front.all():
+        points, observed, variance = points[:, front], observed[:, front], variance[front]
+        behind = len(front) - points.shape[1]
     fx, fy = camera.fx_px, camera.fy_px
-    u, v, zero = x / z, y / z, np.zeros_like(z)
-    r = np.stack([fx * u + camera.cx_px, fy * v + camera.cy_px]) - pinhole_px[front].T
-    # The pinhole's derivative times ∂p_c/∂ξ = [hat(p_c), −I]: rows of u, rows of v, (2, N, 6).
-    J = np.stack(
-        [
-            fx * np.stack([u * v, -1 - u * u, v, -1 / z, zero, u / z], axis=1),
-            fy * np.stack([1 + v * v, -u * v, -u, zero, -1 / z, v / z], axis=1),
-        ]
-    )
+    inverse_z = 1.0 / points[2]
+    u, v = points[0] * inverse_z, points[1] * inverse_z
+    r = np.stack([fx * u + (camera.cx_px - observed[0]), fy * v + (camera.cy_px - observed[1])])
     norm = np.sqrt((r * r).sum(axis=0) / variance)
-    weight = np.where(norm <= huber_k, 1.0, huber_k / np.maximum(norm, huber_k)) / variance
-    cost = np.where(norm <= huber_k, 0.5 * norm**2, huber_k * (norm - 0.5 * huber_k)).sum()
-    cost += (len(front) - len(z)) * _BEHIND_COST
-    root = np.sqrt(weight)
-    A = (J * root[:, None]).reshape(-1, 6)
-    return A.T @ A, A.T @ (r * root).ravel(), float(cost)
+    # Huber on what is left of a residual when its landmark has moved: the quadratic part reaches
+    # as far as the noise of the pixel alone allows.
+    limit = huber_k * np.sqrt(variance) / sigma_px
+    clipped = np.minimum(norm, limit)
+    cost = float((clipped * (norm - 0.5 * clipped)).sum()) + behind * _BEHIND_COST
+    root = np.sqrt(limit / np.maximum(norm, limit) / variance)
+    # The pinhole's derivative times ∂p_c/∂ξ = [hat(p_c), −I], weighted: (6, 2, N).
+    J = np.zeros((6, 2, len(u)))
+    x, y = fx * root, fy * root
+    np.multiply(x, u * v, out=J[0, 0])
+    np.multiply(-x, 1 + u * u, out=J[1, 0])
+    np.multiply(x, v, out=J[2, 0])
+    np.multiply(-x, inverse_z, out=J[3, 0])
+    np.multiply(-J[3, 0], u, out=J[5, 0])
+    np.multiply(y, 1 + v * v, out=J[0, 1])
+    np.multiply(-y, u * v, out=J[1, 1])
+    np.multiply(-y, u, out=J[2, 1])
+    np.multiply(-y, inverse_z, out=J[4, 1])
+    np.multiply(-J[4, 1], v, out=J[5, 1])
+    A = J.reshape(6, -1)
+    return A @ A.T, A @ (r * root).ravel(), cost
