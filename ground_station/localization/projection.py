@@ -15,7 +15,7 @@ from ground_station.mapping.store import Landmarks
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-_NEAREST_M = 0.05
+NEAREST_M = 0.05
 """Nearer than this a landmark has no useful projection."""
 
 
@@ -55,17 +55,24 @@ class Lens:
 
 
 def project(
-    landmarks: Landmarks, wTc: npt.ArrayLike, lens: Lens, settings: ProjectionSettings
+    landmarks: Landmarks,
+    wTc: npt.ArrayLike,
+    lens: Lens,
+    settings: ProjectionSettings,
+    among: Indices | None = None,
 ) -> Projected:
     """The landmarks that a camera at `wTc` (4, 4) would see.
 
     Those behind the camera or outside of its (distorted) image are dropped and, if the settings say
-    so, those looked at from outside of their viewing cone (Alcantarilla et al., ICRA 2010).
+    so, those looked at from outside of their viewing cone (Alcantarilla et al., ICRA 2010). Only
+    landmarks `among` (N,) are looked at, where given: those of `visibility.LandmarkIndex`.
     """
     cTw = poses.inverse(wTc)
-    points = landmarks.position_m @ cTw[:3, :3].T + cTw[:3, 3]
-    index = np.flatnonzero(points[:, 2] > _NEAREST_M)
-    points = points[index]
+    position_m = landmarks.position_m if among is None else landmarks.position_m[among]
+    points = position_m @ cTw[:3, :3].T + cTw[:3, 3]
+    front = np.flatnonzero(points[:, 2] > NEAREST_M)
+    points = points[front]
+    index = front if among is None else among[front]
     normalized = points[:, :2] / points[:, 2:]
     keep = lens.inside(normalized)
     index, normalized = index[keep], normalized[keep]

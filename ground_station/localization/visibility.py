@@ -1,0 +1,106 @@
+"""Which landmarks a camera could see at all, without looking at each of a large map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.localization.projection import NEAREST_M, Lens
+from ground_station.localization.settings import ProjectionSettings
+from ground_station.mapping.store import Landmarks
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_CELL_M = 2.0
+_CELLS_A_BLOCK = 8
+"""Along each axis: blocks of 16 m keep the number of tests small in a map of 10⁶ landmarks."""
+
+_SLACK_M = 1e-4
+"""For rounding: a sphere that only touches the view counts as in it."""
+
+
+@dataclass(frozen=True)
+class _Spheres:
+    """Bounding spheres of groups of consecutive points: group k is starts[k]:starts[k + 1]."""
+
+    starts: Indices
+    centre_m: Array
+    radius_m: Array
+    farthest_m: Array
+    """The largest distance from which a keyframe saw a landmark of the group."""
+
+
+class LandmarkIndex:
+    """Landmarks in cells, cells in blocks; a block out of view costs one test for all of its."""
+
+    def __init__(self, landmarks: Landmarks, cell_m: float = _CELL_M) -> None:
+        """Takes positions as they are: landmarks that move need another index."""
+        cell = np.floor(landmarks.position_m / cell_m).astype(np.int64)
+        block = cell // _CELLS_A_BLOCK
+        keys = [*cell.T, *block.T]
+        self._order = np.lexsort(keys)
+        position_m = landmarks.position_m[self._order]
+        farthest_m = landmarks.distance_m[self._order, 1]
+        self._cells = _bound(position_m, farthest_m, cell[self._order])
+        self._blocks = _bound(position_m, farthest_m, block[self._order])
+        # Where each block's cells begin among all cells.
+        self._block_cells = np.searchsorted(self._cells.starts, self._blocks.starts)
+
+    def near(self, wTc: npt.ArrayLike, lens: Lens, settings: ProjectionSettings) -> Indices:
+        """Every landmark that `project` could keep from `wTc` (4, 4), and few others; sorted."""
+        cTw = poses.inverse(wTc)
+        blocks = _in_view(self._blocks, slice(None), cTw, lens, settings)
+        cells = _ranges(self._block_cells[blocks], self._block_cells[blocks + 1])
+        cells = cells[_in_view(self._cells, cells, cTw, lens, settings)]
+        rows = _ranges(self._cells.starts[cells], self._cells.starts[cells + 1])
+        return np.sort(self._order[rows])
+
+
+def _bound(
+    position_m: Array, farthest_m: npt.NDArray[np.float32], group: npt.NDArray[np.int64]
+) -> _Spheres:
+    """Spheres around points (M, 3) that are sorted by their group's three indices (M, 3)."""
+    if not len(position_m):
+        none = np.empty(0)
+        return _Spheres(np.zeros(1, np.intp), np.empty((0, 3)), none, none)
+    changes = np.flatnonzero((group[1:] != group[:-1]).any(axis=1)) + 1
+    begins = np.concatenate([[0], changes])
+    starts = np.append(begins, len(position_m))
+    low = np.minimum.reduceat(position_m, begins)
+    centre_m = 0.5 * (low + np.maximum.reduceat(position_m, begins))
+    offset = position_m - np.repeat(centre_m, np.diff(starts), axis=0)
+    radius_m = np.sqrt(np.maximum.reduceat(np.einsum("ij,ij->i", offset, offset), begins))
+    return _Spheres(
+        starts, centre_m, radius_m, np.maximum.reduceat(farthest_m, begins).astype(np.float64)
+    )
+
+
+def _in_view(
+    spheres: _Spheres, which: slice | Indices, cTw: Array, lens: Lens, settings: ProjectionSettings
+) -> Indices:
+    """Of the spheres `which`, the indices of those that reach into the cone around the image.
+
+    A sphere reaches into a cone of half angle θ about z when ρ·cos θ − z·sin θ is at most its
+    radius, ρ the distance of its centre from the axis; near the apex that keeps some too many.
+    """
+    centre = spheres.centre_m[which] @ cTw[:3, :3].T + cTw[:3, 3]
+    reach = spheres.radius_m[which] + _SLACK_M
+    half = np.arctan(lens.max_radius)
+    aside = np.hypot(centre[:, 0], centre[:, 1])
+    keep = aside * np.cos(half) - centre[:, 2] * np.sin(half) <= reach
+    keep &= centre[:, 2] + reach > NEAREST_M
+    if settings.viewing_cone:
+        limit = spheres.farthest_m[which] * settings.max_distance_ratio
+        keep &= np.linalg.norm(centre, axis=1) - reach <= limit
+    return np.flatnonzero(keep)
+
+
+def _ranges(begins: Indices, ends: Indices) -> Indices:
+    """The indices begins[0]..ends[0] − 1, begins[1]..ends[1] − 1, and so on, in one array."""
+    lengths = ends - begins
+    shift = begins - np.concatenate([[0], np.cumsum(lengths)[:-1]]) if len(begins) else begins
+    return np.arange(int(lengths.sum())) + np.repeat(shift, lengths)
