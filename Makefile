@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo test check lock sample
+.PHONY: help setup demo test check bench lock sample
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' Makefile
@@ -20,6 +20,10 @@ check: setup  ## Lint, formatting and types
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
+
+bench: setup  ## Measure what each step of the localizer costs, beside the preset thesis
+	@mkdir -p out
+	@$(BLIMP) bench localize --json out/bench.json
 
 sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed seeds (about 10 minutes)
 	@$(BLIMP) simulate --sample maps/atrium

@@ -15,6 +15,7 @@ COMMANDS = [
     ["localize"],
     ["replay"],
     ["evaluate"],
+    ["bench", "localize"],
 ]
 HEAVY = ("numpy", "cv2", "pycolmap", "gtsam", "mujoco", "matplotlib", "zenoh", "av", "gi", "scipy")
 

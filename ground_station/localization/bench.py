@@ -1,0 +1,257 @@
+"""What the localizer's steps cost, each beside what it is measured against, in one run."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from ground_station.features.extractors import create
+from ground_station.geometry import poses
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.association import associate
+from ground_station.localization.estimate import PoseEstimate
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.pose_direct import solve_direct
+from ground_station.localization.pose_graph import solve_graph
+from ground_station.localization.projection import Lens, project
+from ground_station.localization.settings import (
+    PRESETS,
+    AssociationSettings,
+    PoseSettings,
+    load_preset,
+)
+from ground_station.localization.visibility import LandmarkIndex
+from ground_station.mapping.store import Landmarks, Map
+from ground_station.recording.flight import FlightRecording, trajectory_of
+from ground_station.recording.frames import Frame, FrameRange
+from pi_firmware.wire.recording import TRUTH_TOPIC
+
+Array = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+Pairs = list[tuple[int, int]]
+
+_FEATURES, _LANDMARKS, _DIMENSION, _RADIUS_PX = 1000, 3000, 256, 40.0
+_OBSERVATIONS, _OUTLIERS = 400, 0.2
+_SIZE_M = 50.0
+"""Side of the square that holds the smaller map of the growth table; 3 m high."""
+
+
+def median_ms(work: Callable[[], object], repetitions: int) -> float:
+    """The median time of one call after one that warms up, in milliseconds."""
+    work()
+    spans = []
+    for _ in range(repetitions):
+        begin = time.perf_counter()
+        work()
+        spans.append(1e3 * (time.perf_counter() - begin))
+    return float(np.median(spans))
+
+
+def machine() -> dict[str, Any]:
+    """The cores this process may use, and the threads BLAS was given."""
+    return {
+        "cores": len(os.sched_getaffinity(0)),
+        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
+    }
+
+
+def association(seed: int, repetitions: int) -> dict[str, Any]:
+    """Ours and a loop of one query a feature on one tree, on the same features; do they agree?"""
+    rng = np.random.default_rng(seed)
+    landmark_px = rng.uniform(0, 1, (_LANDMARKS, 2)) * [640, 480]
+    landmark = _unit(rng.normal(size=(_LANDMARKS, _DIMENSION)))
+    own = rng.permutation(_LANDMARKS)[:_FEATURES]
+    feature_px = landmark_px[own] + rng.normal(0, 5, (_FEATURES, 2))
+    noise = rng.normal(0, 0.4 / np.sqrt(_DIMENSION), (_FEATURES, _DIMENSION))
+    feature = _unit(landmark[own] + noise)
+    settings = AssociationSettings(radius_px=_RADIUS_PX)
+    data = (feature_px, feature, landmark_px, landmark, settings)
+    found = associate(*data)
+    pairs = list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
+    ours = median_ms(lambda: associate(*data), repetitions)
+    loop = median_ms(lambda: _associate_by_loop(*data), max(3, repetitions // 4))
+    return {
+        "ours_ms": ours,
+        "loop_ms": loop,
+        "ratio": loop / ours,
+        "pairs": len(pairs),
+        "same": pairs == _associate_by_loop(*data),
+    }
+
+
+def _associate_by_loop(
+    feature_px: Array,
+    feature: F32,
+    landmark_px: Array,
+    landmark: F32,
+    settings: AssociationSettings,
+) -> Pairs:
+    tree = cKDTree(landmark_px)
+    best: dict[int, tuple[float, int]] = {}
+    for i, pixel in enumerate(feature_px):
+        near = tree.query_ball_point(pixel, settings.radius_px)
+        if not near:
+            continue
+        distance = np.linalg.norm(landmark[near] - feature[i], axis=1)
+        nearest = int(np.argmin(distance))
+        apart, j = float(distance[nearest]), near[nearest]
+        if apart < settings.max_descriptor_distance and (j not in best or apart < best[j][0]):
+            best[j] = apart, i
+    return sorted((i, j) for j, (_, i) in best.items())
+
+
+def _unit(rows: npt.NDArray[Any]) -> F32:
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
+
+
+def pose(seed: int, repetitions: int) -> dict[str, Any]:
+    """Both solvers on the same observations, landmarks as good as known; and how far apart."""
+    rng = np.random.default_rng(seed)
+    camera = THESIS_CAMERA
+    depth = rng.uniform(2, 8, _OBSERVATIONS)
+    flat = rng.uniform([-0.55, -0.42], [0.55, 0.42], (_OBSERVATIONS, 2))
+    wTc = poses.exp([0.1, -0.4, 0.2, 1.0, 2.0, 3.0])
+    points = poses.transform(wTc, np.c_[flat, np.ones(_OBSERVATIONS)] * depth[:, None])
+    pixels = flat * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+    pixels += rng.normal(0, 1, pixels.shape)
+    wrong = rng.permutation(_OBSERVATIONS)[: round(_OUTLIERS * _OBSERVATIONS)]
+    pixels[wrong] += rng.uniform(-40, 40, (len(wrong), 2))
+    guess = wTc @ poses.exp([0.02, -0.03, 0.02, 0.08, -0.05, 0.06])
+    settings = PoseSettings(sigma_px=2.0, landmark_sigma_m=1e-5)
+    data = (guess, points, pixels, camera, settings)
+    direct, graph = solve_direct(*data).wTc, solve_graph(*data).wTc
+    assert direct is not None and graph is not None
+    ours = median_ms(lambda: solve_direct(*data), repetitions)
+    theirs = median_ms(lambda: solve_graph(*data), repetitions)
+    return {
+        "direct_ms": ours,
+        "graph_ms": theirs,
+        "ratio": theirs / ours,
+        "apart_m": float(np.linalg.norm(direct[:3, 3] - graph[:3, 3])),
+    }
+
+
+def frames(map_: Map, recording: Path, count: int) -> dict[str, Any]:
+    """Every preset on the first frames of a flight, each from its true first pose, by stage.
+
+    Each frame's time is from its picture to its pose; decoding stands beside it. A stage's time is
+    its mean over all frames, whether it ran in them or not, so that stages add up to the total.
+    """
+    source = FlightRecording(recording, FrameRange(0, count))
+    truth = trajectory_of(recording, TRUTH_TOPIC, [])
+    pictures: list[Frame] = []
+    begin = time.perf_counter()
+    pictures.extend(source)
+    decode_ms = 1e3 * (time.perf_counter() - begin) / max(len(pictures), 1)
+    camera = source.camera or map_.info.camera
+    result: dict[str, Any] = {"frames": len(pictures), "decode_ms": decode_ms, "presets": {}}
+    for preset in PRESETS:
+        estimates = _fly(map_, camera, preset, pictures, truth)
+        stages = dict.fromkeys(stage for e in estimates for stage in e.stage_ms)
+        total = [e.stage_ms["total"] for e in estimates]
+        result["presets"][preset] = {
+            "localized": sum(e.localized for e in estimates),
+            "mean_ms": {
+                stage: float(sum(e.stage_ms.get(stage, 0.0) for e in estimates) / len(estimates))
+                for stage in stages
+            },
+            "p50_ms": float(np.median(total)),
+            "p99_ms": float(np.percentile(total, 99)),
+            "position_rmse_m": _rmse_m(estimates, truth),
+        }
+    means = {preset: result["presets"][preset]["mean_ms"]["total"] for preset in PRESETS}
+    result["ratio"] = means["thesis"] / means["default"]
+    return result
+
+
+def _fly(
+    map_: Map, camera: Camera, preset: str, pictures: list[Frame], truth: Trajectory
+) -> list[PoseEstimate]:
+    settings = load_preset(preset)
+    extractor = create(settings.features.extractor, settings.features.max_features)
+    localizer = Localizer(map_, camera, extractor, settings)
+    first = pictures[0].time_ns
+    localizer.set_initial_pose(truth.wTc[truth.nearest(first)], first)
+    return [localizer.process(frame.time_ns, frame.image, frame.index) for frame in pictures]
+
+
+def _rmse_m(estimates: list[PoseEstimate], truth: Trajectory) -> float:
+    """Unaligned, over the frames that were solved; NaN when none was."""
+    apart = [
+        np.linalg.norm(e.wTc[:3, 3] - truth.wTc[truth.nearest(e.time_ns), :3, 3])
+        for e in estimates
+        if e.wTc is not None
+    ]
+    return float(np.sqrt(np.mean(np.square(apart)))) if apart else float("nan")
+
+
+def growth(seed: int, repetitions: int, sizes: tuple[int, int]) -> list[dict[str, Any]]:
+    """Projection and association of a frame in a small map and in one that contains it.
+
+    The larger one goes on around the smaller with the same density, so that what is in view stays
+    the same. `plain_ms` looks at every landmark, `indexed_ms` through the index.
+    """
+    rng = np.random.default_rng(seed)
+    large = _building(rng, *sizes)
+    preset = load_preset("default")
+    camera, settings = THESIS_CAMERA, preset.projection
+    lens = Lens(camera)
+    views = []
+    for angle in rng.uniform(0, 2 * np.pi, repetitions):
+        z = np.array([np.cos(angle), np.sin(angle), 0.0])
+        R = np.stack([np.cross(z, [0, 0, 1.0]), [0, 0, -1.0], z], axis=1)
+        wTc = poses.pose(R, [*rng.uniform(-1, 1, 2), 1.5])
+        seen = project(large, wTc, lens, settings)
+        mine = rng.permutation(len(seen.landmark))[:_FEATURES]
+        noise = rng.normal(0, 0.05, (len(mine), large.descriptor.shape[1]))
+        described = _unit(large.descriptor[seen.landmark[mine]] + noise)
+        views.append((wTc, seen.pinhole_px[mine] + rng.normal(0, 3, (len(mine), 2)), described))
+    rows = []
+    for size in sizes:
+        fields = dataclasses.fields(Landmarks)
+        map_ = Landmarks(**{f.name: getattr(large, f.name)[:size] for f in fields})
+        index = LandmarkIndex(map_)
+        row: dict[str, Any] = {"landmarks": size}
+        for name in ("plain", "indexed"):
+            spans, in_view = [], []
+            for wTc, pixels, descriptors in views:
+                begin = time.perf_counter()
+                among = index.near(wTc, lens, settings) if name == "indexed" else None
+                seen = project(map_, wTc, lens, settings, among)
+                expected = map_.descriptor[seen.landmark]
+                associate(pixels, descriptors, seen.pinhole_px, expected, preset.association)
+                spans.append(1e3 * (time.perf_counter() - begin))
+                in_view.append(len(seen.landmark))
+            row |= {f"{name}_ms": float(np.median(spans)), "in_view": float(np.median(in_view))}
+        rows.append(row)
+    return rows
+
+
+def _building(rng: np.random.Generator, inner: int, total: int) -> Landmarks:
+    """`inner` landmarks on the square around the origin, the others around it as densely."""
+    side_m = _SIZE_M * np.sqrt(total / inner)
+    around = rng.uniform(-side_m / 2, side_m / 2, (2 * total, 2))
+    around = around[np.abs(around).max(axis=1) > _SIZE_M / 2]
+    around = around[: total - inner]
+    square = rng.uniform(-_SIZE_M / 2, _SIZE_M / 2, (inner, 2))
+    angle = rng.uniform(0, 2 * np.pi, total)
+    return Landmarks(
+        id=np.arange(total),
+        position_m=np.c_[np.concatenate([square, around]), rng.uniform(0, 3, total)],
+        covariance_m2=np.zeros((total, 3, 3), np.float32),
+        descriptor=_unit(rng.standard_normal((total, 64), np.float32)),
+        spread=np.zeros(total, np.float32),
+        view_direction=np.c_[np.cos(angle), np.sin(angle), np.zeros(total)].astype(np.float32),
+        view_cos=np.full(total, 0.5, np.float32),
+        distance_m=np.tile(np.array([1.0, 8.0], np.float32), (total, 1)),
+        observations=np.full(total, 3, np.int32),
+    )
