@@ -1,4 +1,8 @@
-"""The camera's pose from the whole map, without a guess."""
+"""The camera's pose from the whole map, without a guess.
+
+Places that look like the frame, matches within each, P3P in locally optimised RANSAC, and then a
+check that asks the other way round: does the frame show what the map says this pose would see?
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,11 @@ import numpy.typing as npt
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.localization.projection import Lens
+from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
-from ground_station.mapping.store import Landmarks
+from ground_station.localization.verification import Witness
+from ground_station.mapping.store import Landmarks, Map
 
 Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
@@ -69,6 +76,192 @@ def spread(pixel_px: npt.ArrayLike, camera: Camera) -> float:
     return float(rms / np.hypot(camera.width_px, camera.height_px))
 
 
+_RETRIEVED, _PLACES, _MIN_SHARED = 24, 3, 0.15
+"""Keyframes retrieved, places tried, the share of landmarks that makes keyframes one place."""
+_NEIGHBOUR_M, _NEIGHBOUR_COS, _NEIGHBOURS = 4.0, 0.5, 12
+"""Keyframes near a found pose that look the same way (60 degrees): what they saw should be seen."""
+_MIN_MATCHED = 12
+"""Inliers of RANSAC that are worth the check that follows."""
+_MIN_EXCESS = 0.10
+"""Share of expected landmarks found, less that by chance: a smaller one is refused."""
+_MAX_SIGMA_M = 0.04
+"""Of the position, from the inliers alone: beyond, a rolling shutter's shear moves it by a foot."""
+_SAME_M = 0.5
+"""Two poses nearer than this are one."""
+_RIVAL = 0.5
+"""A pose elsewhere with this share of the best one's inliers leaves the place undecided."""
+
+
+class _Search:
+    """One frame in search of its pose."""
+
+    def __init__(
+        self,
+        features: Features,
+        normalized: Array,
+        landmarks: Landmarks,
+        lens: Lens,
+        settings: RecoverySettings,
+        seed: int,
+    ) -> None:
+        camera = lens.camera
+        self.camera, self.landmarks, self.settings, self.seed = camera, landmarks, settings, seed
+        self.features = features
+        focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
+        self.pinhole_px = normalized * focal + centre
+        self.witness = Witness(features, self.pinhole_px, lens)
+
+    def propose(self, candidates: Indices) -> Array | str:
+        """wTc from matches with some landmarks (M,), or why there is none."""
+        settings, lm = self.settings, self.landmarks
+        feature, row = match_all(
+            self.features.descriptors, lm.descriptor[candidates], settings.max_ratio
+        )
+        if len(feature) < _MIN_MATCHED:
+            return f"{len(feature)} matches"
+        landmark = candidates[row]
+        params = cv2.UsacParams()
+        params.threshold = settings.max_reprojection_px
+        params.maxIterations = settings.max_iterations
+        params.confidence = 0.9999
+        params.randomGeneratorState = self.seed
+        params.sampler = cv2.SAMPLING_UNIFORM
+        params.score = cv2.SCORE_METHOD_MAGSAC
+        params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+        params.loIterations = 10
+        params.loSampleSize = 30
+        try:
+            found, _, rvec, tvec, inliers = cv2.solvePnPRansac(
+                lm.position_m[landmark], self.pinhole_px[feature], self.camera.matrix, None,
+                params=params,
+            )  # fmt: skip
+        except cv2.error:
+            return "no pose explains the matches"
+        if not found or inliers is None or not np.isfinite(np.r_[rvec.ravel(), tvec.ravel()]).all():
+            return "no pose explains the matches"
+        if len(inliers) < max(_MIN_MATCHED, settings.min_inlier_share * len(feature)):
+            return f"{len(inliers)} inliers of {len(feature)} matches"
+        return poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], tvec.ravel()))
+
+    def confirm(self, wTc: Array, expected: Indices) -> Relocalization | str:
+        """The pose refined over all landmarks that should be seen, or why it is refused."""
+        settings = self.settings
+        support = self.witness.support(wTc, self.landmarks, expected)
+        if len(support.feature) >= _MIN_MATCHED:
+            wTc = self._refine(wTc, support.feature, support.landmark)
+            support = self.witness.support(wTc, self.landmarks, expected)
+        near = self._residual_px(wTc, support.feature, support.landmark)
+        good = near < settings.max_reprojection_px
+        feature, landmark = support.feature[good], support.landmark[good]
+        if len(feature) < settings.min_inliers:
+            return f"{len(feature)} of {support.expected} landmarks where they should be"
+        if support.share - support.chance < _MIN_EXCESS:
+            return f"{support.share:.0%} of the landmarks found, {support.chance:.0%} by chance"
+        if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
+            return "the inliers lie in one corner of the image"
+        wTc = self._refine(wTc, feature, landmark)
+        if (sigma_m := self._sigma_m(wTc, landmark)) > _MAX_SIGMA_M:
+            return f"the inliers leave the position open by {sigma_m:.2f} m"
+        return Relocalization(wTc, feature, landmark)
+
+    def _sigma_m(self, wTc: Array, landmark: Indices) -> float:
+        """Standard deviation of the position by the inliers' geometry, at half the threshold."""
+        X, Y, Z = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark]).T
+        x, y, none = X / Z, Y / Z, np.zeros_like(Z)
+        u = np.stack([x * y, -1 - x * x, y, -1 / Z, none, x / Z], axis=1) * self.camera.fx_px
+        v = np.stack([1 + y * y, -x * y, -x, none, -1 / Z, y / Z], axis=1) * self.camera.fy_px
+        sigma_px = self.settings.max_reprojection_px / 2
+        try:
+            covariance = np.linalg.inv((u.T @ u + v.T @ v) / sigma_px**2)
+        except np.linalg.LinAlgError:
+            return float("inf")
+        return float(np.sqrt(np.trace(covariance[3:, 3:])))
+
+    def _residual_px(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
+        points = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark])
+        projected = points @ self.camera.matrix.T
+        offset = projected[:, :2] / projected[:, 2:] - self.pinhole_px[feature]
+        return np.asarray(np.linalg.norm(offset, axis=1), np.float64)
+
+    def _refine(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
+        """Least squares over the matches (Levenberg-Marquardt)."""
+        cTw = poses.inverse(wTc)
+        rvec, tvec = cv2.solvePnPRefineLM(
+            self.landmarks.position_m[landmark], self.pinhole_px[feature], self.camera.matrix,
+            None, cv2.Rodrigues(cTw[:3, :3])[0], cTw[:3, 3:].copy(),
+        )  # fmt: skip
+        return poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], np.ravel(tvec)))
+
+
+class Relocalizer:
+    """Finds frames in one map, whose keyframes are indexed once."""
+
+    def __init__(self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int) -> None:
+        self._landmarks, self._keyframes = map_.landmarks, map_.keyframes
+        self._lens, self._settings, self._seed = Lens(camera), settings, seed
+        self._index: PlaceIndex | None = None
+        if len(map_.keyframes):
+            self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed)
+
+    def find(self, features: Features, normalized: Array) -> Relocalization | str:
+        """The pose of a frame anywhere in the map, or the reason why there is none.
+
+        `normalized` (F, 2) are the features undistorted, on the plane z = 1. The most alike
+        keyframes are matched together, so that only what is unlike all the rest counts, and when
+        that fails (in a building that repeats itself) place by place; of two places that fit
+        nearly as well, neither is believed. A map without keyframes is one place. The same
+        frame gives the same answer.
+        """
+        if not len(features):
+            return "no features"
+        search = _Search(
+            features, normalized, self._landmarks, self._lens, self._settings, self._seed
+        )
+        if self._index is None:
+            return _only_place(search)
+        ranked = self._index.ranked(features.descriptors, _RETRIEVED)
+        together = self._try(self._index, search, self._index.seen_by(ranked))
+        if not isinstance(together, str):
+            return together
+        found = []
+        for place in self._index.places(ranked, _PLACES, _MIN_SHARED):
+            alone = self._try(self._index, search, self._index.seen_by(place))
+            if not isinstance(alone, str):
+                found.append(alone)
+        return _undisputed(found) if found else f"{together} in the most alike places"
+
+    def _try(self, index: PlaceIndex, search: _Search, candidates: Indices) -> Relocalization | str:
+        wTc = search.propose(candidates)
+        if isinstance(wTc, str):
+            return wTc
+        return search.confirm(wTc, index.seen_by(self._around(wTc)))
+
+    def _around(self, wTc: Array) -> Indices:
+        """The nearest keyframes to a pose that look the same way."""
+        all_wTc = self._keyframes.wTc
+        distance = np.linalg.norm(all_wTc[:, :3, 3] - wTc[:3, 3], axis=1)
+        distance[all_wTc[:, :3, 2] @ wTc[:3, 2] < _NEIGHBOUR_COS] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:_NEIGHBOURS]
+        return np.asarray(nearest[distance[nearest] < _NEIGHBOUR_M], np.intp)
+
+
+def _undisputed(found: list[Relocalization]) -> Relocalization | str:
+    """The best of several poses unless another, elsewhere, is nearly as good."""
+    found.sort(key=lambda one: -len(one.feature))
+    best = found[0]
+    for other in found[1:]:
+        apart_m = float(np.linalg.norm(other.wTc[:3, 3] - best.wTc[:3, 3]))
+        if apart_m > _SAME_M and len(other.feature) > _RIVAL * len(best.feature):
+            return f"two places {apart_m:.1f} m apart fit alike"
+    return best
+
+
+def _only_place(search: _Search) -> Relocalization | str:
+    everything = np.arange(len(search.landmarks))
+    wTc = search.propose(everything)
+    return wTc if isinstance(wTc, str) else search.confirm(wTc, everything)
+
+
 def relocalize(
     features: Features,
     normalized: Array,
@@ -77,38 +270,7 @@ def relocalize(
     settings: RecoverySettings,
     seed: int,
 ) -> Relocalization | str:
-    """The pose of a frame anywhere in the map, or the reason why there is none.
-
-    `normalized` (F, 2) are the features undistorted, on the plane z = 1. Matches against every
-    landmark, P3P in locally optimised RANSAC (`cv2.USAC_ACCURATE`), and a strict check of the
-    inliers' number, share and spread over the image.
-    """
-    feature, landmark = match_all(features.descriptors, landmarks.descriptor, settings.max_ratio)
-    if len(feature) < settings.min_inliers:
-        return f"{len(feature)} matches with the whole map"
-    pinhole_px = normalized[feature] * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-    params = cv2.UsacParams()
-    params.threshold = settings.max_reprojection_px
-    params.maxIterations = settings.max_iterations
-    params.confidence = 0.9999
-    params.randomGeneratorState = seed
-    params.sampler = cv2.SAMPLING_UNIFORM
-    params.score = cv2.SCORE_METHOD_MAGSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    params.loIterations = 10
-    params.loSampleSize = 30
-    try:
-        found, _, rvec, tvec, inliers = cv2.solvePnPRansac(
-            landmarks.position_m[landmark], pinhole_px, camera.matrix, None, params=params
-        )
-    except cv2.error:
-        return "no pose explains the matches"
-    if not found or inliers is None or not np.isfinite(np.r_[rvec.ravel(), tvec.ravel()]).all():
-        return "no pose explains the matches"
-    rows = inliers.ravel()
-    if len(rows) < max(settings.min_inliers, settings.min_inlier_share * len(feature)):
-        return f"{len(rows)} inliers of {len(feature)} matches with the whole map"
-    if spread(features.keypoints_px[feature[rows]], camera) < settings.min_spread:
-        return "the inliers lie in one corner of the image"
-    wTc = poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], tvec.ravel()))
-    return Relocalization(wTc, feature[rows], landmark[rows])
+    """As `Relocalizer.find`, without keyframes: every landmark is matched, at a cost in time."""
+    if not len(features):
+        return "no features"
+    return _only_place(_Search(features, normalized, landmarks, Lens(camera), settings, seed))

@@ -1,0 +1,92 @@
+"""Does a frame show what the map says a pose would see? The check of a relocalization."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from ground_station.features.extractor import Features
+from ground_station.geometry import poses
+from ground_station.localization.projection import Lens, in_cone
+from ground_station.localization.settings import ProjectionSettings
+from ground_station.mapping.store import Landmarks
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_RADIUS_PX = 5.0
+"""A feature this near to where a landmark should be may be it."""
+_NEIGHBOURS = 4
+"""Features that are looked at within the radius."""
+_MAX_DISTANCE = 0.75
+"""Of unit descriptors: a landmark seen again, in other light, too."""
+_SHIFTS_PX = np.array([[24.0, 10.0], [-24.0, -10.0], [-10.0, 24.0], [10.0, -24.0]])
+"""Where the landmarks are certainly not: what matches there matches by chance."""
+_CONES = ProjectionSettings(viewing_cone=True)
+
+
+@dataclass(frozen=True)
+class Support:
+    """What speaks for a pose.
+
+    `feature` and `landmark` (N,): landmarks found again near where they project, each once;
+    `expected`: landmarks that should be visible; `share` of them found; `chance`: the share found
+    when the projections are shifted aside, which a wrong pose reaches as well.
+    """
+
+    feature: Indices
+    landmark: Indices
+    expected: int
+    share: float
+    chance: float
+
+
+class Witness:
+    """A frame's features as a place to look landmarks up in."""
+
+    def __init__(self, features: Features, pinhole_px: Array, lens: Lens) -> None:
+        """`pinhole_px` (F, 2): the features without the lens."""
+        self.features, self.pinhole_px, self.lens = features, pinhole_px, lens
+        self._tree = cKDTree(pinhole_px)
+
+    def support(self, wTc: Array, landmarks: Landmarks, index: Indices) -> Support:
+        """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
+        cTw, camera = poses.inverse(wTc), self.lens.camera
+        points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
+        ahead = points[:, 2] > 0.05
+        index, points = index[ahead], points[ahead]
+        flat = points[:, :2] / points[:, 2:]
+        seen = self.lens.inside(flat)
+        index, flat = index[seen], flat[seen]
+        if len(index):
+            seen = in_cone(landmarks, index, wTc[:3, 3], _CONES)
+            index, flat = index[seen], flat[seen]
+        if not len(index):
+            return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
+        pixel = flat * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+        descriptors = landmarks.descriptor[index]
+        feature, distance = self._near(pixel, descriptors)
+        found = distance < _MAX_DISTANCE
+        chance = np.mean(
+            [(self._near(pixel + s, descriptors)[1] < _MAX_DISTANCE).mean() for s in _SHIFTS_PX]
+        )
+        # A feature is one landmark: the one it looks most like.
+        rows = np.flatnonzero(found)
+        rows = rows[np.argsort(distance[rows], kind="stable")]
+        rows = rows[np.unique(feature[rows], return_index=True)[1]]
+        return Support(feature[rows], index[rows], len(index), float(found.mean()), float(chance))
+
+    def _near(self, pixel_px: Array, descriptors: npt.NDArray[np.float32]) -> tuple[Indices, Array]:
+        """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf)."""
+        _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_PX)
+        there = near < len(self.pinhole_px)
+        own = self.features.descriptors[np.where(there, near, 0)]
+        cosine = np.where(there, np.einsum("nkd,nd->nk", own, descriptors), -np.inf)
+        best = cosine.argmax(axis=1)
+        row = np.arange(len(best))
+        value = cosine[row, best]
+        distance = np.sqrt(np.maximum(2 - 2 * value, 0))
+        return np.asarray(near[row, best], np.intp), np.asarray(distance, np.float64)

@@ -1,0 +1,182 @@
+"""A frame is found in the map it belongs to, and in no other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+
+from ground_station.features.extractor import Features
+from ground_station.geometry import poses
+from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization.relocalization import Relocalization, Relocalizer, relocalize
+from ground_station.localization.retrieval import PlaceIndex
+from ground_station.localization.settings import load_preset
+from ground_station.mapping.store import Keyframes, Landmarks, Map
+
+SETTINGS = load_preset("default").recovery
+
+
+def observed(map_: Map, wTc: np.ndarray, most: int = 300) -> np.ndarray:
+    """Landmarks in view of a pose, the first of them."""
+    points = poses.transform(poses.inverse(wTc), map_.landmarks.position_m)
+    pixels = THESIS_CAMERA.project(points)
+    flat = np.abs(points[:, :2] / np.maximum(points[:, 2:], 1e-3))
+    inside = (points[:, 2] > 0.1) & (flat < 0.9).all(axis=1)
+    inside &= ((pixels >= 0) & (pixels <= [639, 479])).all(axis=1)
+    return np.flatnonzero(inside)[:most].astype(np.int32)
+
+
+def with_keyframes(map_: Map, wTc: np.ndarray) -> Map:
+    """The map as if it had been made from frames at these poses (K, 4, 4)."""
+    seen = [observed(map_, pose) for pose in wTc]
+    total = int(sum(map(len, seen)))
+    keyframes = Keyframes(
+        names=[f"{k}" for k in range(len(seen))],
+        time_ns=np.arange(len(seen), dtype=np.int64),
+        wTc=wTc,
+        offset=np.r_[0, np.cumsum([len(s) for s in seen])].astype(np.int64),
+        landmark=np.concatenate(seen),
+        pixel_px=np.zeros((total, 2), np.float32),
+    )
+    return replace(map_, keyframes=keyframes)
+
+
+def twice(map_: Map, aside_m: float) -> Map:
+    """Two buildings with the same landmarks."""
+    lm, kf = map_.landmarks, map_.keyframes
+    both = {f.name: np.concatenate([getattr(lm, f.name)] * 2) for f in fields(Landmarks)}
+    both["position_m"][len(lm) :] += [aside_m, 0, 0]
+    wTc = kf.wTc.copy()
+    wTc[:, :3, 3] += [aside_m, 0, 0]
+    keyframes = Keyframes(
+        names=kf.names * 2,
+        time_ns=np.concatenate([kf.time_ns] * 2),
+        wTc=np.concatenate([kf.wTc, wTc]),
+        offset=np.concatenate([kf.offset, kf.offset[1:] + kf.offset[-1]]),
+        landmark=np.concatenate([kf.landmark, kf.landmark + np.int32(len(lm))]),
+        pixel_px=np.concatenate([kf.pixel_px] * 2),
+    )
+    return replace(map_, landmarks=Landmarks(**both), keyframes=keyframes)
+
+
+@dataclass
+class Building:
+    """A mapped room, and places in it where no keyframe was."""
+
+    map: Map
+    path: np.ndarray
+    features: Callable[..., Features]
+
+
+@pytest.fixture
+def building(room) -> Building:
+    _, path = room.path(540)
+    return Building(with_keyframes(room.map, path[::12]), path[6::60], room.features)
+
+
+def find(map_: Map, features: Features) -> Relocalization | str:
+    relocalizer = Relocalizer(map_, THESIS_CAMERA, SETTINGS, 0)
+    return relocalizer.find(features, THESIS_CAMERA.undistort(features.keypoints_px))
+
+
+def apart(found: Relocalization | str, truth: np.ndarray) -> tuple[float, float]:
+    assert isinstance(found, Relocalization), found
+    difference = poses.inverse(truth) @ found.wTc
+    angle = float(np.degrees(poses.rotation_angle(difference[:3, :3])))
+    return float(np.linalg.norm(difference[:3, 3])), angle
+
+
+def test_the_right_place_is_found_among_sixty_percent_outliers(building):
+    for wTc in building.path:
+        position_m, angle_deg = apart(find(building.map, building.features(wTc, outliers=0.6)), wTc)
+        assert position_m < 0.03 and angle_deg < 0.3
+
+
+def test_without_keyframes_every_landmark_is_matched(building):
+    wTc = building.path[2]
+    features = building.features(wTc, outliers=0.6)
+    normalized = THESIS_CAMERA.undistort(features.keypoints_px)
+    found = relocalize(features, normalized, building.map.landmarks, THESIS_CAMERA, SETTINGS, 0)
+    assert apart(found, wTc)[0] < 0.03
+
+
+def test_a_frame_that_shares_nothing_with_the_map_is_refused(building):
+    rng = np.random.default_rng(3)
+    for wTc in building.path[:4]:
+        features = building.features(wTc)
+        other = rng.normal(size=features.descriptors.shape)
+        other /= np.linalg.norm(other, axis=1, keepdims=True)
+        foreign = replace(features, descriptors=other.astype(np.float32))
+        assert isinstance(find(building.map, foreign), str)
+    empty = Features(
+        np.empty((0, 2), np.float32), np.empty(0, np.float32), features.descriptors[:0]
+    )
+    assert find(building.map, empty) == "no features"
+
+
+def test_known_things_in_another_arrangement_are_refused(building):
+    rng = np.random.default_rng(4)
+    for wTc in building.path[:4]:
+        features = building.features(wTc)
+        shuffled = rng.permutation(features.keypoints_px)
+        assert isinstance(find(building.map, replace(features, keypoints_px=shuffled)), str)
+
+
+def test_one_known_poster_in_another_building_is_no_place(building):
+    # A small patch matches perfectly, the rest of the view is something else.
+    for wTc in building.path[:4]:
+        features = building.features(wTc, outliers=0.0)
+        centre = np.median(features.keypoints_px, axis=0)
+        known = np.linalg.norm(features.keypoints_px - centre, axis=1) < 80
+        rng = np.random.default_rng(5)
+        other = rng.normal(size=features.descriptors.shape).astype(np.float32)
+        other /= np.linalg.norm(other, axis=1, keepdims=True)
+        descriptors = np.where(known[:, None], features.descriptors, other)
+        assert known.sum() >= 12
+        assert isinstance(find(building.map, replace(features, descriptors=descriptors)), str)
+
+
+def test_of_two_equal_places_neither_is_believed(building):
+    double = twice(building.map, 20.0)
+    for wTc in building.path[:4]:
+        found = find(double, building.features(wTc))
+        assert isinstance(found, str) and "fit alike" in found
+
+
+def test_what_differs_between_two_alike_places_decides(building):
+    double = twice(building.map, 20.0)
+    rng = np.random.default_rng(6)
+    own = double.landmarks.descriptor[len(building.map.landmarks) :]
+    changed = rng.random(len(own)) < 0.6
+    other = rng.normal(size=own[changed].shape)
+    own[changed] = other / np.linalg.norm(other, axis=1, keepdims=True)
+    for wTc in building.path[:4]:
+        assert apart(find(double, building.features(wTc)), wTc)[0] < 0.03
+
+
+def test_the_same_frame_and_seed_give_the_same_answer(building):
+    features = building.features(building.path[1], outliers=0.5)
+    one, other = find(building.map, features), find(building.map, features)
+    assert isinstance(one, Relocalization) and isinstance(other, Relocalization)
+    assert np.array_equal(one.wTc, other.wTc) and np.array_equal(one.landmark, other.landmark)
+
+
+def test_the_keyframes_nearest_to_the_frame_rank_first(building):
+    index = PlaceIndex(building.map.landmarks, building.map.keyframes, 0)
+    for wTc in building.path:
+        ranked = index.ranked(building.features(wTc, outliers=0.6).descriptors, 5)
+        forward = building.map.keyframes.wTc[ranked[0], :3, 2]
+        assert forward @ wTc[:3, 2] > np.cos(np.radians(20))
+
+
+def test_the_words_find_most_of_what_a_search_of_everything_finds(building):
+    index = PlaceIndex(building.map.landmarks, building.map.keyframes, 0)
+    descriptors = building.features(building.path[0], outliers=0.0).descriptors
+    landmark, cosine = index.nearest(descriptors)
+    products = descriptors @ building.map.landmarks.descriptor.T
+    assert (landmark[:, 0] == products.argmax(axis=1)).mean() > 0.9
+    assert np.allclose(cosine, np.take_along_axis(products, landmark, axis=1), atol=1e-5)
+    assert (cosine[:, 0] >= cosine[:, 1]).all() and (landmark[:, 0] != landmark[:, 1]).all()

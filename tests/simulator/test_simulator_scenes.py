@@ -1,0 +1,74 @@
+"""Every scene has room for every plan, and no two are one building."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_station.recording.open import open_input
+from ground_station.simulator import scenes
+from ground_station.simulator.lighting import surface_albedo
+from ground_station.simulator.plans import Reference, plan_named
+from ground_station.simulator.scene import Scene
+from ground_station.simulator.simulate import SimulationSettings, simulate
+from ground_station.simulator.textures import TextureBank
+
+HULL_M = 0.35
+"""Half the blimp's width and what a draught adds."""
+
+
+def nearest_surface_m(scene: Scene, position_m: np.ndarray) -> float:
+    """The distance from a position to the nearest (rectangular) surface."""
+    nearest = np.inf
+    for surface in scene.surfaces:
+        offset = position_m - surface.origin_m
+        at = surface.origin_m.copy()
+        for edge in (surface.u_m, surface.v_m):
+            at += np.clip(offset @ edge / (edge @ edge), 0, 1) * edge
+        nearest = min(nearest, float(np.linalg.norm(position_m - at)))
+    return nearest
+
+
+@pytest.mark.parametrize("plan", ["mapping", "loop", "small-circle", "fast"])
+@pytest.mark.parametrize("name", scenes.names())
+def test_every_plan_keeps_clear_of_the_building(name: str, plan: str) -> None:
+    scene = scenes.build(name, 10)
+    reference = Reference(plan_named(plan, scene, np.random.default_rng(3)), 0.0)
+    lap_s = 120.0 if plan == "mapping" else 45.0
+    position, _ = reference.at(np.linspace(0, lap_s, 40))
+    assert min(nearest_surface_m(scene, p) for p in position) > HULL_M
+
+
+def test_the_scenes_share_no_texture() -> None:
+    atrium, office = (scenes.build(name, 10) for name in ("atrium", "office"))
+    assert atrium.texture_seed != office.texture_seed
+    posters = []
+    for scene in (atrium, office):
+        index = next(i for i, s in enumerate(scene.surfaces) if s.material == "poster")
+        picture = surface_albedo(TextureBank(scene.texture_seed), scene, index)
+        posters.append(picture[:8, :8])
+    assert not np.allclose(posters[0], posters[1], atol=0.05)
+
+
+def test_the_office_has_what_a_flight_needs() -> None:
+    office = scenes.build("office", 10)
+    names = [point.name for point in office.known_points]
+    assert len(names) == len(set(names)) >= 12
+    assert office.lamps and {f.kind for f in office.footprints} >= {"wall", "furniture"}
+    size = np.array(office.size_m)
+    for point in office.known_points:
+        assert ((np.array(point.position_m) >= 0) & (np.array(point.position_m) <= size)).all()
+
+
+def test_the_office_can_be_filmed(tmp_path: Path) -> None:
+    out = tmp_path / "office.mcap"
+    simulate(
+        SimulationSettings(
+            out=out, scene="office", plan="loop", light="cloudy", seed=5, duration_s=0.4,
+            rate_hz=5.0, texels_per_m=12.0, supersampling=0.5, renders=1,
+        )
+    )  # fmt: skip
+    frames = [frame.image for frame in open_input(out)]
+    assert len(frames) == 2 and all(frame.std() > 20 for frame in frames)
