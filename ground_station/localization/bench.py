@@ -45,15 +45,18 @@ _SIZE_M = 50.0
 """Side of the square that holds the smaller map of the growth table; 3 m high."""
 
 
-def median_ms(work: Callable[[], object], repetitions: int) -> float:
-    """The median time of one call after one that warms up, in milliseconds."""
-    work()
-    spans = []
-    for _ in range(repetitions):
-        begin = time.perf_counter()
-        work()
-        spans.append(1e3 * (time.perf_counter() - begin))
-    return float(np.median(spans))
+def medians_ms(repetitions: int, *works: Callable[[], object]) -> list[float]:
+    """The median time of a call of each, in milliseconds.
+
+    They take turns, so that a busy moment of the machine slows all; a first turn warms up.
+    """
+    spans = np.empty((repetitions + 1, len(works)))
+    for row in spans:
+        for k, work in enumerate(works):
+            begin = time.perf_counter()
+            work()
+            row[k] = 1e3 * (time.perf_counter() - begin)
+    return [float(median) for median in np.median(spans[1:], axis=0)]
 
 
 def machine() -> dict[str, Any]:
@@ -77,8 +80,9 @@ def association(seed: int, repetitions: int) -> dict[str, Any]:
     data = (feature_px, feature, landmark_px, landmark, settings)
     found = associate(*data)
     pairs = list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
-    ours = median_ms(lambda: associate(*data), repetitions)
-    loop = median_ms(lambda: _associate_by_loop(*data), max(3, repetitions // 4))
+    ours, loop = medians_ms(
+        repetitions, lambda: associate(*data), lambda: _associate_by_loop(*data)
+    )
     return {
         "ours_ms": ours,
         "loop_ms": loop,
@@ -130,8 +134,7 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     data = (guess, points, pixels, camera, settings)
     direct, graph = solve_direct(*data).wTc, solve_graph(*data).wTc
     assert direct is not None and graph is not None
-    ours = median_ms(lambda: solve_direct(*data), repetitions)
-    theirs = median_ms(lambda: solve_graph(*data), repetitions)
+    ours, theirs = medians_ms(repetitions, lambda: solve_direct(*data), lambda: solve_graph(*data))
     return {
         "direct_ms": ours,
         "graph_ms": theirs,
