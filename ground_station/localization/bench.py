@@ -218,25 +218,30 @@ def growth(seed: int, repetitions: int, sizes: tuple[int, int]) -> list[dict[str
         noise = rng.normal(0, 0.05, (len(mine), large.descriptor.shape[1]))
         described = _unit(large.descriptor[seen.landmark[mine]] + noise)
         views.append((wTc, seen.pinhole_px[mine] + rng.normal(0, 3, (len(mine), 2)), described))
-    rows = []
-    for size in sizes:
-        fields = dataclasses.fields(Landmarks)
-        map_ = Landmarks(**{f.name: getattr(large, f.name)[:size] for f in fields})
-        index = LandmarkIndex(map_)
-        row: dict[str, Any] = {"landmarks": size}
-        for name in ("plain", "indexed"):
-            spans, in_view = [], []
-            for wTc, pixels, descriptors in views:
+    fields = [field.name for field in dataclasses.fields(Landmarks)]
+    maps = [Landmarks(**{name: getattr(large, name)[:size] for name in fields}) for size in sizes]
+    indices = [LandmarkIndex(map_) for map_ in maps]
+    spans = np.empty((len(views), len(sizes), 2))
+    in_view = np.empty((len(views), len(sizes)))
+    for v, (wTc, pixels, descriptors) in enumerate(views):
+        for m, (map_, index) in enumerate(zip(maps, indices, strict=True)):
+            for k in range(2):
                 begin = time.perf_counter()
-                among = index.near(wTc, lens, settings) if name == "indexed" else None
+                among = index.near(wTc, lens, settings) if k else None
                 seen = project(map_, wTc, lens, settings, among)
                 expected = map_.descriptor[seen.landmark]
                 associate(pixels, descriptors, seen.pinhole_px, expected, preset.association)
-                spans.append(1e3 * (time.perf_counter() - begin))
-                in_view.append(len(seen.landmark))
-            row |= {f"{name}_ms": float(np.median(spans)), "in_view": float(np.median(in_view))}
-        rows.append(row)
-    return rows
+                spans[v, m, k] = 1e3 * (time.perf_counter() - begin)
+            in_view[v, m] = len(seen.landmark)
+    return [
+        {
+            "landmarks": size,
+            "in_view": float(np.median(in_view[:, m])),
+            "plain_ms": float(np.median(spans[:, m, 0])),
+            "indexed_ms": float(np.median(spans[:, m, 1])),
+        }
+        for m, size in enumerate(sizes)
+    ]
 
 
 def _building(rng: np.random.Generator, inner: int, total: int) -> Landmarks:
