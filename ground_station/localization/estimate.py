@@ -26,7 +26,10 @@ class State(enum.Enum):
 
 @dataclass(frozen=True)
 class Counts:
-    """Features of the frame, landmarks projected into it, pairs associated, inliers of the pose."""
+    """Features of the frame, landmarks projected into it, pairs associated, inliers of the pose.
+
+    Of a tracked frame: points found again (twice), points expected in view, inliers.
+    """
 
     features: int = 0
     projected: int = 0
@@ -65,8 +68,10 @@ class PoseEstimate:
     `wTc` (4, 4) is only there when the frame was solved from its own observations. `covariance`
     (6, 6) is of the right tangent wTc·exp(ξ) in the camera's axes, rotation (rad) before
     translation (m), as of GTSAM's Pose3. `predicted_wTc` is the motion model's, for drawing only.
-    `stage_ms` has entropy, features, projection, association, pose, relocalization and total, those
-    that ran.
+    `stage_ms` has entropy, track, features, projection, association, pose, relocalization, wait and
+    total, those that ran; a keyframe's features landed in a frame with `background`, the time they
+    took beside the frames, which is no part of the total. `tracked`: solved from a keyframe's
+    points found again in this frame, and not from features of its own.
     """
 
     time_ns: int
@@ -82,6 +87,7 @@ class PoseEstimate:
     entropy_bits: float = float("nan")
     gated: bool = False
     relocalized: bool = False
+    tracked: bool = False
 
     @property
     def localized(self) -> bool:

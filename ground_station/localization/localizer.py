@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
 from ground_station.localization.association import associate
+from ground_station.localization.attempt import Attempt, Stopwatch
 from ground_station.localization.estimate import (
     Counts,
     Observations,
@@ -24,6 +26,8 @@ from ground_station.localization.pose_graph import PoseSolution, failure, solve_
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.relocalization import relocalize, spread
 from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.tracking import Keyframe, spread_out, track
+from ground_station.localization.worker import Worker
 from ground_station.mapping.store import Map, check_features
 from pi_firmware.wire.entropy import entropy_bits
 
@@ -36,36 +40,12 @@ class LocalizationError(GroundStationError):
     """A localizer that cannot be used as asked."""
 
 
-class _Stopwatch:
-    """Milliseconds by stage; a stage that runs twice adds up."""
+@dataclasses.dataclass(frozen=True)
+class _Described:
+    """A keyframe made beside the frames, or None when its features did not fit, and its time."""
 
-    def __init__(self) -> None:
-        self.stage_ms: dict[str, float] = {}
-        self._begin = self._mark = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (now - self._mark)
-        self._mark = now
-
-    def finish(self) -> dict[str, float]:
-        return self.stage_ms | {"total": 1e3 * (time.perf_counter() - self._begin)}
-
-
-class _Attempt:
-    """One frame on its way to a pose."""
-
-    def __init__(
-        self, time_ns: int, index: int, watch: _Stopwatch, entropy: float = float("nan")
-    ) -> None:
-        self.time_ns, self.index, self.watch, self.entropy = time_ns, index, watch, entropy
-        self.predicted: Array | None = None
-        self.counts = Counts()
-        self.observations = no_observations()
-        self.features = Features(
-            np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 0), np.float32)
-        )
-        self.normalized = np.empty((0, 2))
+    keyframe: Keyframe | None
+    background_ms: float
 
 
 class Localizer:
@@ -79,6 +59,10 @@ class Localizer:
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._lens = Lens(camera)
         self._solve = _SOLVERS[settings.pose.solver]
+        self._tracked_pose = dataclasses.replace(
+            settings.pose, sigma_px=settings.tracking.sigma_px, min_inliers=6
+        )
+        self._worker: Worker[_Described] = Worker(settings.tracking.features_lag_frames)
         self.reset()
 
     def reset(self) -> None:
@@ -88,6 +72,8 @@ class Localizer:
         self._last_frame_ns: int | None = None
         self._last_solved_ns: int | None = None
         self._last_relocalization_ns: int | None = None
+        self._keyframe: Keyframe | None = None
+        self._worker.drop()
 
     def set_initial_pose(self, wTc: npt.ArrayLike, time_ns: int) -> None:
         """A first pose (4, 4) from elsewhere: a prediction, so the frame is still solved itself.
@@ -113,27 +99,34 @@ class Localizer:
             raise InputError(
                 f"frame {index} has {size} pixels, the camera {camera.width_px}x{camera.height_px}"
             )
-        watch = _Stopwatch()
+        watch = Stopwatch()
         if (refused := self._refuse(time_ns, index, watch)) is not None:
             return refused
         entropy = entropy_bits(image)
         watch.lap("entropy")
-        attempt = _Attempt(time_ns, index, watch, entropy)
+        attempt = Attempt(time_ns, index, watch, entropy)
         limit = self.settings.gate.min_entropy_bits
         if entropy < limit:
             self._last_frame_ns = time_ns
             return self._gated(attempt, f"entropy {entropy:.2f} below {limit:g} bits")
+        if (tracked := self._follow(attempt, image)) is not None:
+            return tracked
         features = self.extractor.extract(image)
         watch.lap("features")
-        return self._locate(attempt, features)
+        estimate = self._locate(attempt, features)
+        if self.settings.tracking.enabled and estimate.localized and not estimate.relocalized:
+            # A relocalization is to be confirmed by features of the next frame: its own points
+            # found again would only repeat it.
+            self._keyframe = self._keyframe_of(attempt, image, estimate.wTc)
+        return estimate
 
     def process_features(self, time_ns: int, features: Features, index: int = 0) -> PoseEstimate:
         """The same from features that were extracted elsewhere; nothing is gated."""
-        watch = _Stopwatch()
+        watch = Stopwatch()
         refused = self._refuse(time_ns, index, watch)
-        return refused or self._locate(_Attempt(time_ns, index, watch), features)
+        return refused or self._locate(Attempt(time_ns, index, watch), features)
 
-    def _refuse(self, time_ns: int, index: int, watch: _Stopwatch) -> PoseEstimate | None:
+    def _refuse(self, time_ns: int, index: int, watch: Stopwatch) -> PoseEstimate | None:
         last = self._last_frame_ns
         if last is None or time_ns > last:
             return None
@@ -141,8 +134,108 @@ class Localizer:
         reason = f"refused: {(last - time_ns) / 1e9:.3f} s before the last frame"
         return PoseEstimate(time_ns, index, state, reason, stage_ms=watch.finish())
 
-    def _locate(self, attempt: _Attempt, features: Features) -> PoseEstimate:
+    def _follow(self, attempt: Attempt, image: npt.NDArray[np.uint8]) -> PoseEstimate | None:
+        """The frame's pose from the keyframe's points; None when features of its own are needed."""
+        settings = self.settings.tracking
+        if (landed := self._worker.collect()) is not None:
+            attempt.watch.lap("wait")
+            attempt.watch.stage_ms["background"] = landed.background_ms
+            # A keyframe whose features do not agree with its tracked pose is no ground to go on.
+            self._keyframe = landed.keyframe
+        keyframe = self._keyframe
+        predicted = self._motion.predict(attempt.time_ns)
+        if keyframe is None or predicted is None:
+            return None
+        tracks = track(keyframe, image, predicted, self.camera, settings)
+        attempt.watch.lap("track")
+        solution = failure(0, 0, "")
+        if len(tracks.point) >= settings.min_inliers:
+            pinhole_px = self.camera.undistort_to_pinhole(tracks.pixel_px)
+            solution = self._believe(
+                self._solve(
+                    predicted,
+                    keyframe.points_m[tracks.point],
+                    pinhole_px,
+                    self.camera,
+                    self._tracked_pose,
+                )
+            )
+            attempt.watch.lap("pose")
+        inliers = int(solution.inlier.sum())
+        if solution.wTc is None or inliers < settings.min_inliers:
+            self._keyframe = None
+            self._worker.drop()
+            return None
+        found = len(tracks.point)
+        attempt.predicted = predicted
+        attempt.counts = Counts(found, tracks.sought, found, inliers)
+        attempt.observations = Observations(
+            tracks.pixel_px, keyframe.landmark[tracks.point], solution.residual_px, solution.inlier
+        )
         self._last_frame_ns = attempt.time_ns
+        self._motion.update(attempt.time_ns, solution.wTc)
+        age_s = (attempt.time_ns - keyframe.time_ns) / 1e9
+        if not self._worker.busy and (
+            age_s >= settings.keyframe_interval_s
+            or inliers < settings.keyframe_min_share * len(keyframe)
+        ):
+            self._worker.submit(self._describing(attempt, image, solution.wTc))
+        return self._solved(attempt, solution, tracked=True)
+
+    def _describing(
+        self, frame: Attempt, image: npt.NDArray[np.uint8], wTc: Array
+    ) -> Callable[[], _Described]:
+        """The job that makes a tracked frame at `wTc` (4, 4) the next keyframe.
+
+        It changes nothing of the localizer, so that it can run beside the frames that follow.
+        """
+        attempt = Attempt(frame.time_ns, frame.index, frame.watch)
+        settings = self.settings.association
+
+        def job() -> _Described:
+            attempt.watch = Stopwatch()
+            self._describe(attempt, self.extractor.extract(image))
+            radius_px = settings.refine_radius_px or settings.radius_px
+            solution = self._track_once(attempt, wTc, radius_px)
+            keyframe = self._keyframe_of(attempt, image, solution.wTc)
+            return _Described(keyframe, attempt.watch.finish()["total"])
+
+        return job
+
+    def _keyframe_of(
+        self, attempt: Attempt, image: npt.NDArray[np.uint8], wTc: Array | None
+    ) -> Keyframe | None:
+        """The inliers of a frame solved at `wTc` (4, 4); None when there are too few to follow."""
+        settings, seen = self.settings.tracking, attempt.observations
+        if wTc is None or seen.inlier.sum() < settings.min_inliers:
+            return None
+        pixel, landmark = seen.pixel_px[seen.inlier], seen.landmark[seen.inlier]
+        chosen = spread_out(pixel, settings.max_points)
+        pixel, landmark = pixel[chosen], landmark[chosen]
+        position = np.asarray(self.map.landmarks.position_m[landmark], np.float64)
+        return Keyframe(attempt.time_ns, image, wTc, pixel, landmark, position)
+
+    def _locate(self, attempt: Attempt, features: Features) -> PoseEstimate:
+        self._last_frame_ns = attempt.time_ns
+        self._describe(attempt, features)
+        attempt.predicted = self._motion.predict(attempt.time_ns)
+        attempt.watch.lap("projection")
+        if attempt.predicted is not None:
+            solution = self._track(attempt, attempt.predicted)
+        else:
+            solution = failure(0, 0, "no first pose")
+        if solution.wTc is not None:
+            self._motion.update(attempt.time_ns, solution.wTc)
+            return self._solved(attempt, solution)
+        if self._may_relocalize(attempt.time_ns):
+            found = self._relocalize(attempt)
+            if found.wTc is not None:
+                self._motion.restart(attempt.time_ns, found.wTc)
+                return self._solved(attempt, found, relocalized=True)
+            solution = found
+        return self._unsolved(attempt, solution.reason)
+
+    def _describe(self, attempt: Attempt, features: Features) -> None:
         finite = np.isfinite(features.keypoints_px).all(axis=1)
         finite &= np.isfinite(features.descriptors).all(axis=1)
         if not finite.all():
@@ -154,24 +247,8 @@ class Localizer:
         attempt.features = features
         attempt.normalized = self.camera.undistort(features.keypoints_px)
         attempt.counts = Counts(features=len(features))
-        attempt.predicted = self._motion.predict(attempt.time_ns)
-        attempt.watch.lap("projection")
-        if attempt.predicted is not None:
-            solution = self._track(attempt, attempt.predicted)
-        else:
-            solution = failure(0, 0, "no first pose")
-        if solution.wTc is not None:
-            self._motion.update(attempt.time_ns, solution.wTc)
-            return self._solved(attempt, solution, relocalized=False)
-        if self._may_relocalize(attempt.time_ns):
-            found = self._relocalize(attempt)
-            if found.wTc is not None:
-                self._motion.restart(attempt.time_ns, found.wTc)
-                return self._solved(attempt, found, relocalized=True)
-            solution = found
-        return self._unsolved(attempt, solution.reason)
 
-    def _track(self, attempt: _Attempt, wTc: Array) -> PoseSolution:
+    def _track(self, attempt: Attempt, wTc: Array) -> PoseSolution:
         """Projects, associates and solves from a guess; once more, closer, if the settings say."""
         settings = self.settings.association
         solution = self._track_once(attempt, wTc, settings.radius_px)
@@ -179,7 +256,7 @@ class Localizer:
             solution = self._track_once(attempt, solution.wTc, settings.refine_radius_px)
         return solution
 
-    def _track_once(self, attempt: _Attempt, wTc: Array, radius_px: float) -> PoseSolution:
+    def _track_once(self, attempt: Attempt, wTc: Array, radius_px: float) -> PoseSolution:
         landmarks, camera, settings = self.map.landmarks, self.camera, self.settings
         projected = project(landmarks, wTc, self._lens, settings.projection)
         focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
@@ -235,7 +312,7 @@ class Localizer:
             State.LOST,
         )  # fmt: skip
 
-    def _relocalize(self, attempt: _Attempt) -> PoseSolution:
+    def _relocalize(self, attempt: Attempt) -> PoseSolution:
         self._last_relocalization_ns = attempt.time_ns
         found = relocalize(
             attempt.features,
@@ -258,7 +335,14 @@ class Localizer:
         recent = time_ns - self._last_solved_ns <= patience_s * 1e9
         return State.DEGRADED if recent and self.state is not State.LOST else State.LOST
 
-    def _solved(self, attempt: _Attempt, solution: PoseSolution, relocalized: bool) -> PoseEstimate:
+    def _solved(
+        self,
+        attempt: Attempt,
+        solution: PoseSolution,
+        *,
+        relocalized: bool = False,
+        tracked: bool = False,
+    ) -> PoseEstimate:
         settings, inliers = self.settings.state, attempt.counts.inliers
         self._last_solved_ns = attempt.time_ns
         width = spread(attempt.observations.pixel_px[solution.inlier], self.camera)
@@ -271,13 +355,13 @@ class Localizer:
             reason = f"poor spread: {width:.3f}"
         else:
             self.state = State.TRACKING
-        return self._estimate(attempt, reason, solution, relocalized=relocalized)
+        return self._estimate(attempt, reason, solution, relocalized=relocalized, tracked=tracked)
 
-    def _unsolved(self, attempt: _Attempt, reason: str) -> PoseEstimate:
+    def _unsolved(self, attempt: Attempt, reason: str) -> PoseEstimate:
         self.state = self._unsupported_state(attempt.time_ns)
         return self._estimate(attempt, reason)
 
-    def _gated(self, attempt: _Attempt, reason: str) -> PoseEstimate:
+    def _gated(self, attempt: Attempt, reason: str) -> PoseEstimate:
         # Skipped is not failed: until the prediction is no more than a held pose.
         patience_s = max(self.settings.state.lost_after_s, self.settings.motion.coast_s)
         self.state = self._unsupported_state(attempt.time_ns, patience_s)
@@ -286,12 +370,13 @@ class Localizer:
 
     def _estimate(
         self,
-        attempt: _Attempt,
+        attempt: Attempt,
         reason: str,
         solution: PoseSolution | None = None,
         *,
         relocalized: bool = False,
         gated: bool = False,
+        tracked: bool = False,
     ) -> PoseEstimate:
         return PoseEstimate(
             time_ns=attempt.time_ns,
@@ -307,4 +392,5 @@ class Localizer:
             entropy_bits=attempt.entropy,
             gated=gated,
             relocalized=relocalized,
+            tracked=tracked,
         )

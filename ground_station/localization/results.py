@@ -53,6 +53,7 @@ def summary(
         },
         "states": {state.value: sum(e.state is state for e in estimates) for state in State},
         "relocalized": sum(e.relocalized for e in estimates),
+        "tracked": sum(e.tracked for e in estimates),
         "stage_ms": {stage: span["p50"] for stage, span in spans.items() if span},
         "stage_p99_ms": {stage: span["p99"] for stage, span in spans.items() if span},
         "latency_ms": percentiles([e.stage_ms["total"] for e in worked]),

@@ -118,6 +118,38 @@ class PoseSettings:
 
 
 @dataclass(frozen=True)
+class TrackingSettings:
+    """How matched points are followed between the frames that are described."""
+
+    enabled: bool = config.key(
+        False, "follow a keyframe's points by KLT; false: features of every frame"
+    )
+    max_points: int = config.key(300, "points of a keyframe that are followed", low=12, high=2000)
+    window_px: int = config.key(21, "side of KLT's window", unit="px", low=5, high=63)
+    levels: int = config.key(3, "levels of KLT's pyramid", low=1, high=6)
+    max_return_px: float = config.key(
+        0.7, "a point that misses its start by more, followed back, is dropped",
+        unit="px", low=0.05, high=10,
+    )  # fmt: skip
+    sigma_px: float = config.key(
+        1.5, "standard deviation of a followed point", unit="px", low=0.1, high=50
+    )
+    min_inliers: int = config.key(
+        40, "with fewer the frame's own features are computed at once", low=6, high=1000
+    )
+    keyframe_interval_s: float = config.key(
+        0.2, "a keyframe as old as this is replaced", unit="s", low=0, high=10
+    )
+    keyframe_min_share: float = config.key(
+        0.6, "and one of which a smaller share of points is found again", low=0, high=1
+    )
+    features_lag_frames: int = config.key(
+        6, "frames after which a keyframe's features land, waited for; 0: when ready",
+        low=0, high=30,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class StateSettings:
     """When a localizer calls itself degraded or lost."""
 
@@ -170,6 +202,7 @@ class LocalizerSettings:
     projection: ProjectionSettings = config.table(ProjectionSettings)
     association: AssociationSettings = config.table(AssociationSettings)
     pose: PoseSettings = config.table(PoseSettings)
+    tracking: TrackingSettings = config.table(TrackingSettings)
     state: StateSettings = config.table(StateSettings)
     recovery: RecoverySettings = config.table(RecoverySettings)
 

@@ -1,0 +1,263 @@
+"""Frames in between: points followed from a keyframe, and keyframes made beside the tracking."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from ground_station.features.rootsift import RootSift
+from ground_station.geometry import poses
+from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization.estimate import State
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import TrackingSettings, load_preset
+from ground_station.localization.tracking import Keyframe, spread_out, track
+from ground_station.localization.worker import Worker
+from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
+
+DEPTH_M = 4.0
+
+
+class Wall:
+    """A textured wall 4 m ahead, and pictures of it through the thesis's lens."""
+
+    def __init__(self, seed: int = 5) -> None:
+        rng = np.random.default_rng(seed)
+        self.camera = THESIS_CAMERA
+        self.texture = cv2.GaussianBlur(
+            rng.uniform(0, 255, (1800, 2400)).astype(np.float32), (0, 0), 3
+        )
+        self.texture = cv2.normalize(self.texture, None, 0, 255, cv2.NORM_MINMAX)
+        self.scale = 250.0
+        rows, columns = np.mgrid[: self.camera.height_px, : self.camera.width_px]
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+        self.rays = np.c_[self.camera.undistort(pixels), np.ones(len(pixels))]
+
+    def on_wall(self, rays: np.ndarray, wTc: np.ndarray) -> np.ndarray:
+        """Where rays (N, 3) of a camera at wTc meet the wall, (N, 3)."""
+        turned = rays @ wTc[:3, :3].T
+        return wTc[:3, 3] + turned * ((DEPTH_M - wTc[2, 3]) / turned[:, 2])[:, None]
+
+    def picture(self, wTc: np.ndarray) -> np.ndarray:
+        """The grey image (H, W) a camera at wTc takes."""
+        where = self.on_wall(self.rays, wTc)[:, :2] * self.scale + [1200, 900]
+        shape = (self.camera.height_px, self.camera.width_px)
+        x, y = where.astype(np.float32).reshape(*shape, 2).transpose(2, 0, 1)
+        return cv2.remap(self.texture, x, y, cv2.INTER_LINEAR).astype(np.uint8)
+
+    def keyframe(self, wTc: np.ndarray, count: int = 200, seed: int = 1) -> Keyframe:
+        rng = np.random.default_rng(seed)
+        pixel = rng.uniform([60, 60], [580, 420], (count, 2)).astype(np.float32)
+        rays = np.c_[self.camera.undistort(pixel), np.ones(count)]
+        points = self.on_wall(rays, wTc)
+        return Keyframe(0, self.picture(wTc), wTc, pixel, np.arange(count), points)
+
+    def map(self) -> Map:
+        """Landmarks from RootSIFT of one picture, each where its ray meets the wall."""
+        wTc = np.eye(4)
+        features = RootSift(1000).extract(self.picture(wTc))
+        rays = np.c_[self.camera.undistort(features.keypoints_px), np.ones(len(features))]
+        position = self.on_wall(rays, wTc)
+        n = len(position)
+        landmarks = Landmarks(
+            id=np.arange(n, dtype=np.int64),
+            position_m=position,
+            covariance_m2=np.tile(np.eye(3, dtype=np.float32) * 1e-4, (n, 1, 1)),
+            descriptor=features.descriptors,
+            spread=np.full(n, 0.1, np.float32),
+            view_direction=np.tile(np.array([0, 0, -1], np.float32), (n, 1)),
+            view_cos=np.full(n, 0.5, np.float32),
+            distance_m=np.tile(np.array([3, 6], np.float32), (n, 1)),
+            observations=np.full(n, 5, np.int32),
+        )
+        keyframes = Keyframes(
+            names=[],
+            time_ns=np.empty(0, np.int64),
+            wTc=np.empty((0, 4, 4)),
+            offset=np.zeros(1, np.int64),
+            landmark=np.empty(0, np.int32),
+            pixel_px=np.empty((0, 2), np.float32),
+        )
+        sift = RootSift()
+        info = MapInfo(sift.name, sift.sha256, 128, self.camera, "wall", "world", "m")
+        return Map(info, landmarks, keyframes)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    return Wall()
+
+
+def path(count):
+    """A smooth sway before the wall at 30 Hz: times (N,), ns, and poses (N, 4, 4)."""
+    t = np.arange(count) / 30.0
+    wTc = [
+        poses.exp([0.02 * np.sin(2 * a), 0.05 * np.sin(a), 0.03 * a, 0.2 * a, 0.1 * a * a, 0.1 * a])
+        for a in t
+    ]
+    return np.round(t * 1e9).astype(np.int64).tolist(), wTc
+
+
+def make(wall, **changes):
+    settings = load_preset("default")
+    tracking = dataclasses.replace(settings.tracking, **({"enabled": True} | changes))
+    settings = dataclasses.replace(settings, tracking=tracking)
+    extractor = Counting()
+    return Localizer(wall.map(), wall.camera, extractor, settings), extractor
+
+
+class Counting(RootSift):
+    """RootSIFT that remembers which threads it ran in."""
+
+    def __init__(self):
+        super().__init__(1000)
+        self.threads = []
+
+    def extract(self, image):
+        self.threads.append(threading.current_thread().name)
+        return super().extract(image)
+
+
+def run(wall, count=24, **changes):
+    localizer, extractor = make(wall, **changes)
+    times, truth = path(count)
+    localizer.set_initial_pose(truth[0], times[0])
+    estimates = [
+        localizer.process(time_ns, wall.picture(wTc), k)
+        for k, (time_ns, wTc) in enumerate(zip(times, truth, strict=True))
+    ]
+    return estimates, truth, extractor
+
+
+def test_points_are_found_where_the_wall_says_they_are(wall):
+    keyframe = wall.keyframe(np.eye(4))
+    wTc = poses.exp([0.02, -0.03, 0.04, 0.1, -0.05, 0.1])
+    predicted = wTc @ poses.exp([0.004, 0.004, 0.0, 0.01, 0.0, 0.0])
+    tracks = track(keyframe, wall.picture(wTc), predicted, wall.camera, TrackingSettings())
+    truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
+    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
+    assert len(tracks.point) > 0.9 * tracks.sought > 100
+    assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.5
+
+
+def test_points_of_what_is_no_longer_there_are_dropped(wall):
+    keyframe = wall.keyframe(np.eye(4))
+    other = Wall(seed=6).picture(np.eye(4))
+    tracks = track(keyframe, other, np.eye(4), wall.camera, TrackingSettings())
+    assert tracks.sought == len(keyframe) and len(tracks.point) < 0.2 * tracks.sought
+
+
+def test_points_out_of_view_are_not_sought(wall):
+    keyframe = wall.keyframe(np.eye(4))
+    away = poses.exp([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])
+    tracks = track(keyframe, keyframe.image, away, wall.camera, TrackingSettings())
+    assert tracks.sought == 0 and len(tracks.point) == 0
+
+
+def test_points_are_kept_evenly_and_the_best_first():
+    rng = np.random.default_rng(3)
+    crowd = rng.uniform([0, 0], [30, 30], (500, 2))
+    rest = np.array([[100.0, 100.0], [400.0, 100.0], [100.0, 400.0]])
+    chosen = spread_out(np.concatenate([crowd, rest]), 10)
+    assert len(chosen) == 10 and {500, 501, 502, 0} <= set(chosen.tolist())
+    assert spread_out(rest, 10).tolist() == [0, 1, 2]
+
+
+def test_frames_in_between_are_tracked_as_well_as_described_ones(wall):
+    estimates, truth, extractor = run(wall)
+    assert not estimates[0].tracked and all(e.tracked for e in estimates[1:])
+    for estimate, wTc in zip(estimates, truth, strict=True):
+        apart = poses.log(poses.inverse(wTc) @ estimate.wTc)
+        assert estimate.state is State.TRACKING
+        assert np.linalg.norm(apart[3:]) < 0.01 and np.linalg.norm(apart[:3]) < 0.003
+    assert {"track", "pose", "total"} <= set(estimates[1].stage_ms)
+    assert any("background" in e.stage_ms for e in estimates)
+    assert estimates[5].counts.inliers == estimates[5].observations.inlier.sum()
+    # One in the foreground, and the keyframes after it beside the frames.
+    assert extractor.threads[0] == threading.current_thread().name
+    assert len(extractor.threads) >= 3
+    assert all(name.startswith("keyframes") for name in extractor.threads[1:])
+
+
+def test_the_same_frames_give_the_same_poses_again(wall):
+    first, second = (run(wall)[0] for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        assert np.array_equal(a.wTc, b.wTc) and np.array_equal(a.covariance, b.covariance)
+
+
+def test_a_black_frame_falls_back_to_its_own_features_and_the_next_comes_back(wall):
+    localizer, extractor = make(wall)
+    times, truth = path(12)
+    localizer.set_initial_pose(truth[0], times[0])
+    for k in range(8):
+        localizer.process(times[k], wall.picture(truth[k]), k)
+    black = localizer.process(times[8], np.zeros((480, 640), np.uint8), 8)
+    assert not black.localized and not black.tracked and black.state is State.DEGRADED
+    assert extractor.threads[-1] == threading.current_thread().name
+    back = localizer.process(times[9], wall.picture(truth[9]), 9)
+    assert back.localized and not back.tracked
+    assert localizer.process(times[10], wall.picture(truth[10]), 10).tracked
+
+
+def test_a_relocalization_is_not_confirmed_by_its_own_points(wall):
+    localizer, _ = make(wall)
+    times, truth = path(3)
+    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(3)]
+    assert frames[0].relocalized
+    assert frames[1].state is State.TRACKING and not frames[1].tracked
+    assert frames[2].tracked
+
+
+def test_a_time_that_jumps_back_is_refused_while_tracking(wall):
+    localizer, _ = make(wall)
+    times, truth = path(4)
+    localizer.set_initial_pose(truth[0], times[0])
+    for k in range(3):
+        localizer.process(times[k], wall.picture(truth[k]), k)
+    refused = localizer.process(times[1], wall.picture(truth[1]), 1)
+    assert refused.reason.startswith("refused") and refused.wTc is None
+    assert localizer.process(times[3], wall.picture(truth[3]), 3).tracked
+
+
+def test_the_thesis_preset_describes_every_frame():
+    assert not load_preset("thesis").tracking.enabled
+
+
+def test_a_result_lands_at_its_frame_and_is_waited_for():
+    worker: Worker[int] = Worker(3)
+    release = threading.Event()
+    worker.submit(lambda: 7 if release.wait(10) else 0)
+    assert worker.collect() is None and worker.collect() is None and worker.busy
+    release.set()
+    assert worker.collect() == 7 and not worker.busy and worker.collect() is None
+
+
+def test_without_a_lag_nothing_is_waited_for():
+    worker: Worker[int] = Worker(0)
+    release, done = threading.Event(), threading.Event()
+
+    def job() -> int:
+        release.wait(10)
+        return 7
+
+    worker.submit(job)
+    assert worker.collect() is None and worker.busy
+    release.set()
+    for _ in range(1000):
+        if (result := worker.collect()) is not None or done.wait(0.01):
+            break
+    assert result == 7
+
+
+def test_what_a_job_raised_is_raised_where_it_lands_and_a_dropped_one_never():
+    worker: Worker[int] = Worker(1)
+    worker.submit(lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        worker.collect()
+    worker.submit(lambda: 1 // 0)
+    worker.drop()
+    assert not worker.busy and worker.collect() is None
