@@ -132,7 +132,11 @@ class TrackingSettings:
         unit="px", low=0.05, high=10,
     )  # fmt: skip
     sigma_px: float = config.key(
-        1.5, "standard deviation of a followed point", unit="px", low=0.1, high=50
+        3.0,
+        "standard deviation of a followed point, common errors of its keyframe included",
+        unit="px",
+        low=0.1,
+        high=50,
     )
     min_inliers: int = config.key(
         40, "with fewer the frame's own features are computed at once", low=6, high=1000
