@@ -24,9 +24,10 @@ from ground_station.localization.motion import MotionModel
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import PoseSolution, failure, solve_graph
 from ground_station.localization.projection import Lens, project
-from ground_station.localization.relocalization import relocalize, spread
+from ground_station.localization.relocalization import Relocalizer, spread
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe, spread_out, track
+from ground_station.localization.visibility import LandmarkIndex
 from ground_station.localization.worker import Worker
 from ground_station.mapping.store import Map, check_features
 from pi_firmware.wire.entropy import entropy_bits
@@ -58,6 +59,11 @@ class Localizer:
         check_features(map_.info, extractor.name, extractor.sha256)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._lens = Lens(camera)
+        self._index = LandmarkIndex(map_.landmarks)
+        recovery = settings.recovery
+        self._relocalizer = (
+            Relocalizer(map_, camera, recovery, settings.seed) if recovery.relocalize else None
+        )
         self._solve = _SOLVERS[settings.pose.solver]
         self._tracked_pose = dataclasses.replace(
             settings.pose, sigma_px=settings.tracking.sigma_px, min_inliers=6
@@ -258,7 +264,8 @@ class Localizer:
 
     def _track_once(self, attempt: Attempt, wTc: Array, radius_px: float) -> PoseSolution:
         landmarks, camera, settings = self.map.landmarks, self.camera, self.settings
-        projected = project(landmarks, wTc, self._lens, settings.projection)
+        among = self._index.near(wTc, self._lens, settings.projection)
+        projected = project(landmarks, wTc, self._lens, settings.projection, among)
         focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
         pinhole_px = attempt.normalized * focal + centre
         attempt.watch.lap("projection")
@@ -314,14 +321,8 @@ class Localizer:
 
     def _relocalize(self, attempt: Attempt) -> PoseSolution:
         self._last_relocalization_ns = attempt.time_ns
-        found = relocalize(
-            attempt.features,
-            attempt.normalized,
-            self.map.landmarks,
-            self.camera,
-            self.settings.recovery,
-            self.settings.seed,
-        )
+        assert self._relocalizer is not None  # the settings say so: _may_relocalize
+        found = self._relocalizer.find(attempt.features, attempt.normalized)
         attempt.watch.lap("relocalization")
         if isinstance(found, str):
             return failure(0, 0, found)
