@@ -260,17 +260,3 @@ def _only_place(search: _Search) -> Relocalization | str:
     everything = np.arange(len(search.landmarks))
     wTc = search.propose(everything)
     return wTc if isinstance(wTc, str) else search.confirm(wTc, everything)
-
-
-def relocalize(
-    features: Features,
-    normalized: Array,
-    landmarks: Landmarks,
-    camera: Camera,
-    settings: RecoverySettings,
-    seed: int,
-) -> Relocalization | str:
-    """As `Relocalizer.find`, without keyframes: every landmark is matched, at a cost in time."""
-    if not len(features):
-        return "no features"
-    return _only_place(_Search(features, normalized, landmarks, Lens(camera), settings, seed))

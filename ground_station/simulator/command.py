@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `blimp simulate`."""
     parser.epilog = EXAMPLE
     add = parser.add_argument
-    add("--scene", default="atrium", help="building to fly in (default: atrium)")
+    add("--scene", default="atrium", help="atrium or office (default: atrium)")
     add("--plan", default="loop", help="mapping, loop, small-circle or fast (default: loop)")
     add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")
