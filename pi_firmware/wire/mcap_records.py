@@ -64,6 +64,8 @@ def records(file: IO[bytes]) -> Iterator[Record | Footer]:
     against what the file still has before anything is read, so that it cannot ask for memory.
     """
     size = file.seek(0, io.SEEK_END)
+    file.seek(max(0, size - len(MAGIC)))
+    ends_whole = file.read() == MAGIC
     at = file.seek(len(MAGIC))
     crc = zlib.crc32(MAGIC)
     while size - at >= 9:
@@ -72,6 +74,10 @@ def records(file: IO[bytes]) -> Iterator[Record | Footer]:
         if opcode == 0:
             raise Damage(f"damaged at byte {at}: no record starts here")
         if length > size - at - 9:
+            # A file with its closing magic was not cut: its length is wrong, and what follows may
+            # be as well, with no checksum to tell.
+            if ends_whole:
+                raise Damage(f"damaged at byte {at}: a length is wrong")
             if opcode == Opcode.CHUNK:
                 yield from _whole_ones(file.read(min(size - at - 9, _SALVAGE_LIMIT_BYTES)))
             return
