@@ -1,0 +1,80 @@
+"""Where the camera is and how it moves, with what is known of both: the state of the filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Pose and velocity at a time.
+
+    `wTc` (4, 4); `twist` (6,) in the camera's axes, rotation (rad/s) before translation (m/s), so
+    that wTc(t + dt) = wTc·exp(twist·dt); `covariance` (12, 12) of the right tangent of the pose
+    (rotation, translation) and then of the twist.
+    """
+
+    time_ns: int
+    wTc: Array
+    twist: Array
+    covariance: Array
+
+    def after(self, dt_s: float) -> Array:
+        """The pose (4, 4) `dt_s` later at the same twist."""
+        return np.asarray(self.wTc @ poses.exp(self.twist * dt_s))
+
+
+@dataclass(frozen=True)
+class Sights:
+    """N landmarks seen in one frame.
+
+    `points_m` (N, 3) in the world; `pinhole_px` (N, 2), undistorted pixels; `row_s` (N,), when each
+    one's row was exposed after the frame's time (0 for a global shutter); `sigma_px` (N,), standard
+    deviation of a pixel coordinate; `covariance_m2` (N, 3, 3) of the points' positions.
+    """
+
+    points_m: Array
+    pinhole_px: Array
+    row_s: Array
+    sigma_px: Array
+    covariance_m2: Array
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A pose and twist from a prediction and one frame's sights; `state` is None when it failed.
+
+    `information` (12, 12) and `gradient` (12,) are of the sights alone, robustly weighted, at the
+    solution: minus log-likelihood is ½ δᵀ·information·δ + gradientᵀ·δ for a tangent step δ of pose
+    and twist. `innovation` is the squared Mahalanobis distance of the solution from the prediction
+    by the prediction's covariance (12 degrees of freedom). `residual_px` (N,) and `inlier` (N,)
+    belong to the sights given; `reason` says why there is no state.
+    """
+
+    state: Kinematics | None
+    information: Array
+    gradient: Array
+    residual_px: Array
+    inlier: Flags
+    innovation: float = float("nan")
+    iterations: int = 0
+    reason: str = ""
+
+
+def no_solution(count: int, reason: str, iterations: int = 0) -> Solution:
+    """A solution that is none, of `count` sights."""
+    return Solution(
+        None, np.zeros((12, 12)), np.zeros(12), np.full(count, np.inf), np.zeros(count, bool),
+        iterations=iterations, reason=reason,
+    )  # fmt: skip
