@@ -7,15 +7,17 @@ from pathlib import Path
 
 import av
 import numpy as np
+import numpy.typing as npt
 
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.recording.exposures import Exposures
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey
 from ground_station.recording.video import check_given, frame_name
 from pi_firmware.wire import annexb, config
-from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
+from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader, VideoSample
 
 CAMERA_TABLE = "camera"
 """The recording's metadata table that may hold `readout_s`, which no Foxglove message has."""
@@ -42,11 +44,13 @@ class FlightRecording:
     def __iter__(self) -> Iterator[Frame]:
         self.notes.clear()
         reader, decoder = RecordingReader(self.path), Decoder()
+        exposures = Exposures(self.path)
         given = 0
-        for number, time_ns, picture in self._pictures(reader, decoder):
+        for number, sample, picture in self._pictures(reader, decoder):
             if number in self._range:
                 given += 1
-                yield self._frame(number, time_ns, grey(picture))
+                exposure_s = exposures.of(sample)
+                yield self._frame(number, sample.time_ns, grey(picture), exposure_s)
         if reader.cut:
             self.notes.append(f"{self.path}: cut ({reader.cut_reason}); {given} frames read")
         if decoder.damaged:
@@ -57,9 +61,9 @@ class FlightRecording:
 
     def _pictures(
         self, reader: RecordingReader, decoder: Decoder
-    ) -> Iterator[tuple[int, int, av.VideoFrame]]:
-        """Every picture up to the range's end with its access unit's number and capture time."""
-        times_ns: dict[int, int] = {}
+    ) -> Iterator[tuple[int, VideoSample, av.VideoFrame]]:
+        """Every picture up to the range's end with its access unit and that one's number."""
+        samples: dict[int, VideoSample] = {}
         missing, is_empty = {annexb.NAL_SPS, annexb.NAL_PPS}, True
         for k, sample in enumerate(reader.video()):
             if self._range.is_past(k):
@@ -67,22 +71,24 @@ class FlightRecording:
             is_empty = False
             if missing:
                 missing -= set(annexb.nal_types(sample.data))
-            times_ns[k] = sample.time_ns
+            samples[k] = sample
             for number, picture in decoder.decode(sample.data, k):
-                yield number, times_ns.pop(number), picture
+                yield number, samples.pop(number), picture
         for number, picture in decoder.flush():
-            yield number, times_ns.pop(number), picture
+            yield number, samples.pop(number), picture
         if missing and not is_empty:
             raise InputError(f"{self.path}: its video carries no H.264 parameter sets (SPS/PPS)")
 
-    def _frame(self, number: int, time_ns: int, image: np.ndarray) -> Frame:
+    def _frame(
+        self, number: int, time_ns: int, image: npt.NDArray[np.uint8], exposure_s: float | None
+    ) -> Frame:
         height, width = image.shape
         if self.camera and (width, height) != (self.camera.width_px, self.camera.height_px):
             raise InputError(
                 f"{self.path}: its video has {width}x{height} px, its calibration "
                 f"{self.camera.width_px}x{self.camera.height_px} px"
             )
-        return Frame(number, frame_name(number), time_ns, image)
+        return Frame(number, frame_name(number), time_ns, image, exposure_s)
 
 
 def camera_of(reader: RecordingReader) -> Camera | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +14,27 @@ from ground_station.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture. `index` counts in the input from 0; `image` is (H, W) uint8, grey."""
+    """One picture. `index` counts in the input from 0; `image` is (H, W) uint8, grey.
+
+    `exposure_s` is how long each row was exposed, None where the input does not tell.
+    """
 
     index: int
     name: str
     time_ns: int
     image: npt.NDArray[np.uint8]
+    exposure_s: float | None = None
+
+
+MAX_EXPOSURE_S = 1.0
+"""No camera that films exposes longer: a message that says so is wrong."""
+
+
+def plausible_exposure_s(value: Any) -> float | None:
+    """An exposure as a message tells it; None unless it is a number above 0 s and at most 1 s."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    return float(value) if 0 < value <= MAX_EXPOSURE_S else None  # NaN fails both
 
 
 @dataclass(frozen=True)

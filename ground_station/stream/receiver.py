@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
@@ -37,7 +38,8 @@ class ReceivedFrame:
 
     `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
     machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is uint8,
-    gray (H, W) or, from a receiver with `color`, BGR (H, W, 3).
+    gray (H, W) or, from a receiver with `color`, BGR (H, W, 3). `exposure_s` is None where the
+    payload does not tell it or what it tells cannot be.
     """
 
     image: NDArray[np.uint8]
@@ -258,7 +260,7 @@ def _frame(
         arrival_ns=arrival_ns,
         entropy_bits=info.entropy_bits,
         sharpness=info.sharpness,
-        exposure_s=info.exposure_s,
+        exposure_s=plausible_exposure_s(info.exposure_s),
         gain=info.gain,
         heartbeat=info.heartbeat,
         ssrc=ssrc,

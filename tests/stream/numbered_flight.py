@@ -82,7 +82,7 @@ def write_flight(path: Path, frames: int, dark: Iterable[int] = ()) -> Path:
     return path
 
 
-def stamped(unit: bytes, index: int) -> bytes:
+def stamped(unit: bytes, index: int, exposure_s: float | None = None) -> bytes:
     """The access unit with the numbers that the payload would put into it."""
     info = sei.FrameInfo(
         sequence=index,
@@ -90,6 +90,7 @@ def stamped(unit: bytes, index: int) -> bytes:
         clock_ns=capture_ns(index) + 5,
         entropy_bits=7.0,
         sharpness=10.0,
+        exposure_s=exposure_s,
     )
     return annexb.insert_before_slice(unit, sei.encode(info))
 

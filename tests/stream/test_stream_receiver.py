@@ -265,3 +265,19 @@ def test_closing_wakes_who_waits() -> None:
     receiver = Receiver(0)
     receiver.close()
     assert receiver.get(60.0) is None
+
+
+def test_an_exposure_that_cannot_be_is_not_passed_on() -> None:
+    told = [0.004, None, float("nan"), -0.01, 0.0, 5.0, 1.0]
+    units = [
+        stamped(unit, index, exposure_s)
+        for index, (unit, exposure_s) in enumerate(zip(encoded(FRAMES), told, strict=False))
+    ]
+    with Receiver(port=0, queue_frames=FRAMES) as receiver:
+        send(packets(units), receiver)
+        assert until(lambda: receiver.counters.decoded == len(told))
+        frames = all_frames(receiver)
+    assert [frame.sequence for frame in frames] == list(range(len(told)))
+    assert [frame.exposure_s for frame in frames] == [
+        pytest.approx(0.004), None, None, None, None, None, 1.0
+    ]  # fmt: skip
