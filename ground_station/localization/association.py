@@ -26,6 +26,9 @@ _PREFIX = 128
 _SLACK = 1e-4
 """Of the bound on the cosine, for float32's rounding."""
 
+_GATE = 9.21
+"""The 99 % quantile of chi-square with two degrees of freedom."""
+
 
 @dataclass(frozen=True)
 class Associations:
@@ -48,34 +51,54 @@ def associate(
     candidate_px: Array,
     candidate_descriptors: F32,
     settings: AssociationSettings,
-    radius_px: float | None = None,
+    radius_px: float | Array | None = None,
+    max_distance: Array | F32 | None = None,
+    innovation_px2: Array | None = None,
 ) -> Associations:
     """Pairs features (F, 2), (F, D) with expected landmarks (L, 2), (L, D), all unit descriptors.
 
     Each feature takes, of the landmarks within `radius_px` of it, the one with the smallest L2
     descriptor distance, if that is below `max_descriptor_distance` and stands out from the second
     by `max_ratio`; of features that take the same landmark the nearest in descriptor keeps it.
+
+    `radius_px` may be one for each landmark (L,). `max_distance` (L,) gives each landmark a limit
+    of its own instead of `max_descriptor_distance`; beyond its limit over `max_ratio` it is no
+    rival either. `innovation_px2` (L, 2, 2), the covariance of a feature about each landmark's
+    projection, also drops pairs beyond its 99 % ellipse. A landmark whose radius, limit or
+    covariance is not finite is not paired.
     """
-    radius = settings.radius_px if radius_px is None else radius_px
+    radius = np.asarray(settings.radius_px if radius_px is None else radius_px, np.float64)
+    limit = np.asarray(settings.max_descriptor_distance, np.float32)
+    if max_distance is not None:
+        limit = np.asarray(max_distance, np.float32)
+    # NaN would spoil the largest of them; no pair is nearer than -1.
+    radius, limit = (np.where(np.isfinite(each), each, -1.0) for each in (radius, limit))
     empty = np.empty(0, np.intp)
     if not len(feature_px) or not len(candidate_px):
         return Associations(empty, empty, np.empty(0, np.float32))
     # A second landmark farther off than this can neither win nor spoil a winner's ratio.
-    farthest = min(settings.max_descriptor_distance / settings.max_ratio, 2.0)
+    farthest = np.clip(limit / settings.max_ratio, 0.0, 2.0)
     feature, candidate = _near_in_both(
         feature_px,
         _bounding(feature_descriptors),
         candidate_px,
         _bounding(candidate_descriptors),
-        radius,
+        float(radius.max()),
         1.0 - 0.5 * farthest**2 - _SLACK,
     )
+    near = _near(feature_px[feature] - candidate_px[candidate], candidate, radius, innovation_px2)
+    feature, candidate = feature[near], candidate[near]
     apart = feature_descriptors[feature] - candidate_descriptors[candidate]
     distance = np.sqrt(np.einsum("ij,ij->i", apart, apart)).astype(np.float32)
+    if limit.ndim:
+        plausible = distance <= farthest[candidate]
+        feature, candidate, distance = feature[plausible], candidate[plausible], distance[plausible]
+        limit = limit[candidate]
     order = np.lexsort((candidate, distance, feature))
     feature, candidate, distance = feature[order], candidate[order], distance[order]
+    limit = limit[order] if limit.ndim else limit
     new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
-    wins = new & (distance < settings.max_descriptor_distance)
+    wins = new & (distance < limit)
     if settings.max_ratio < 1.0:
         second = np.full(len(distance), np.inf, np.float32)
         second[:-1] = np.where(new[1:], np.inf, distance[1:])
@@ -107,14 +130,17 @@ def _near_in_both(
     candidate_px: Array,
     candidate_rows: F32,
     radius_px: float,
-    least_product: float,
+    least_product: Array,
 ) -> tuple[Indices, Indices]:
-    """The pairs within a radius whose rows' product is large enough, in no order.
+    """The pairs whose rows' product is large enough, of those within a radius and some others.
+
+    `least_product` is a number or one for each candidate. The pairs are in no order.
 
     Features are cut into bands of y and chunks of x. The landmarks around a chunk are consecutive
     in its band's order of x, so that each chunk is one small matrix product: far cheaper than all
     products, and than gathering two rows for each pair.
     """
+    each = least_product.ndim > 0
     height = max(2 * radius_px, _BAND_PX)
     band = np.floor(feature_px[:, 1] / height)
     features = np.lexsort((feature_px[:, 0], band))
@@ -128,6 +154,7 @@ def _near_in_both(
         mine = features[begin:end]
         x, xs = feature_px[mine, 0], candidate_px[around, 0]
         A, B = feature_rows[mine], candidate_rows[around]
+        least = least_product[around, None] if each else least_product
         starts = np.arange(0, len(mine), _CHUNK)
         stops = np.minimum(starts + _CHUNK, len(mine))
         lefts = np.searchsorted(xs, x[starts] - radius_px, "left")
@@ -136,10 +163,25 @@ def _near_in_both(
             starts.tolist(), stops.tolist(), lefts.tolist(), rights.tolist(), strict=True
         ):
             product = B[left:right] @ A[start:stop].T
-            flat = np.flatnonzero(product >= least_product)
+            flat = np.flatnonzero(product >= (least[left:right] if each else least))
             row, column = np.divmod(flat, stop - start)
             pairs.append((mine[start + column], around[left + row]))
     feature, candidate = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    offset = feature_px[feature] - candidate_px[candidate]
-    near = np.einsum("ij,ij->i", offset, offset) <= radius_px**2
-    return feature[near], candidate[near]
+    return feature, candidate
+
+
+def _near(
+    offset_px: Array, candidate: Indices, radius_px: Array, innovation_px2: Array | None
+) -> npt.NDArray[np.bool_]:
+    """Whether offsets (N, 2) from candidates (N,) are within their radius and their ellipse."""
+    radius = radius_px[candidate] if radius_px.ndim else radius_px
+    near = np.einsum("ij,ij->i", offset_px, offset_px) <= np.where(radius < 0, -1, radius**2)
+    if innovation_px2 is None:
+        return near
+    S = np.asarray(innovation_px2, np.float64)[candidate]
+    u, v = offset_px.T
+    a, b, c = S[:, 0, 0], 0.5 * (S[:, 0, 1] + S[:, 1, 0]), S[:, 1, 1]
+    # rᵀS⁻¹r ≤ gate without the division; a matrix that is no covariance holds nothing.
+    determinant = a * c - b * b
+    square = c * u * u - 2 * b * u * v + a * v * v
+    return near & (a > 0) & (determinant > 0) & (square <= _GATE * determinant)
