@@ -34,8 +34,8 @@ class MotionSettings:
 
     model: str = config.key(
         "constant_velocity",
-        "static: where the last solved frame was",
-        choices=["static", "constant_velocity"],
+        "static: where the last solved frame was; blimp: with drag and swing",
+        choices=["static", "constant_velocity", "blimp"],
     )
     max_step_s: float = config.key(
         1.0, "two solved frames further apart give no velocity", unit="s", low=0.001, high=10
@@ -46,6 +46,47 @@ class MotionSettings:
         unit="s",
         low=0,
         high=10,
+    )
+    rotation_density_rad2_s3: float = config.key(
+        3e-4, "spectral density of a quiet flight's angular acceleration, each axis",
+        unit="rad2/s3", low=1e-9, high=1e3,
+    )  # fmt: skip
+    translation_density_m2_s3: float = config.key(
+        3e-3, "spectral density of a quiet flight's acceleration, each axis",
+        unit="m2/s3", low=1e-9, high=1e3,
+    )  # fmt: skip
+    density_limit: float = config.key(
+        3000.0, "innovations raise the densities up to this often; 1: they stay", low=1, high=1e6
+    )
+    density_time_s: float = config.key(
+        0.3, "time in which the densities follow the innovations", unit="s", low=0.03, high=60
+    )
+    walk_rotation_rad2_s: float = config.key(
+        0.02, "static: spectral density of the pose's random walk, each axis",
+        unit="rad2/s", low=1e-9, high=1e3,
+    )  # fmt: skip
+    walk_translation_m2_s: float = config.key(
+        0.02, "static: spectral density of the pose's random walk, each axis",
+        unit="m2/s", low=1e-9, high=1e3,
+    )  # fmt: skip
+    drag_time_s: float = config.key(
+        20.0, "blimp: its speed falls to 1/e in this time", unit="s", low=0.1, high=1000
+    )
+    pitch_period_s: float = config.key(
+        3.4, "blimp: period of its swing about the camera's x axis", unit="s", low=0.2, high=60
+    )
+    roll_period_s: float = config.key(
+        1.5, "blimp: period of its swing about the axis across", unit="s", low=0.2, high=60
+    )
+    swing_damping: float = config.key(0.12, "blimp: damping ratio of the swing", low=0, high=0.99)
+    swing_arm_m: float = config.key(
+        0.42, "blimp: the camera is this far below the turning point", unit="m", low=0, high=10
+    )
+    rest_time_s: float = config.key(
+        20.0, "blimp: time in which its direction of rest is learned", unit="s", low=0.1, high=1000
+    )
+    smoother_lag_s: float = config.key(
+        1.0, "smoothed poses use the frames of this long after them", unit="s", low=0.1, high=5
     )
 
 
@@ -88,8 +129,9 @@ class PoseSettings:
 
     solver: str = config.key(
         "graph",
-        "graph: GTSAM factors on pose and landmarks; direct: landmarks marginalised, vectorised",
-        choices=["graph", "direct"],
+        "graph: GTSAM factors on pose and landmarks; direct: landmarks marginalised, vectorised; "
+        "rolling: pose and velocity with a prediction's covariance, rows at their own times",
+        choices=["graph", "direct", "rolling"],
     )
     sigma_px: float = config.key(
         5.0, "standard deviation of an observation", unit="px", low=0.1, high=50
@@ -154,6 +196,24 @@ class TrackingSettings:
 
 
 @dataclass(frozen=True)
+class StartSettings:
+    """What is believed of a pose that did not come from the frame before."""
+
+    sigma_m: float = config.key(
+        0.3, "standard deviation of its position, an axis", unit="m", low=0.001, high=10
+    )
+    sigma_deg: float = config.key(
+        5.0, "and of its direction, an axis", unit="deg", low=0.01, high=90
+    )
+    speed_m_s: float = config.key(
+        1.5, "standard deviation of the velocity, an axis", unit="m/s", low=0.001, high=50
+    )
+    turn_deg_s: float = config.key(
+        40.0, "standard deviation of the turn rate, an axis", unit="deg/s", low=0.1, high=1000
+    )
+
+
+@dataclass(frozen=True)
 class StateSettings:
     """When a localizer calls itself degraded or lost."""
 
@@ -164,11 +224,53 @@ class StateSettings:
         low=0,
         high=60,
     )
+    confirm_frames: int = config.key(
+        1, "frames after a relocalization that must agree before TRACKING", low=0, high=100
+    )
+    recover_frames: int = config.key(
+        0, "good frames in a row from DEGRADED back to TRACKING, less one", low=0, high=100
+    )
     good_inliers: int = config.key(25, "fewer inliers: DEGRADED", low=4, high=1000)
+    good_inlier_share: float = config.key(
+        0.0, "a smaller share of inliers: DEGRADED", low=0, high=1
+    )
     good_spread: float = config.key(
         0.06, "inliers' spread (RMS from their centre over the image's diagonal) below: DEGRADED",
         low=0, high=0.5,
     )  # fmt: skip
+    good_sigma_m: float = config.key(
+        1000.0, "standard deviation of the position above: DEGRADED", unit="m", low=0, high=1000
+    )
+    good_sigma_deg: float = config.key(
+        360.0, "standard deviation of the direction above: DEGRADED", unit="deg", low=0, high=360
+    )
+    good_residual: float = config.key(
+        1000.0, "inliers' RMS residual in standard deviations above: DEGRADED", low=0, high=1000
+    )
+    good_sharpness: float = config.key(
+        0.0, "sharpness over that of the frames before below: DEGRADED", low=0, high=1
+    )
+    max_innovation: float = config.key(
+        1e9, "squared Mahalanobis distance from the prediction (12 degrees of freedom) above: "
+        "DEGRADED", low=0, high=1e9,
+    )  # fmt: skip
+    max_support_s: float = config.key(
+        1000.0, "a keyframe older than this: DEGRADED", unit="s", low=0, high=1000
+    )
+
+
+@dataclass(frozen=True)
+class CovarianceSettings:
+    """From what the filter believes to what is published: calibrated against truth."""
+
+    scale: float = config.key(1.0, "standard deviations are multiplied by it", low=0.01, high=100)
+    floor_m: float = config.key(
+        0.0, "added to the position's variance, an axis: errors that frames share", unit="m",
+        low=0, high=10,
+    )  # fmt: skip
+    floor_deg: float = config.key(
+        0.0, "added to the direction's variance, an axis", unit="deg", low=0, high=90
+    )
 
 
 @dataclass(frozen=True)
@@ -207,7 +309,9 @@ class LocalizerSettings:
     association: AssociationSettings = config.table(AssociationSettings)
     pose: PoseSettings = config.table(PoseSettings)
     tracking: TrackingSettings = config.table(TrackingSettings)
+    start: StartSettings = config.table(StartSettings)
     state: StateSettings = config.table(StateSettings)
+    covariance: CovarianceSettings = config.table(CovarianceSettings)
     recovery: RecoverySettings = config.table(RecoverySettings)
 
 

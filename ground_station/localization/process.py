@@ -1,0 +1,273 @@
+"""How a state moves on between frames, with what is not known of it: the process models.
+
+All are pure functions on `Kinematics`. The tangent of a state has twelve axes: the pose's right
+tangent (rotation, translation), then the twist's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.localization.kinematics import Kinematics
+from ground_station.localization.settings import MotionSettings
+
+Array = npt.NDArray[np.float64]
+
+_SHORTEST_S = 1e-4
+"""No two frames are nearer: a shorter step would give a noise that can't be inverted."""
+
+_ZERO, _ONE = np.zeros((6, 6)), np.eye(6)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a process from one state to a later time.
+
+    `state` is the mean with its covariance, transition·P·transitionᵀ + noise; `transition` (12, 12)
+    takes tangent steps of the state before to those of the predicted one; `noise` (12, 12) is what
+    the process itself does not know, never singular.
+    """
+
+    state: Kinematics
+    transition: Array
+    noise: Array
+
+
+@dataclass(frozen=True)
+class Density:
+    """Spectral densities of the white acceleration: rad²/s³ and m²/s³ along each axis."""
+
+    rotation: float
+    translation: float
+
+    def diagonal(self) -> Array:
+        """(6,), rotation first."""
+        return np.array([self.rotation] * 3 + [self.translation] * 3)
+
+
+def adjoint(aTb: Array) -> Array:
+    """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
+    R, t = aTb[:3, :3], aTb[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[3:, :3] = _hat(t) @ R
+    return result
+
+
+def right_jacobian(xi: Array) -> Array:
+    """(6, 6) J of exp(ξ + δ) ≈ exp(ξ)·exp(J·δ), as its series: Barfoot 2017, eq. 7.78b.
+
+    Exact to 1e-6 up to a turn of 1 rad, to 1 % up to 2 rad.
+    """
+    minus_ad = -_ad(xi)
+    term, result = minus_ad / 2, _ONE + minus_ad / 2
+    for n in range(3, 10):
+        term = term @ minus_ad / n
+        result += term
+    return np.asarray(result)
+
+
+def inverse_right_jacobian(xi: Array) -> Array:
+    """(6, 6) J⁻¹ of log(exp(ξ)·exp(δ)) ≈ ξ + J⁻¹·δ, to the fourth power: ibid., eq. 7.80.
+
+    The missing part is below 1e-4 up to a turn of 1 rad.
+    """
+    ad = _ad(xi)
+    ad2 = ad @ ad
+    return np.asarray(_ONE + ad / 2 + ad2 / 12 - ad2 @ ad2 / 720)
+
+
+def difference(a: Kinematics, b: Kinematics) -> Array:
+    """The tangent step (12,) from state a to state b."""
+    return np.concatenate([poses.log(poses.inverse(a.wTc) @ b.wTc), b.twist - a.twist])
+
+
+def moved(state: Kinematics, step: Array, covariance: Array) -> Kinematics:
+    """The state a tangent step (12,) away, with this covariance (12, 12)."""
+    wTc = _rotation_again(state.wTc @ poses.exp(step[:6]))
+    return Kinematics(state.time_ns, wTc, state.twist + step[6:], covariance)
+
+
+def advance(
+    state: Kinematics,
+    time_ns: int,
+    settings: MotionSettings,
+    density: Density,
+    rest_up: Array | None = None,
+) -> Step:
+    """The step of the settings' process from a state to a later time.
+
+    `density` is that of the velocity's white noise; the static process has its own settings.
+    `rest_up` (3,), a unit vector, is where "up" lies in the camera's axes at rest, for the blimp;
+    without it today's is taken. The velocity is carried on for `coast_s`. After that the pose is
+    held and the velocity expected to be 0, and what was dropped of the mean counts as one standard
+    deviation more. Raises `ValueError` when the time is before the state's.
+    """
+    if time_ns < state.time_ns:
+        raise ValueError(f"time {time_ns} ns is before the state's, {state.time_ns} ns")
+    dt_s = max((time_ns - state.time_ns) / 1e9, _SHORTEST_S)
+    carried_s = min(dt_s, max(settings.coast_s, _SHORTEST_S))
+    if settings.model == "static":
+        wTc, twist, transition, noise = _static(state, dt_s, settings)
+        carried_s = dt_s
+    elif settings.model == "blimp":
+        up = state.wTc[2, :3] if rest_up is None else rest_up
+        wTc, twist, transition, noise = _blimp(state, carried_s, settings, density, up)
+    else:
+        wTc, twist, transition, noise = _constant_velocity(state, carried_s, density)
+    if dt_s > carried_s:
+        held_s = dt_s - carried_s
+        hold = np.block([[_ONE, held_s * _ONE], [_ZERO, _ONE]])
+        dropped = np.concatenate([twist * held_s, twist])
+        transition = hold @ transition
+        noise = hold @ noise @ hold.T + _integrated(density, held_s) + np.outer(dropped, dropped)
+        twist = np.zeros(6)
+    covariance = transition @ state.covariance @ transition.T + noise
+    covariance = (covariance + covariance.T) / 2
+    return Step(Kinematics(time_ns, _rotation_again(wTc), twist, covariance), transition, noise)
+
+
+def _static(
+    state: Kinematics, dt_s: float, settings: MotionSettings
+) -> tuple[Array, Array, Array, Array]:
+    # A velocity that is drawn anew each time: over one step its variance is walk/dt, so that the
+    # pose walks at random, and nothing of the old one is kept.
+    walk = np.array([settings.walk_rotation_rad2_s] * 3 + [settings.walk_translation_m2_s] * 3)
+    transition = np.zeros((12, 12))
+    transition[:6, :6] = _ONE
+    return state.wTc, np.zeros(6), transition, np.diag(np.concatenate([walk * dt_s, walk / dt_s]))
+
+
+def _constant_velocity(
+    state: Kinematics, dt_s: float, density: Density
+) -> tuple[Array, Array, Array, Array]:
+    """White noise on acceleration: Anderson and Barfoot, IROS 2015, in right tangents."""
+    step = state.twist * dt_s
+    transition = _transition(step, dt_s * _ONE)
+    return state.wTc @ poses.exp(step), state.twist, transition, _integrated(density, dt_s)
+
+
+def _transition(step: Array, by_twist: Array) -> Array:
+    """(12, 12) of wTc·exp(step) when a twist's step δ changes the tangent `step` by by_twist·δ."""
+    result = np.eye(12)
+    result[:6, :6] = adjoint(poses.exp(-step))
+    result[:6, 6:] = right_jacobian(step) @ by_twist
+    return result
+
+
+def _integrated(density: Density, dt_s: float) -> Array:
+    """(12, 12): the white acceleration of `dt_s` in pose and twist. Barfoot 2017, eq. 3.129."""
+    q = np.diag(density.diagonal())
+    return np.block([[q * dt_s**3 / 3, q * dt_s**2 / 2], [q * dt_s**2 / 2, q * dt_s]])
+
+
+def _blimp(
+    state: Kinematics, dt_s: float, settings: MotionSettings, density: Density, rest_up: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Drag, and pitch and roll as damped pendulums about the hull's turning point above the camera.
+
+    All is linear in (tilt, rates, speed) at the turning point; a constant adjoint takes tangents
+    of the camera there and back.
+    """
+    arm = np.eye(4)
+    arm[:3, 3] = -settings.swing_arm_m * rest_up
+    to_point, to_camera = adjoint(arm), adjoint(poses.inverse(arm))
+    basis = _swing_axes(rest_up)
+    twist = to_point @ state.twist
+    w, v = basis.T @ twist[:3], twist[3:]
+    up = state.wTc[2, :3]
+    tilt = basis.T @ np.cross(up, rest_up)  # a step ξ of the pose adds its part across `rest_up`
+    tilt[2] = 0.0
+    spring = _oscillators(settings, np.array([dt_s]))[:, :, :, 0]
+    angle = np.einsum("aij,aj->ai", spring, np.stack([tilt, w], axis=1))
+    fade = np.exp(-dt_s / settings.drag_time_s)
+    reach_s = settings.drag_time_s * (1 - fade)
+    step = np.concatenate([basis @ (angle[:, 0] - tilt), v * reach_s])
+    moved_twist = np.concatenate([basis @ angle[:, 1], v * fade])
+    # The tangent: its pose part enters by the tilt, its twist part by rates and speed.
+    tilts = np.array([1.0, 1.0, 0.0])
+    by_pose, by_twist = np.zeros((6, 6)), np.zeros((6, 6))
+    by_pose[:3, :3] = basis @ np.diag(tilts * (spring[:, 0, 0] - 1)) @ basis.T
+    by_twist[:3, :3] = basis @ np.diag(spring[:, 0, 1]) @ basis.T
+    by_twist[3:, 3:] = reach_s * np.eye(3)
+    transition = _transition(step, by_twist)
+    transition[:6, :6] += right_jacobian(step) @ by_pose
+    transition[6:9, :3] = basis @ np.diag(tilts * spring[:, 1, 0]) @ basis.T
+    transition[6:9, 6:9] = basis @ np.diag(spring[:, 1, 1]) @ basis.T
+    transition[9:, 9:] = fade * np.eye(3)
+    noise = _swing_noise(settings, density, dt_s, basis)
+    there, back = np.kron(np.eye(2), to_point), np.kron(np.eye(2), to_camera)
+    point = poses.inverse(arm)
+    wTc = state.wTc @ point @ poses.exp(step) @ arm
+    return wTc, to_camera @ moved_twist, back @ transition @ there, back @ noise @ back.T
+
+
+def _swing_axes(rest_up: Array) -> Array:
+    """(3, 3), columns: the axes of pitch and roll in the camera's axes, and up.
+
+    Pitch is about the camera's x axis as far as that is level; a camera that looks along its
+    nose is meant. One on its side takes its z axis instead.
+    """
+    side = np.array([1.0, 0.0, 0.0]) if abs(rest_up[0]) < 0.7 else np.array([0.0, 0.0, 1.0])
+    pitch = side - rest_up * (side @ rest_up)
+    pitch /= np.linalg.norm(pitch)
+    return np.stack([pitch, np.cross(rest_up, pitch), rest_up], axis=1)
+
+
+def _oscillators(settings: MotionSettings, after_s: Array) -> Array:
+    """(3, 2, 2, N): what becomes of angle and rate of pitch, roll and yaw after N times.
+
+    Damped oscillators for pitch and roll; yaw keeps its rate.
+    """
+    result = np.zeros((3, 2, 2, len(after_s)))
+    result[2] = [[np.ones_like(after_s), after_s], [np.zeros_like(after_s), np.ones_like(after_s)]]
+    zeta = settings.swing_damping
+    for axis, period_s in enumerate((settings.pitch_period_s, settings.roll_period_s)):
+        free = 2 * np.pi / period_s
+        damped = free * np.sqrt(1 - zeta**2)
+        fade = np.exp(-zeta * free * after_s)
+        c, s = fade * np.cos(damped * after_s), fade * np.sin(damped * after_s) / damped
+        result[axis] = [[c + zeta * free * s, s], [-(free**2) * s, c - zeta * free * s]]
+    return result
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+
+
+def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis: Array) -> Array:
+    """(12, 12) at the turning point: each axis's answer to white acceleration, by quadrature."""
+    after_s = (_NODES + 1) * dt_s / 2
+    fade = np.exp(-after_s / settings.drag_time_s)
+    along = np.stack([settings.drag_time_s * (1 - fade), fade])
+    turning = _oscillators(settings, after_s)[:, :, 1, :]
+    answer = np.concatenate([turning, np.broadcast_to(along, (3, 2, len(after_s)))])
+    weights = _WEIGHTS * dt_s / 2
+    each = np.einsum("ain,ajn,n->aij", answer, answer, weights) * density.diagonal()[:, None, None]
+    turn = np.eye(6)
+    turn[:3, :3] = basis
+    noise = np.zeros((12, 12))
+    for i in range(2):
+        for j in range(2):
+            noise[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = turn @ np.diag(each[:, i, j]) @ turn.T
+    return noise
+
+
+def _hat(w: Array) -> Array:
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def _ad(xi: Array) -> Array:
+    """(6, 6): the Lie bracket with ξ. Barfoot 2017, eq. 7.46, rotation first."""
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = _hat(xi[:3])
+    result[3:, :3] = _hat(xi[3:])
+    return result
+
+
+def _rotation_again(wTc: Array) -> Array:
+    # Products of products grow their rounding error: see motion.constant_velocity.
+    return poses.from_quaternion(wTc[:3, 3], poses.to_quaternion(wTc))
