@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 import numpy.typing as npt
 
@@ -49,46 +50,35 @@ class Density:
         return np.array([self.rotation] * 3 + [self.translation] * 3)
 
 
+def exp(xi: Array) -> Array:
+    """`poses.exp` of one tangent vector (6,), as GTSAM computes it: faster."""
+    return np.asarray(gtsam.Pose3.Expmap(xi).matrix())
+
+
 def adjoint(aTb: Array) -> Array:
     """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
-    R, t = aTb[:3, :3], aTb[:3, 3]
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[3:, :3] = _hat(t) @ R
-    return result
+    return np.asarray(gtsam.Pose3(aTb).AdjointMap())
 
 
 def right_jacobian(xi: Array) -> Array:
-    """(6, 6) J of exp(ξ + δ) ≈ exp(ξ)·exp(J·δ), as its series: Barfoot 2017, eq. 7.78b.
-
-    Exact to 1e-6 up to a turn of 1 rad, to 1 % up to 2 rad.
-    """
-    minus_ad = -_ad(xi)
-    term, result = minus_ad / 2, _ONE + minus_ad / 2
-    for n in range(3, 10):
-        term = term @ minus_ad / n
-        result += term
-    return np.asarray(result)
+    """(6, 6) J of exp(ξ + δ) ≈ exp(ξ)·exp(J·δ). Barfoot 2017, section 7.1.5."""
+    return np.asarray(gtsam.Pose3.ExpmapDerivative(xi))
 
 
 def inverse_right_jacobian(xi: Array) -> Array:
-    """(6, 6) J⁻¹ of log(exp(ξ)·exp(δ)) ≈ ξ + J⁻¹·δ, to the fourth power: ibid., eq. 7.80.
-
-    The missing part is below 1e-4 up to a turn of 1 rad.
-    """
-    ad = _ad(xi)
-    ad2 = ad @ ad
-    return np.asarray(_ONE + ad / 2 + ad2 / 12 - ad2 @ ad2 / 720)
+    """(6, 6) J⁻¹ of log(exp(ξ)·exp(δ)) ≈ ξ + J⁻¹·δ."""
+    return np.asarray(gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(xi)))
 
 
 def difference(a: Kinematics, b: Kinematics) -> Array:
     """The tangent step (12,) from state a to state b."""
-    return np.concatenate([poses.log(poses.inverse(a.wTc) @ b.wTc), b.twist - a.twist])
+    aTb = gtsam.Pose3(poses.inverse(a.wTc) @ b.wTc)
+    return np.concatenate([gtsam.Pose3.Logmap(aTb), b.twist - a.twist])
 
 
 def moved(state: Kinematics, step: Array, covariance: Array) -> Kinematics:
     """The state a tangent step (12,) away, with this covariance (12, 12)."""
-    wTc = _rotation_again(state.wTc @ poses.exp(step[:6]))
+    wTc = _rotation_again(state.wTc @ exp(step[:6]))
     return Kinematics(state.time_ns, wTc, state.twist + step[6:], covariance)
 
 
@@ -148,13 +138,13 @@ def _constant_velocity(
     """White noise on acceleration: Anderson and Barfoot, IROS 2015, in right tangents."""
     step = state.twist * dt_s
     transition = _transition(step, dt_s * _ONE)
-    return state.wTc @ poses.exp(step), state.twist, transition, _integrated(density, dt_s)
+    return state.wTc @ exp(step), state.twist, transition, _integrated(density, dt_s)
 
 
 def _transition(step: Array, by_twist: Array) -> Array:
     """(12, 12) of wTc·exp(step) when a twist's step δ changes the tangent `step` by by_twist·δ."""
     result = np.eye(12)
-    result[:6, :6] = adjoint(poses.exp(-step))
+    result[:6, :6] = adjoint(exp(-step))
     result[:6, 6:] = right_jacobian(step) @ by_twist
     return result
 
@@ -202,7 +192,7 @@ def _blimp(
     noise = _swing_noise(settings, density, dt_s, basis)
     there, back = np.kron(np.eye(2), to_point), np.kron(np.eye(2), to_camera)
     point = poses.inverse(arm)
-    wTc = state.wTc @ point @ poses.exp(step) @ arm
+    wTc = state.wTc @ point @ exp(step) @ arm
     return wTc, to_camera @ moved_twist, back @ transition @ there, back @ noise @ back.T
 
 
@@ -256,18 +246,8 @@ def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis:
     return noise
 
 
-def _hat(w: Array) -> Array:
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-
-
-def _ad(xi: Array) -> Array:
-    """(6, 6): the Lie bracket with ξ. Barfoot 2017, eq. 7.46, rotation first."""
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = _hat(xi[:3])
-    result[3:, :3] = _hat(xi[3:])
-    return result
-
-
 def _rotation_again(wTc: Array) -> Array:
-    # Products of products grow their rounding error: see motion.constant_velocity.
-    return poses.from_quaternion(wTc[:3, 3], poses.to_quaternion(wTc))
+    # Products of products grow their rounding error: see motion.constant_velocity. One step of
+    # Newton's iteration for the polar factor squares what is left (Higham 1986, SIAM J. Sci. Stat.).
+    R = wTc[:3, :3]
+    return poses.pose(R @ (1.5 * np.eye(3) - 0.5 * R.T @ R), wTc[:3, 3])

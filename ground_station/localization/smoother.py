@@ -1,0 +1,305 @@
+"""The live pose graph: the states of the last second, the sights of each, and the process between.
+
+A fixed-lag smoother on GTSAM's ISAM2 (Kaess et al., IJRR 2012). Its newest state is the causal
+estimate; a state that is one lag old leaves it, and is the smoothed one. The two are never mixed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+from gtsam.symbol_shorthand import X
+
+from ground_station.localization import process
+from ground_station.localization.kinematics import Kinematics, Solution
+from ground_station.localization.process import Density, Step
+from ground_station.localization.settings import MotionSettings
+
+Array = npt.NDArray[np.float64]
+
+_ZERO = np.zeros(12)
+_UNIT = gtsam.noiseModel.Unit.Create(12)
+_ROTATION = np.array([True, False]).repeat(3)
+
+_VAGUE = np.array([0.3] * 3 + [1.0] * 3 + [1.0] * 3 + [2.0] * 3)
+"""Standard deviations (rad, m, rad/s, m/s) of a start whose covariance can't be used."""
+
+
+class _Refused(Exception):
+    """Numbers that no filter can use; the message says which."""
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A state of the graph: its key, and where its factors were made linear."""
+
+    key: int
+    anchor: Kinematics
+
+
+class FixedLagSmoother:
+    """Poses and twists of the last `smoother_lag_s`.
+
+    Each state is one 12-vector of GTSAM, its step from the solution it came with. Factors are linear
+    at that solution: a frame's sights as a Hessian, the process as a Jacobian. So ISAM2 never calls
+    back into Python. `failures` counts updates that could not be used and restarted the graph,
+    `failure` says why the last one could not.
+    """
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self.settings = settings
+        self.failures = 0
+        self.failure = ""
+        self._latest: Kinematics | None = None
+        self._left: list[Kinematics] = []
+        self._adaptation = _Adaptation(settings)
+        self._clear()
+
+    @property
+    def latest(self) -> Kinematics | None:
+        """The newest state, estimated from its own frame and those before; None before a start."""
+        return self._latest
+
+    @property
+    def density(self) -> Density:
+        """The process noise of the next step, as the innovations have set it."""
+        return self._adaptation.density
+
+    def restart(self, state: Kinematics) -> None:
+        """Forgets all, also the states not asked for, and starts from a state's covariance.
+
+        A covariance that is none is replaced by a vague one. Raises `ValueError` when the pose or
+        the twist is not finite.
+        """
+        if not (np.isfinite(state.wTc).all() and np.isfinite(state.twist).all()):
+            raise ValueError("the state to start from is not finite")
+        self._left = []
+        self._start(state)
+
+    def predict(self, time_ns: int) -> Kinematics | None:
+        """What the process expects at a time, from the newest state; None before a start.
+
+        Nothing is changed: a frame that gives no solution stretches the next one's prediction.
+        Raises `ValueError` when the time is before the newest state's.
+        """
+        if self._latest is None:
+            return None
+        return self._advance(self._latest, time_ns, self.density).state
+
+    def update(self, time_ns: int, solution: Solution) -> Kinematics:
+        """Adds a solved frame and returns the newest state with its covariance, causal.
+
+        `solution.information` and `.gradient` are of the frame's sights alone, at `solution.state`.
+        When they can't be used, or the graph becomes singular, it restarts from the solution's own
+        state and covariance; when that is not finite either, the prediction is returned and nothing
+        is added. Raises `ValueError` when there is no state, or its time is not after the newest.
+        """
+        state = solution.state
+        if state is None:
+            raise ValueError("a solution without a state can't be added")
+        state = Kinematics(time_ns, state.wTc, state.twist, state.covariance)
+        latest = self._latest
+        if latest is not None and time_ns <= latest.time_ns:
+            raise ValueError(f"time {time_ns} ns is not after the newest, {latest.time_ns} ns")
+        if latest is None:
+            self.restart(state)
+            return state if self._latest is None else self._latest
+        self._leave(time_ns)
+        try:
+            self._latest = self._add(latest, state, solution)
+        except (_Refused, RuntimeError, np.linalg.LinAlgError, ValueError) as error:
+            # GTSAM raises RuntimeError for a singular system, and its graph is then unusable.
+            self.failures += 1
+            self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if not (np.isfinite(state.wTc).all() and np.isfinite(state.twist).all()):
+                state = self._advance(latest, time_ns, self.density).state
+            self._drain()
+            self._start(state)
+        assert self._latest is not None
+        return self._latest
+
+    def smoothed(self) -> list[Kinematics]:
+        """The states that have left the lag since last asked, oldest first: each used the frames of
+        `smoother_lag_s` after it, fewer before a restart. Never to be published as causal."""
+        left, self._left = self._left, []
+        return left
+
+    def flush(self) -> list[Kinematics]:
+        """At a recording's end: `smoothed()`, and the states still within the lag.
+
+        What was added before then stands only in `latest`: the next update starts from it.
+        """
+        latest = self._latest
+        self._drain()
+        if latest is not None:
+            self._start(latest)
+            self._nodes.clear()
+        return self.smoothed()
+
+    def _clear(self) -> None:
+        parameters = gtsam.ISAM2Params()
+        # All factors are linear where they stay: nothing is to be made linear again, and all of
+        # the lag is to hear of each frame.
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        parameters.setRelinearizeThreshold(1e12)
+        parameters.relinearizeSkip = 1_000_000
+        # A little longer than ours: a state is read by us before GTSAM drops it.
+        lag_s = self.settings.smoother_lag_s + 1e-3
+        self._graph = gtsam.IncrementalFixedLagSmoother(lag_s, parameters)
+        self._nodes: deque[_Node] = deque()
+        self._key = 0
+        self._up: Array | None = None
+
+    def _start(self, state: Kinematics) -> None:
+        self._clear()
+        self._adaptation.restart()
+        covariance, information = _usable(state.covariance)
+        state = Kinematics(state.time_ns, state.wTc, state.twist, covariance)
+        prior = gtsam.HessianFactor(X(0), information, _ZERO, 0.0)
+        self._push(state, [prior])
+        self._latest = state
+        self._up = state.wTc[2, :3].copy()
+
+    def _advance(self, state: Kinematics, time_ns: int, density: Density) -> Step:
+        return process.advance(state, time_ns, self.settings, density, self._up)
+
+    def _add(self, latest: Kinematics, state: Kinematics, solution: Solution) -> Kinematics:
+        information = (solution.information + solution.information.T) / 2
+        if not (np.isfinite(information).all() and np.isfinite(solution.gradient).all()):
+            raise _Refused("the sights' information is not finite")
+        step = self._advance(latest, state.time_ns, self.density)
+        error = process.difference(step.state, state)
+        if not (np.isfinite(error).all() and np.isfinite(step.noise).all()):
+            raise _Refused("the step from the last state is not finite")
+        if self._adaptation.learn(latest, step, error, information):
+            step = self._advance(latest, state.time_ns, self.density)
+        by_state, by_latest = _error_jacobians(error, step.transition)
+        whiten = np.linalg.inv(np.linalg.cholesky(step.noise))
+        before = self._nodes[-1]
+        # The process starts from the last state's estimate, which lies a step from its anchor.
+        offset = self._graph.calculateEstimateVector(before.key)
+        key = X(self._key)
+        process_factor = gtsam.JacobianFactor(
+            before.key, whiten @ by_latest, key, whiten @ by_state,
+            whiten @ (by_latest @ offset - error), _UNIT,
+        )  # fmt: skip
+        sights = gtsam.HessianFactor(key, information, -solution.gradient, 0.0)
+        self._push(state, [process_factor, sights])
+        result = self._estimate(self._nodes[-1])
+        self._learn_rest(result, (state.time_ns - latest.time_ns) / 1e9)
+        return result
+
+    def _push(self, anchor: Kinematics, factors: list[gtsam.GaussianFactor]) -> None:
+        key = X(self._key)
+        graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        start.insert(key, _ZERO)
+        for factor in factors:
+            graph.add(gtsam.LinearContainerFactor(factor))
+        self._graph.update(graph, start, {key: anchor.time_ns / 1e9})
+        self._key += 1
+        self._nodes.append(_Node(key, anchor))
+
+    def _estimate(self, node: _Node) -> Kinematics:
+        step = self._graph.calculateEstimateVector(node.key)
+        covariance = self._graph.marginalCovariance(node.key)
+        if not (np.isfinite(step).all() and (np.diag(covariance) > 0).all()):
+            raise _Refused("the graph's estimate is not finite")
+        return process.moved(node.anchor, step, (covariance + covariance.T) / 2)
+
+    def _leave(self, time_ns: int) -> None:
+        """Reads the states that the coming frame pushes out: their lag is over."""
+        oldest_ns = time_ns - self.settings.smoother_lag_s * 1e9
+        while len(self._nodes) > 1 and self._nodes[0].anchor.time_ns < oldest_ns:
+            self._take(self._nodes.popleft())
+
+    def _drain(self) -> None:
+        for node in self._nodes:
+            self._take(node)
+        self._nodes.clear()
+
+    def _take(self, node: _Node) -> None:
+        # A graph that has failed may not answer any more: its states are then left out.
+        with contextlib.suppress(RuntimeError, _Refused, ValueError):
+            self._left.append(self._estimate(node))
+
+    def _learn_rest(self, state: Kinematics, dt_s: float) -> None:
+        """Where "up" lies in the camera at rest: a slow mean, for the blimp's swing."""
+        assert self._up is not None
+        share = min(1.0, dt_s / self.settings.rest_time_s)
+        up = (1 - share) * self._up + share * state.wTc[2, :3]
+        length = float(np.linalg.norm(up))
+        if length > 1e-3:
+            self._up = up / length
+
+
+class _Adaptation:
+    """The densities of the process, raised and lowered by what the innovations are.
+
+    After Mehra's covariance matching (IEEE TAC 1972), in the form of the likelihood's score. The
+    deviation e of a solution from its prediction has the covariance P − P⁺ when the filter is right
+    (P predicted, P⁺ with the sights), so y = P⁻¹e has S = P⁻¹ − P⁻¹P⁺P⁻¹. Each density's noise Qᵢ
+    weighs the directions in which it tells: yᵀQᵢy is expected to be tr(Qᵢ S).
+    """
+
+    _MOST = 30.0  # one frame's ratio: an outlier shall not open the filter at once
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self.settings = settings
+        self.restart()
+
+    def restart(self) -> None:
+        """Between quiet and wild: nothing is known yet."""
+        self._factor = np.full(2, np.sqrt(self.settings.density_limit))
+
+    @property
+    def density(self) -> Density:
+        """Of the next step."""
+        rotation, translation = (float(f) for f in self._factor)
+        return Density(
+            rotation * self.settings.rotation_density_rad2_s3,
+            translation * self.settings.translation_density_m2_s3,
+        )
+
+    def learn(self, latest: Kinematics, step: Step, error: Array, information: Array) -> bool:
+        """Takes one frame's deviation (12,) into account; whether the densities have changed."""
+        limit = self.settings.density_limit
+        if limit <= 1.0 or self.settings.model == "static":
+            return False
+        precision = np.linalg.inv(step.state.covariance)
+        # P⁻¹ − P⁻¹P⁺P⁻¹ with P⁺ = (P⁻¹ + I)⁻¹
+        expected = precision - precision @ np.linalg.solve(precision + information, precision)
+        pulled = precision @ error
+        dt_s = (step.state.time_ns - latest.time_ns) / 1e9
+        share = min(0.5, dt_s / self.settings.density_time_s)
+        for i, rotates in enumerate((True, False)):
+            axes = np.tile(_ROTATION == rotates, 2)
+            noise = step.noise[np.ix_(axes, axes)]
+            seen = float(pulled[axes] @ noise @ pulled[axes])
+            usual = float(np.sum(noise * expected[np.ix_(axes, axes)]))
+            ratio = min(seen / usual, self._MOST) if usual > 1e-9 else 1.0
+            self._factor[i] = np.clip(self._factor[i] * (1 + share * (ratio - 1)), 1.0, limit)
+        return True
+
+
+def _error_jacobians(error: Array, transition: Array) -> tuple[Array, Array]:
+    """(12, 12) each: how the error (12,) of a state against its prediction moves with steps of that
+    state and, through the process, of the one before."""
+    by_state, by_predicted = np.eye(12), -np.eye(12)
+    by_state[:6, :6] = process.inverse_right_jacobian(error[:6])
+    by_predicted[:6, :6] = -process.inverse_right_jacobian(-error[:6])
+    return by_state, by_predicted @ transition
+
+
+def _usable(covariance: Array) -> tuple[Array, Array]:
+    """A covariance (12, 12) and its inverse; a vague one when it has none."""
+    if covariance.shape == (12, 12) and np.isfinite(covariance).all():
+        covariance = (covariance + covariance.T) / 2
+        with contextlib.suppress(np.linalg.LinAlgError):
+            whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+            return covariance, whiten.T @ whiten
+    return np.diag(_VAGUE**2), np.diag(_VAGUE**-2.0)
