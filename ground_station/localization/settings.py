@@ -214,6 +214,22 @@ class StartSettings:
 
 
 @dataclass(frozen=True)
+class BlurSettings:
+    """How much less an observation weighs in a blurred frame."""
+
+    enabled: bool = config.key(
+        False, "expect blur from speed and exposure; false: all frames weigh alike"
+    )
+    sigma_per_px: float = config.key(
+        0.12, "of an observation, added in quadrature for each pixel of blur", low=0, high=2
+    )
+    plain_sharpness: float = config.key(
+        0.75, "less gradient than this share of the recent frames' is blur, too", low=0.05, high=1
+    )
+    recent_frames: int = config.key(30, "frames whose gradients are compared", low=1, high=1000)
+
+
+@dataclass(frozen=True)
 class StateSettings:
     """When a localizer calls itself degraded or lost."""
 
@@ -310,6 +326,7 @@ class LocalizerSettings:
     pose: PoseSettings = config.table(PoseSettings)
     tracking: TrackingSettings = config.table(TrackingSettings)
     start: StartSettings = config.table(StartSettings)
+    blur: BlurSettings = config.table(BlurSettings)
     state: StateSettings = config.table(StateSettings)
     covariance: CovarianceSettings = config.table(CovarianceSettings)
     recovery: RecoverySettings = config.table(RecoverySettings)
