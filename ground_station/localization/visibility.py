@@ -1,4 +1,8 @@
-"""Which landmarks a camera could see at all, without looking at each of a large map."""
+"""Which landmarks a camera could see at all, without looking at each of a large map.
+
+Two indices: `LandmarkIndex` by place and `Covisibility` by the keyframes that saw landmarks
+together (Alcantarilla et al., ICRA 2010), which also knows what hides behind a wall.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from ground_station.geometry import poses
 from ground_station.localization.projection import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.mapping.store import Landmarks
+from ground_station.mapping.store import Keyframes, Landmarks
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -18,6 +23,13 @@ Indices = npt.NDArray[np.intp]
 _CELL_M = 2.0
 _CELLS_A_BLOCK = 8
 """Along each axis: blocks of 16 m keep the number of tests small in a map of 10⁶ landmarks."""
+
+_SHARED = 0.1
+"""Of the landmarks just seen, the share that a covisible keyframe saw as well,"""
+_NEIGHBOURS, _NEIGHBOUR_M, _NEIGHBOUR_COS = 12, 4.0, 0.5
+"""or it is one of the nearest to the pose that look the same way (60 degrees)."""
+_FEWEST = 60
+"""With fewer landmarks than this the keyframes know too little of the place."""
 
 _SLACK_M = 1e-4
 """For rounding: a sphere that only touches the view counts as in it."""
@@ -58,6 +70,46 @@ class LandmarkIndex:
         cells = cells[_in_view(self._cells, cells, cTw, lens, settings)]
         rows = _ranges(self._cells.starts[cells], self._cells.starts[cells + 1])
         return np.sort(self._order[rows])
+
+
+class Covisibility:
+    """Which landmarks were seen together: by keyframe, and keyframes by landmark."""
+
+    def __init__(self, count: int, keyframes: Keyframes) -> None:
+        """`count` landmarks, M, and the keyframes that observed them."""
+        self._position_m = np.ascontiguousarray(keyframes.wTc[:, :3, 3])
+        self._forward = np.ascontiguousarray(keyframes.wTc[:, :3, 2])
+        self._count, self._offset = count, keyframes.offset
+        self._landmark = keyframes.landmark
+        seen = sparse.csr_matrix(
+            (np.ones(len(keyframes.landmark), np.int8), keyframes.landmark, keyframes.offset),
+            shape=(len(keyframes), count),
+        ).tocsc()
+        self._first, self._keyframe = seen.indptr, seen.indices
+
+    def keyframes(self, recent: Indices, wTc: npt.ArrayLike) -> Indices:
+        """The keyframes that share landmarks `recent` (N,), just seen, or are near wTc (4, 4)."""
+        T = np.asarray(wTc, np.float64)
+        rows = _ranges(self._first[recent], self._first[recent + 1])
+        shared = np.bincount(self._keyframe[rows], minlength=len(self._position_m))
+        chosen = shared >= max(_SHARED * len(recent), 1.0)
+        distance = np.linalg.norm(self._position_m - T[:3, 3], axis=1)
+        distance[self._forward @ T[:3, 2] < _NEIGHBOUR_COS] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:_NEIGHBOURS]
+        chosen[nearest[distance[nearest] < _NEIGHBOUR_M]] = True
+        return np.flatnonzero(chosen)
+
+    def covisible(self, recent: Indices, wTc: npt.ArrayLike, among: Indices) -> Indices:
+        """Of landmarks `among` (N,), those that covisible keyframes saw.
+
+        `recent` (R,) are the landmarks seen just before, maybe none. When too few are left, all
+        are given back: a place that the keyframes hardly know is searched without them.
+        """
+        chosen = self.keyframes(recent, wTc)
+        seen = np.zeros(self._count, bool)
+        seen[self._landmark[_ranges(self._offset[chosen], self._offset[chosen + 1])]] = True
+        left = among[seen[among]]
+        return left if len(left) >= _FEWEST else among
 
 
 def _bound(

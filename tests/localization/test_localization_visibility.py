@@ -10,8 +10,8 @@ import pytest
 from ground_station.geometry import poses
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.localization.visibility import LandmarkIndex
-from ground_station.mapping.store import Landmarks
+from ground_station.localization.visibility import Covisibility, LandmarkIndex
+from ground_station.mapping.store import Keyframes, Landmarks
 
 
 def _building(rng: np.random.Generator, count: int, side_m: float) -> Landmarks:
@@ -77,3 +77,49 @@ def test_a_frame_looks_at_no_more_landmarks_when_the_building_grows(room):
 def test_an_index_of_nothing_sees_nothing(room):
     index = LandmarkIndex(_building(np.random.default_rng(0), 0, 10.0))
     assert len(index.near(np.eye(4), Lens(room.camera), ProjectionSettings())) == 0
+
+
+def _keyframes(position_m, seen):
+    """Keyframes at positions (K, 3) that all look along z, and the landmarks that each saw."""
+    wTc = np.tile(np.eye(4), (len(seen), 1, 1))
+    wTc[:, :3, 3] = position_m
+    return Keyframes(
+        names=[str(k) for k in range(len(seen))],
+        time_ns=np.arange(len(seen)),
+        wTc=wTc,
+        offset=np.r_[0, np.cumsum([len(s) for s in seen])].astype(np.int64),
+        landmark=np.concatenate(seen).astype(np.int32),
+        pixel_px=np.zeros((sum(len(s) for s in seen), 2), np.float32),
+    )
+
+
+def test_behind_the_wall_is_what_no_covisible_keyframe_saw():
+    # Two rooms side by side: keyframes of one saw landmarks 0..99, of the other 100..199.
+    here, there = np.arange(100), np.arange(100, 200)
+    place = [[0, 0, 0], [1, 0, 0], [9, 0, 0], [10, 0, 0]]
+    index = Covisibility(220, _keyframes(place, [here, here[:80], there, there[20:]]))
+    everything = np.arange(220)
+    assert index.covisible(here[:30], np.eye(4), everything).tolist() == here.tolist()
+    assert index.covisible(np.empty(0, np.intp), np.eye(4), everything).tolist() == here.tolist()
+    # Landmarks of the other room, seen through the door, bring its keyframes in; one does not.
+    seen = np.r_[here[:30], there[:10]]
+    assert index.covisible(seen, np.eye(4), everything).tolist() == list(range(200))
+    seen = np.r_[here[:30], there[:1]]
+    assert index.covisible(seen, np.eye(4), everything).tolist() == here.tolist()
+    assert index.covisible(here[:30], np.eye(4), there).tolist() == there.tolist()  # too few left
+
+
+def test_where_no_keyframe_is_near_or_shares_anything_nothing_is_left_out():
+    index = Covisibility(300, _keyframes([[0, 0, 0]], [np.arange(100)]))
+    backwards = poses.exp([0, np.pi, 0, 0, 0, 0])
+    far = poses.exp([0, 0, 0, 50.0, 0, 0])
+    everything, unseen = np.arange(300), np.arange(200, 230)
+    for wTc in (backwards, far):
+        assert index.covisible(unseen, wTc, everything).tolist() == everything.tolist()
+
+
+def test_a_map_without_keyframes_leaves_nothing_out(room):
+    index = Covisibility(len(room.map.landmarks), room.map.keyframes)
+    everything = np.arange(len(room.map.landmarks))
+    found = index.covisible(everything[:20], np.eye(4), everything)
+    assert found.tolist() == everything.tolist()
