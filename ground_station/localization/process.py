@@ -247,7 +247,7 @@ def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis:
 
 
 def _rotation_again(wTc: Array) -> Array:
-    # Products of products grow their rounding error: see motion.constant_velocity. One step of
-    # Newton's iteration for the polar factor squares what is left (Higham 1986, SIAM J. Sci. Stat.).
+    # Products of products grow their rounding error: see motion.constant_velocity. A step of Newton
+    # and Schulz's iteration for the polar factor (Higham 1986) squares what is wrong.
     R = wTc[:3, :3]
     return poses.pose(R @ (1.5 * np.eye(3) - 0.5 * R.T @ R), wTc[:3, 3])

@@ -48,15 +48,15 @@ class MotionSettings:
         high=10,
     )
     rotation_density_rad2_s3: float = config.key(
-        3e-4, "spectral density of a quiet flight's angular acceleration, each axis",
+        1e-4, "spectral density of a quiet flight's angular acceleration, each axis",
         unit="rad2/s3", low=1e-9, high=1e3,
     )  # fmt: skip
     translation_density_m2_s3: float = config.key(
-        3e-3, "spectral density of a quiet flight's acceleration, each axis",
+        1e-3, "spectral density of a quiet flight's acceleration, each axis",
         unit="m2/s3", low=1e-9, high=1e3,
     )  # fmt: skip
     density_limit: float = config.key(
-        3000.0, "innovations raise the densities up to this often; 1: they stay", low=1, high=1e6
+        1e5, "innovations raise the densities up to this often; 1: they stay", low=1, high=1e9
     )
     density_time_s: float = config.key(
         0.3, "time in which the densities follow the innovations", unit="s", low=0.03, high=60
@@ -157,6 +157,9 @@ class PoseSettings:
         0.35, "a pose with a smaller share of inliers is not believed", low=0, high=1
     )
     reject_outliers: bool = config.key(False, "solve once more from the inliers alone")
+    rolling_shutter: bool = config.key(
+        False, "each row at its own time, by the camera's readout time; rolling solver only"
+    )
 
 
 @dataclass(frozen=True)
@@ -181,8 +184,13 @@ class TrackingSettings:
         high=50,
     )
     min_inliers: int = config.key(
-        40, "with fewer the frame's own features are computed at once", low=6, high=1000
+        10, "a followed frame with fewer is not believed", low=6, high=1000
     )
+    keyframe_min_points: int = config.key(20, "a keyframe with fewer is none", low=6, high=1000)
+    keyframe_parallax_px: float = config.key(
+        100.0, "a keyframe whose points moved by this in the median is replaced", unit="px",
+        low=1, high=10000,
+    )  # fmt: skip
     keyframe_interval_s: float = config.key(
         0.2, "a keyframe as old as this is replaced", unit="s", low=0, high=10
     )
@@ -260,8 +268,8 @@ class StateSettings:
     good_sigma_deg: float = config.key(
         360.0, "standard deviation of the direction above: DEGRADED", unit="deg", low=0, high=360
     )
-    good_residual: float = config.key(
-        1000.0, "inliers' RMS residual in standard deviations above: DEGRADED", low=0, high=1000
+    good_residual_px: float = config.key(
+        1000.0, "inliers' RMS residual above: DEGRADED", unit="px", low=0, high=1000
     )
     good_sharpness: float = config.key(
         0.0, "sharpness over that of the frames before below: DEGRADED", low=0, high=1

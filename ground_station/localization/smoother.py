@@ -45,9 +45,9 @@ class _Node:
 class FixedLagSmoother:
     """Poses and twists of the last `smoother_lag_s`.
 
-    Each state is one 12-vector of GTSAM, its step from the solution it came with. Factors are linear
-    at that solution: a frame's sights as a Hessian, the process as a Jacobian. So ISAM2 never calls
-    back into Python. `failures` counts updates that could not be used and restarted the graph,
+    Each state is one 12-vector of GTSAM: its step from the solution it came with. Factors are
+    linear at that solution, a frame's sights as a Hessian, the process as a Jacobian, so that ISAM2
+    never calls back into Python. `failures` counts updates that could not be used and restarted the graph,
     `failure` says why the last one could not.
     """
 
@@ -277,7 +277,7 @@ class _Adaptation:
         dt_s = (step.state.time_ns - latest.time_ns) / 1e9
         share = min(0.5, dt_s / self.settings.density_time_s)
         for i, rotates in enumerate((True, False)):
-            axes = np.tile(_ROTATION == rotates, 2)
+            axes = np.tile(rotates == _ROTATION, 2)
             noise = step.noise[np.ix_(axes, axes)]
             seen = float(pulled[axes] @ noise @ pulled[axes])
             usual = float(np.sum(noise * expected[np.ix_(axes, axes)]))
