@@ -1,0 +1,178 @@
+"""Flights in memory, and a localizer that gets their frames: at once, or each at its time."""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from study.metrics import pose_errors
+
+from ground_station.features.extractors import create
+from ground_station.geometry.camera import Camera, load_camera
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.mapping.store import Map
+from ground_station.recording.flight import trajectory_of
+from ground_station.recording.frames import Frame
+from ground_station.recording.open import open_input, parse_range
+from pi_firmware.wire.recording import RecordingReader
+
+Array = npt.NDArray[np.float64]
+
+QUEUE_FRAMES = 4
+"""As the live receiver's: a late localizer loses the oldest frame of a full queue."""
+
+
+@dataclass
+class Flight:
+    """A flight's frames in memory, its camera and, where it is known, its truth."""
+
+    name: str
+    camera: Camera
+    frames: list[Frame]
+    truth: Trajectory | None
+    about: str
+
+    def true_wTc(self, frames: Sequence[Frame]) -> Array:
+        """The true poses (N, 4, 4) of some of its frames."""
+        assert self.truth is not None, f"{self.name} has no truth"
+        return np.array([self.truth.at(f.time_ns) for f in frames]).reshape(-1, 4, 4)
+
+
+def load_flight(spec: str, limit: int | None = None, frame_range: str = "") -> Flight:
+    """A recording, or `FOLDER@CAMERA.toml`; the first `limit` frames of it."""
+    path, _, camera_file = spec.partition("@")
+    source = open_input(path, 30.0, parse_range(frame_range) if frame_range else None)
+    camera = load_camera(camera_file) if camera_file else source.camera
+    assert camera is not None, f"{path} has no camera"
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        if limit is not None and len(frames) >= limit:
+            break
+    is_recording = path.endswith(".mcap")
+    truth = trajectory_of(path) if is_recording else None
+    about = Path(path).name
+    if is_recording:
+        made = RecordingReader(path).metadata_table("simulation")
+        if made:
+            words = [made.get(k, "?") for k in ("scene", "plan", "light")]
+            about = f"{'/'.join(words)} seed {made.get('seed', '?')}"
+    return Flight(Path(path).name, camera, frames, truth, about)
+
+
+@dataclass
+class Run:
+    """What a localizer said of each frame it got; `late_s` from capture to pose, when paced."""
+
+    frames: list[Frame] = field(default_factory=list)
+    estimates: list[PoseEstimate] = field(default_factory=list)
+    took_ms: list[float] = field(default_factory=list)
+    late_s: list[float] = field(default_factory=list)
+    dropped: int = 0
+
+    @property
+    def time_ns(self) -> npt.NDArray[np.int64]:
+        return np.array([f.time_ns for f in self.frames], np.int64)
+
+    def says(self, state: State) -> npt.NDArray[np.bool_]:
+        """Which frames (N,) are in a state."""
+        return np.array([e.state is state for e in self.estimates], bool)
+
+    @property
+    def localized(self) -> npt.NDArray[np.bool_]:
+        return np.array([e.localized for e in self.estimates], bool)
+
+    @property
+    def wTc(self) -> Array:
+        """Poses (N, 4, 4); NaN where a frame has none."""
+        none = np.full((4, 4), np.nan)
+        found = [none if e.wTc is None else e.wTc for e in self.estimates]
+        return np.array(found, np.float64).reshape(-1, 4, 4)
+
+    def errors(self, true_wTc: Array) -> tuple[Array, Array]:
+        """Distances (N,), metres, and angles (N,), degrees; NaN where a frame has no pose."""
+        return pose_errors(self.wTc, true_wTc)
+
+
+def make_localizer(map_: Map, camera: Camera, settings: LocalizerSettings) -> Localizer:
+    extractor = create(settings.features.extractor, settings.features.max_features)
+    return Localizer(map_, camera, extractor, settings)
+
+
+def close(localizer: Localizer) -> None:
+    """Ends its threads, where it has a way to."""
+    end = getattr(localizer, "close", None)
+    if end is not None:
+        end()
+
+
+Feed = Callable[[Localizer, Iterable[Frame]], Run]
+
+
+def feed(localizer: Localizer, frames: Iterable[Frame]) -> Run:
+    """Gives frame after frame, as fast as they are taken."""
+    run = Run()
+    for frame in frames:
+        _give(localizer, frame, run)
+    return run
+
+
+def feed_paced(localizer: Localizer, frames: Iterable[Frame]) -> Run:
+    """Gives each frame at its time; what piles up is queued, and lost as a receiver loses it."""
+    run, queue = Run(), deque[tuple[float, Frame]]()
+    ahead = iter(frames)
+    upcoming = next(ahead, None)
+    first_ns = upcoming.time_ns if upcoming else 0
+    start_s = time.perf_counter()
+    while upcoming is not None or queue:
+        now_s = time.perf_counter() - start_s
+        while upcoming is not None and (upcoming.time_ns - first_ns) / 1e9 <= now_s:
+            queue.append(((upcoming.time_ns - first_ns) / 1e9, upcoming))
+            upcoming = next(ahead, None)
+        while len(queue) > QUEUE_FRAMES:
+            queue.popleft()
+            run.dropped += 1
+        if queue:
+            due_s, frame = queue.popleft()
+            _give(localizer, frame, run)
+            run.late_s.append(time.perf_counter() - start_s - due_s)
+        elif upcoming is not None:
+            time.sleep(max(0.0, (upcoming.time_ns - first_ns) / 1e9 - now_s))
+    return run
+
+
+def _give(localizer: Localizer, frame: Frame, run: Run) -> None:
+    extra = {}
+    if "exposure_s" in inspect.signature(localizer.process).parameters:
+        extra["exposure_s"] = frame.exposure_s
+    begin = time.perf_counter()
+    estimate = localizer.process(frame.time_ns, frame.image, frame.index, **extra)
+    run.took_ms.append(1e3 * (time.perf_counter() - begin))
+    run.frames.append(frame)
+    run.estimates.append(estimate)
+
+
+def joined(parts: Sequence[Sequence[Frame]], rate_hz: float = 30.0) -> list[Frame]:
+    """Pieces of flights one after the other as one stream with times that go on evenly."""
+    frames = [frame for part in parts for frame in part]
+    return [
+        replace(frame, index=k, time_ns=1_000_000_000 + round(k * 1e9 / rate_hz))
+        for k, frame in enumerate(frames)
+    ]
+
+
+def dark_frames(shape: tuple[int, int], count: int, rng: np.random.Generator) -> list[Frame]:
+    """Black pictures (H, W) with a sensor's noise, exposed as long as it goes."""
+    pool = [
+        np.clip(rng.normal(3.0, 3.0, shape), 0, 255).astype(np.uint8) for _ in range(min(count, 12))
+    ]
+    return [Frame(k, f"dark-{k}", 0, pool[k % len(pool)], 1 / 60) for k in range(count)]

@@ -1,0 +1,143 @@
+"""The localizer's promises, measured: run by hand, not by pytest.
+
+    python tests/localization/study/run.py all --flights out/study/loop-*.mcap \\
+        --fast out/study/fast-*.mcap --others out/reloc/office-*.mcap --json out/study.json
+    python tests/localization/study/run.py demo fast --fast out/fast5.mcap --limit 200
+
+Flights are recordings of `blimp simulate`, which hold their truth and seed; other buildings may
+also be `FOLDER@CAMERA.toml`. Each row prints its bound, its figure and the seeds of its flights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from study import accuracy, recovering
+from study.feeding import feed, feed_paced
+from study.growing import grown
+from study.row import Line, Row, Study
+
+from ground_station.errors import GroundStationError
+from ground_station.files import write_json
+from ground_station.localization.bench import machine
+from ground_station.localization.settings import LocalizerSettings, load_preset
+from ground_station.mapping.store import load
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import BlimpError
+
+ROWS = {
+    "throughput": accuracy.throughput,
+    "demo": accuracy.demo,
+    "fast": accuracy.fast,
+    "kidnapping": recovering.kidnapping,
+    "blackout": recovering.blackout,
+    "others": recovering.other_buildings,
+    "covariance": accuracy.covariance,
+    "kitchen": accuracy.kitchen,
+    "single": recovering.single_frames,
+}
+NEEDS = {"fast": "fast", "kidnapping": "flights", "blackout": "flights", "covariance": "flights",
+         "single": "flights", "others": "others"}  # fmt: skip
+"""Rows that cannot be run without flights of the user's."""
+
+_DATA = Path(__file__).resolve().parents[3] / "../shared/data/redkitchen"
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("rows", nargs="+", metavar="ROW", choices=["all", *ROWS],
+                   help=f"all, or of {', '.join(ROWS)}")  # fmt: skip
+    p.add_argument("--map", default="maps/atrium", help="the flights' map (maps/atrium)")
+    p.add_argument("--demo", help="the demo flight (MAP/flight.mcap)")
+    p.add_argument("--fast", nargs="*", default=[], help="fast flights")
+    p.add_argument("--flights", nargs="*", default=[],
+                   help="flights to jump between and to judge the covariance on")  # fmt: skip
+    p.add_argument("--others", nargs="*", default=[], help="flights of other buildings")
+    p.add_argument("--kitchen", type=Path, default=_DATA, help="folder of the red kitchen")
+    p.add_argument("--kitchen-map", type=Path, default=Path("out/rk"),
+                   help="its map: built of frames 0:500:5, registered by --trajectory")  # fmt: skip
+    p.add_argument("--paced", action="store_true",
+                   help="give each frame at its time; else as fast as they are taken")  # fmt: skip
+    p.add_argument("--settings", metavar="FILE.toml", help="instead of the preset default")
+    p.add_argument("--limit", type=int, help="most frames of a flight, for a quick look")
+    p.add_argument("--jumps", type=int, default=200, help="kidnappings (200)")
+    p.add_argument("--repetitions", type=int, default=10, help="blackouts (10)")
+    p.add_argument("--count", type=int, default=1000, help="frames asked on their own (1000)")
+    p.add_argument("--grow", type=int, default=1, help="the map, this many times over (1)")
+    p.add_argument("--seed", type=int, default=0, help="of the places that are drawn (0)")
+    p.add_argument("--json", metavar="F", help="write everything measured to this file")
+    return p
+
+
+def table(lines: list[Line], title: str = "") -> str:
+    """Lines as text, each in two: what and its bound, then the figure and the seeds."""
+    marks = {True: "met   ", False: "MISSED", None: "      "}
+    text = [title] if title else []
+    for line in lines:
+        text.append(f"{marks[line.met]} {line.what:44s} {line.bound}".rstrip())
+        text.append(f"         {line.figure}")
+        text.append(f"         [{line.seeds}]")
+    return "\n".join(text)
+
+
+def study_of(args: argparse.Namespace) -> Study:
+    """What the arguments ask for; raises the program's own errors with one line."""
+    settings = (
+        config.load(args.settings, LocalizerSettings) if args.settings else load_preset("default")
+    )
+    map_ = load(args.map)
+    return Study(
+        map_=grown(map_, args.grow) if args.grow > 1 else map_,
+        settings=settings,
+        demo=args.demo or f"{args.map}/flight.mcap",
+        fast=args.fast,
+        flights=args.flights,
+        others=args.others,
+        kitchen=args.kitchen,
+        kitchen_map=args.kitchen_map,
+        feed=feed_paced if args.paced else feed,
+        limit=args.limit,
+        jumps=args.jumps,
+        repetitions=args.repetitions,
+        count=args.count,
+        seed=args.seed,
+    )
+
+
+def main(words: list[str] | None = None) -> int:
+    args = parser().parse_args(words)
+    rows = list(ROWS) if "all" in args.rows else list(dict.fromkeys(args.rows))
+    for name in rows:
+        if name in NEEDS and not getattr(args, NEEDS[name]):
+            print(f"study: the row '{name}' needs --{NEEDS[name]}", file=sys.stderr)
+            return 2
+    result: dict[str, Any] = {"machine": machine(), "paced": args.paced, "seed": args.seed}
+    try:
+        study = study_of(args)
+        result |= {"map": args.map, "settings": asdict(study.settings), "rows": {}}
+        for name in rows:
+            begin = time.monotonic()
+            row: Row = ROWS[name](study)
+            took_s = time.monotonic() - begin
+            print(table(row.lines), flush=True)
+            lines = [asdict(line) for line in row.lines]
+            result["rows"][name] = {"lines": lines, "took_s": took_s, "data": row.data}
+            if args.json:  # after every row: an interrupted study keeps what it has
+                write_json(args.json, result)
+    except (GroundStationError, BlimpError) as error:
+        print(f"study: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

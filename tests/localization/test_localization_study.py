@@ -1,0 +1,210 @@
+"""The study's figures are what their names say; the study itself is run by hand (study/run.py)."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from study import metrics
+from study.feeding import QUEUE_FRAMES, dark_frames, feed, feed_paced, joined
+from study.recovering import draw_places
+from study.row import Line
+from study.run import NEEDS, ROWS, main, table
+
+from ground_station.geometry import poses
+from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.recording.frames import Frame
+
+
+def some_poses(count: int, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.array([poses.exp(xi) for xi in rng.normal(0, 1, (count, 6))])
+
+
+def frames(count: int, step_ns: int = 33_333_333) -> list[Frame]:
+    image = np.zeros((4, 4), np.uint8)
+    return [Frame(k, str(k), 5 + k * step_ns, image, 0.01) for k in range(count)]
+
+
+class Slow:
+    """A localizer that takes its time over some frames and remembers what it was given."""
+
+    def __init__(self, slow: set[int], seconds: float) -> None:
+        self.slow, self.seconds = slow, seconds
+        self.given: list[tuple[int, float | None]] = []
+
+    def process(
+        self, time_ns: int, image: np.ndarray, index: int, exposure_s: float | None = None
+    ) -> PoseEstimate:
+        self.given.append((index, exposure_s))
+        if index in self.slow:
+            time.sleep(self.seconds)
+        return PoseEstimate(time_ns, index, State.TRACKING, wTc=np.eye(4))
+
+
+def test_errors_are_distance_and_angle_and_nan_where_there_is_no_pose() -> None:
+    true = some_poses(3)
+    moved = true.copy()
+    moved[0, :3, 3] += [0.3, 0.0, 0.4]
+    moved[1] = true[1] @ poses.exp([0, math.radians(3), 0, 0, 0, 0])
+    moved[2] = np.nan
+    m, deg = metrics.pose_errors(moved, true)
+    np.testing.assert_allclose(m, [0.5, 0, np.nan], atol=1e-9)
+    np.testing.assert_allclose(deg, [0, 3, np.nan], atol=1e-6)
+
+
+def test_rmse_and_largest_leave_missing_frames_out() -> None:
+    assert metrics.rmse([3.0, np.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
+    assert metrics.largest([3.0, np.nan, 4.0]) == 4.0
+    assert math.isnan(metrics.rmse([np.nan])) and math.isnan(metrics.largest([]))
+
+
+@pytest.mark.parametrize(
+    ("flags", "seconds"),
+    [([0, 0, 0], 0), ([0, 1, 0, 0], 1), ([1, 1, 0, 1], 2), ([0, 1, 1, 1], 2), ([], 0), ([1], 0)],
+)
+def test_a_span_lasts_from_its_first_frame_to_the_next_that_is_not(
+    flags: list[int], seconds: float
+) -> None:
+    times = np.arange(len(flags), dtype=np.int64) * 1_000_000_000
+    assert metrics.longest_span_s(times, flags) == seconds
+
+
+def recovered(says: list[int], metres: list[float], degrees: float = 0.5) -> metrics.Recovery:
+    seconds = 0.1 * np.arange(len(says))
+    return metrics.recovery(seconds, says, metres, np.full(len(says), degrees))
+
+
+def test_recovery_counts_only_tracking_near_the_truth() -> None:
+    nan = math.nan
+    clean = recovered([0, 0, 0, 1, 1], [9, nan, 0.1, 0.2, 0.1])
+    assert clean == metrics.Recovery(pytest.approx(0.3), 0.0, 0, 0.2, 0.5)
+    kept = recovered([1, 1, 0, 0, 1], [9, 8, nan, nan, 0.1])
+    assert (kept.recovered_s, kept.kept_s, kept.wrong) == (
+        pytest.approx(0.4), pytest.approx(0.2), 2
+    )  # fmt: skip
+    assert kept.worst_m == 9
+    later = recovered([0, 1, 1], [nan, 3.0, 0.1])
+    assert (later.kept_s, later.wrong) == (0, 1) and later.recovered_s == pytest.approx(0.2)
+    turned = recovered([0, 1, 1], [nan, 0.1, 0.1], degrees=5.0)
+    assert turned.recovered_s == math.inf and turned.wrong == 2
+    never = recovered([0, 0], [nan, nan])
+    assert never.recovered_s == math.inf and math.isnan(never.worst_m)
+    stuck = recovered([1, 1, 1], [9, 9, nan])
+    assert stuck.kept_s == pytest.approx(0.2) and stuck.wrong == 3
+
+
+def test_percentiles_do_not_pass_between_a_time_and_never() -> None:
+    times = [0.1] * 19 + [math.inf]
+    assert metrics.percentile_of(times, 50) == metrics.percentile_of(times, 95) == 0.1
+    assert metrics.percentile_of([*times, math.inf], 95) == math.inf
+    assert metrics.percentile_of([3.0, 1.0, 2.0], 50) == 2.0
+    assert math.isnan(metrics.percentile_of([], 50))
+
+
+def test_an_honest_covariance_holds_95_percent_and_a_proud_one_less() -> None:
+    rng = np.random.default_rng(2)
+    count = 4000
+    root = rng.normal(0, 1, (6, 6)) * [0.01, 0.01, 0.01, 0.05, 0.05, 0.05]
+    C = root.T @ root + 1e-8 * np.eye(6)
+    xi = rng.multivariate_normal(np.zeros(6), C, count)
+    estimated = some_poses(count)
+    true = np.array([T @ poses.exp(e) for T, e in zip(estimated, xi, strict=True)])
+    found = metrics.tangent_errors(estimated, true)
+    np.testing.assert_allclose(found, xi, atol=1e-9)
+    honest = metrics.consistency(found, np.tile(C, (count, 1, 1)))
+    assert honest["inside_95"] == pytest.approx(0.95, abs=0.012)
+    assert honest["mean_nees"] == pytest.approx(6, rel=0.05)
+    assert honest["rotation_inside_95"] == pytest.approx(0.95, abs=0.012)
+    assert honest["axis_ratio"] == pytest.approx([1.0] * 6, abs=0.05)
+    proud = metrics.consistency(found, np.tile(C / 4, (count, 1, 1)))
+    assert proud["inside_95"] < 0.7 and proud["axis_ratio"] == pytest.approx([2.0] * 6, abs=0.1)
+    assert proud["mean_nees"] == pytest.approx(24, rel=0.05)
+
+
+def test_what_is_no_covariance_holds_nothing() -> None:
+    C = np.tile(np.eye(6), (3, 1, 1))
+    C[1, 0, 0], C[2, 3, 3] = -1.0, np.nan
+    values = metrics.nees(np.zeros((3, 6)), C)
+    assert values[0] == 0 and np.isinf(values[1:]).all()
+    assert metrics.share_inside(values, 6) == pytest.approx(1 / 3)
+    assert metrics.consistency(np.empty((0, 6)), np.empty((0, 6, 6)))["frames"] == 0
+
+
+def test_every_frame_is_given_with_its_exposure() -> None:
+    localizer: Any = Slow(set(), 0)
+    run = feed(localizer, frames(5))
+    assert localizer.given == [(k, 0.01) for k in range(5)]
+    assert run.dropped == 0 and run.says(State.TRACKING).all() and run.wTc.shape == (5, 4, 4)
+
+
+def test_paced_a_slow_frame_is_late_and_a_full_queue_loses_its_oldest() -> None:
+    localizer: Any = Slow({1}, 0.5)
+    run = feed_paced(localizer, frames(30, 20_000_000))
+    given = [index for index, _ in localizer.given]
+    assert given == sorted(given) and given[:2] == [0, 1] and given[-1] == 29
+    assert run.dropped == 30 - len(given) > 0
+    assert run.late_s[1] >= 0.5
+    # What was lost follows the slow frame, and the queue's worth before it went on is kept.
+    assert given[2] > 2 and given[2 : 2 + QUEUE_FRAMES] == list(
+        range(given[2], given[2] + QUEUE_FRAMES)
+    )
+
+
+def test_a_jump_joins_two_flights_with_times_that_go_on() -> None:
+    stream = joined([frames(3), frames(50)[40:42]])
+    assert [frame.index for frame in stream] == [0, 1, 2, 3, 4]
+    assert np.allclose(np.diff([f.time_ns for f in stream]), 1e9 / 30, atol=1)
+    assert stream[3].image is not None and stream[3].name == "40"
+
+
+def test_places_of_a_jump_are_on_two_flights_and_leave_room() -> None:
+    flights: Any = [SimpleNamespace(frames=frames(n)) for n in (100, 60, 80)]
+    rng = np.random.default_rng(0)
+    drawn = [draw_places(flights, rng, 30, 50) for _ in range(300)]
+    assert all(a != b for a, _, b, _ in drawn)
+    assert {a for a, *_ in drawn} == {b for _, _, b, _ in drawn} == {0, 1, 2}
+    assert all(i + 30 <= len(flights[a].frames) for a, i, _, _ in drawn)
+    assert all(j + 50 <= len(flights[b].frames) for _, _, b, j in drawn)
+
+
+def test_darkness_is_dark_and_noisy() -> None:
+    dark = dark_frames((48, 64), 20, np.random.default_rng(0))
+    assert len(dark) == 20 and all(f.image.mean() < 10 and f.image.std() > 0.5 for f in dark)
+
+
+def test_a_table_tells_what_is_met_and_missed() -> None:
+    line = Line("demo flight", "<= 0.02 m", "0.0190 m", True, "seed 7")
+    text = table([line, replace(line, met=False), replace(line, met=None)]).splitlines()
+    assert [row.split()[0] for row in text[::3]] == ["met", "MISSED", "demo"]
+    assert "0.0190 m" in text[1] and "seed 7" in text[2]
+
+
+@pytest.mark.parametrize("row", sorted(NEEDS))
+def test_a_row_without_its_flights_is_refused_in_one_line(
+    row: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert row in ROWS and main([row]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"--{NEEDS[row]}" in error
+
+
+def test_a_missing_flight_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = Path(__file__).parents[2] / "maps/atrium"
+    out = tmp_path / "a.json"
+    words = ["fast", "--map", str(sample), "--fast", str(tmp_path / "none.mcap")]
+    assert main([*words, "--json", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "none.mcap" in error
+
+
+def test_reasons_are_counted_without_their_numbers() -> None:
+    assert metrics.without_numbers("entropy 6.12 below 7 bits") == "entropy # below # bits"
+    assert json.dumps(metrics.without_numbers("12 of 30")) == '"# of #"'
