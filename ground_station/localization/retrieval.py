@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from ground_station.mapping.descriptors import Descriptors
 from ground_station.mapping.store import Keyframes, Landmarks
 
 F32 = npt.NDArray[np.float32]
@@ -33,7 +34,7 @@ _BLOCK = 4_000_000
 """Products held at once: 16 MB."""
 
 
-def nearest_words(descriptors: F32, words: F32, count: int = 1) -> Indices:
+def nearest_words(descriptors: F32 | Descriptors, words: F32, count: int = 1) -> Indices:
     """The `count` words (W, D) of largest product with each unit descriptor (N, D): (N, count)."""
     found = np.empty((len(descriptors), count), np.intp)
     rows = max(1, _BLOCK // len(words))
@@ -46,7 +47,7 @@ def nearest_words(descriptors: F32, words: F32, count: int = 1) -> Indices:
     return found
 
 
-def learn_words(descriptors: F32, seed: int) -> F32:
+def learn_words(descriptors: F32 | Descriptors, seed: int) -> F32:
     """Words (W, D), unit rows, from unit descriptors (N, D), N > 0: spherical k-means."""
     rng = np.random.default_rng(seed)
     count = int(np.clip(_WORDS_PER_ROOT * np.sqrt(len(descriptors)), 1, _MAX_WORDS))
@@ -68,7 +69,8 @@ class PlaceIndex:
     """A map's landmarks by visual word and its keyframes by landmark; built once for a map.
 
     The cost of a query grows with the root of the landmarks until there are two million, beyond
-    with a two-hundredth of them. Holds a copy of the descriptors, in the order of their words.
+    with a two-hundredth of them. Holds a copy of the descriptors in the order of their words,
+    quantised as they are.
     """
 
     def __init__(self, landmarks: Landmarks, keyframes: Keyframes, seed: int) -> None:
@@ -76,12 +78,19 @@ class PlaceIndex:
         self.words = learn_words(landmarks.descriptor, seed)
         word = nearest_words(landmarks.descriptor, self.words)[:, 0]
         self._landmark = np.argsort(word, kind="stable")
-        self._descriptor = landmarks.descriptor[self._landmark]
         self._offset = np.searchsorted(word[self._landmark], np.arange(len(self.words) + 1))
-        frame = np.repeat(np.arange(len(keyframes)), np.diff(keyframes.offset))
+        every = landmarks.descriptor
+        self._rows = (every.values if isinstance(every, Descriptors) else every)[self._landmark]
+        # Products with rows as they lie, divided by their lengths: cheaper than unit rows.
+        self._length = np.empty(len(every), np.float32)
+        block = max(1, _BLOCK // max(self._rows.shape[1], 1))
+        for start in range(0, len(every), block):
+            rows = self._rows[start : start + block].astype(np.float32)
+            self._length[start : start + block] = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        np.maximum(self._length, 1e-12, out=self._length)
         self._seen = sparse.csr_matrix(
-            (np.ones(len(frame), np.float32), (keyframes.landmark, frame)),
-            shape=(len(landmarks), len(keyframes)),
+            (np.ones(len(keyframes.landmark), np.float32), keyframes.landmark, keyframes.offset),
+            shape=(len(keyframes), len(landmarks)),
         )
         # Half way between counting votes and taking their share: a keyframe that saw much more
         # is not more likely by as much.
@@ -109,7 +118,8 @@ class PlaceIndex:
         for w in np.flatnonzero((np.diff(border) > 0) & (np.diff(self._offset) > 0)).tolist():
             rows = feature[border[w] : border[w + 1]]
             start, stop = self._offset[w : w + 2]
-            product = descriptors[rows] @ self._descriptor[start:stop].T
+            product = descriptors[rows] @ self._rows[start:stop].astype(np.float32).T
+            product /= self._length[start:stop]
             here = np.arange(len(rows))
             for _ in range(2):
                 top = product.argmax(axis=1)
@@ -130,10 +140,10 @@ class PlaceIndex:
         clear = distance[:, 0] < _MAX_RATIO * distance[:, 1]
         # What is there twice speaks for both places, and for each with half a voice.
         double = ~clear & (distance[:, 1] < _SAME_DISTANCE)
-        votes = np.zeros(self._seen.shape[0], np.float32)
+        votes = np.zeros(self._seen.shape[1], np.float32)
         votes[landmark[double].ravel()] = 0.5
         votes[landmark[clear, 0]] = 1  # several features that look like one landmark: a pattern
-        score = (self._seen.T @ votes) * self._weight
+        score = (self._seen @ votes) * self._weight
         return np.asarray(np.argsort(-score, kind="stable")[:most], np.intp)
 
     def places(self, ranked: Indices, most: int, min_shared: float) -> list[Indices]:

@@ -14,6 +14,7 @@ from safetensors.numpy import save
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.mapping.descriptors import Descriptors, open_descriptors, quantised
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
@@ -30,16 +31,17 @@ class Landmarks:
     """M points of the building, in world coordinates and metres once registered.
 
     `id` (M,) is the COLMAP model's point3D id; `position_m` (M, 3); `covariance_m2` (M, 3, 3) of
-    the position; `descriptor` (M, D), the renormalised mean of its observations' descriptors;
-    `spread` (M,), their RMS distance from that mean; `view_direction` (M, 3), the unit mean
-    direction from the point to the cameras that saw it; `view_cos` (M,), the cosine of the angle
-    that holds them all; `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,).
+    the position; `descriptor` (M, D), the renormalised mean of its observations' descriptors: an
+    array or, from a file, `Descriptors` that are read when they are asked for; `spread` (M,), their
+    RMS distance from that mean; `view_direction` (M, 3), the unit mean direction from the point to
+    the cameras that saw it; `view_cos` (M,), the cosine of the angle that holds them all;
+    `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,).
     """
 
     id: npt.NDArray[np.int64]
     position_m: F64
     covariance_m2: F32
-    descriptor: F32
+    descriptor: F32 | Descriptors
     spread: F32
     view_direction: F32
     view_cos: F32
@@ -72,7 +74,7 @@ class Keyframes:
 
 @dataclass
 class MapInfo:
-    """What `map.toml` says. `built` and `registration` are tables of plain values."""
+    """What `map.toml` says. `built`, `registration` and `refined` are tables of plain values."""
 
     features: str
     features_sha256: str
@@ -86,6 +88,7 @@ class MapInfo:
     format: int = FORMAT
     built: dict[str, Any] = field(default_factory=dict)
     registration: dict[str, Any] = field(default_factory=dict)
+    refined: dict[str, Any] = field(default_factory=dict)
 
     @property
     def registered(self) -> bool:
@@ -132,15 +135,9 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     lm, kf = map_.landmarks, map_.keyframes
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
     if quantise:
-        # One byte a number, each row scaled to its own maximum: rows are unit vectors, so the
-        # scale is found again by normalising.
-        top = np.maximum(np.abs(lm.descriptor).max(axis=1, keepdims=True, initial=0), 1e-12)
-        if (lm.descriptor < 0).any():
-            arrays["descriptor_i8"] = np.round(lm.descriptor * 127 / top).astype(np.int8)
-        else:
-            arrays["descriptor_u8"] = np.round(lm.descriptor * 255 / top).astype(np.uint8)
+        arrays |= quantised(lm.descriptor)
     else:
-        arrays["descriptor"] = lm.descriptor
+        arrays["descriptor"] = np.asarray(lm.descriptor, np.float32)
     _save(folder / "landmarks.safetensors", arrays, {"format": str(FORMAT)})
     _save(
         folder / "keyframes.safetensors",
@@ -161,6 +158,7 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
         "camera": info.camera.as_dict(),
         "built": info.built,
         "registration": info.registration,
+        "refined": info.refined,
     }
     path = folder / "map.toml"
     part = folder / "map.toml.part"
@@ -197,6 +195,7 @@ def load_info(folder: str | Path) -> MapInfo:
             units=str(document.get("units", "arbitrary")),
             built=dict(document.get("built", {})),
             registration=dict(document.get("registration", {})),
+            refined=dict(document.get("refined", {})),
         )
     except (ConfigError, ValueError, TypeError) as error:
         raise MapError(str(error)) from None
@@ -211,9 +210,7 @@ def load(folder: str | Path) -> Map:
     m = len(arrays["id"])
     if any(len(value) != m for value in arrays.values()):
         raise MapError(f"{path}: its arrays differ in length")
-    descriptor = _descriptor(path, arrays)
-    if descriptor.shape != (m, info.dimension):
-        raise MapError(f"{path}: descriptors are {descriptor.shape}, not ({m}, {info.dimension})")
+    descriptor = open_descriptors(path, m, info.dimension)
     landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
     path = folder / "keyframes.safetensors"
     arrays, metadata = _read(path, _KEYFRAMES)
@@ -235,21 +232,11 @@ def load(folder: str | Path) -> Map:
     return Map(info, landmarks, keyframes, folder)
 
 
-def _descriptor(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> F32:
-    for name in ("descriptor", "descriptor_u8", "descriptor_i8"):
-        if name in arrays:
-            values = np.asarray(arrays[name], np.float32)
-            norm = np.linalg.norm(values, axis=1, keepdims=True) if values.ndim == 2 else None
-            if norm is None or not np.isfinite(norm).all():
-                break
-            return np.asarray(values / np.maximum(norm, 1e-12), np.float32)
-    raise MapError(f"{path}: it holds no usable descriptors")
-
-
 def _read(path: Path, wanted: _Layout) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
     try:
         with safe_open(path, framework="numpy") as file:
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = [name for name in file.keys() if name in wanted]  # noqa: SIM118
+            arrays = {name: file.get_tensor(name) for name in names}
             metadata = file.metadata() or {}
     except (SafetensorError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

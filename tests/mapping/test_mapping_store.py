@@ -70,6 +70,21 @@ def _edit(name, change):
     return edit
 
 
+def _swap(old, new=None, value=None):
+    """Takes an array out, or puts it under another name, with one value in it if given."""
+
+    def edit(path):
+        arrays = load_file(path)
+        array = arrays.pop(old)
+        if new is not None:
+            array = array if value is None else array.astype(np.float32)
+            array.flat[-1] = array.flat[-1] if value is None else value
+            arrays[new] = array
+        save_file(arrays, path)
+
+    return edit
+
+
 def _nan(array):
     array.flat[0] = np.nan
     return array
@@ -93,6 +108,11 @@ def _huge(array):
         ("landmarks.safetensors", _edit("position_m", lambda a: a[:, :2]), r"\(N, 3\)"),
         ("landmarks.safetensors", _edit("spread", lambda a: a[:-1]), "differ in length"),
         ("landmarks.safetensors", _edit("descriptor_u8", lambda a: a[:, :5]), "descriptors are"),
+        ("landmarks.safetensors", _swap("descriptor_u8"), "holds no descriptors"),
+        ("landmarks.safetensors", _swap("descriptor_u8", "descriptor", np.nan), "not finite"),
+        ("landmarks.safetensors", _swap("descriptor_u8", "descriptor_i8"), "must be int8"),
+        ("landmarks.safetensors", _edit("descriptor_u8", lambda a: a[1:]), "descriptors are"),
+        ("landmarks.safetensors", _edit("descriptor_u8", lambda a: a.ravel()), "descriptors are"),
         ("keyframes.safetensors", _truncate, "keyframes.safetensors"),
         ("keyframes.safetensors", _edit("wTc", _nan), "'wTc'.*not finite"),
         ("keyframes.safetensors", _edit("landmark", _huge), "do not fit each other"),
