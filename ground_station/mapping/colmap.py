@@ -174,8 +174,18 @@ def incremental(
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def adjust(model: Reconstruction, *, loss_px: float, refine_camera: bool, threads: int = 0) -> None:
-    """Bundle adjustment of all poses and points with a Cauchy loss of scale `loss_px`."""
+def adjust(
+    model: Reconstruction,
+    *,
+    loss_px: float,
+    refine_camera: bool,
+    threads: int = 0,
+    max_iterations: int = 50,
+) -> bool:
+    """Bundle adjustment of all poses and points with a Cauchy loss of scale `loss_px`.
+
+    Returns whether it converged within `max_iterations`.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_camera
     options.refine_principal_point = False
@@ -184,13 +194,71 @@ def adjust(model: Reconstruction, *, loss_px: float, refine_camera: bool, thread
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
     options.ceres.solver_options.num_threads = threads or -1
-    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.max_num_iterations = max_iterations
     options.ceres.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    return bool(summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE)
+
+
+def from_arrays(model: Model, camera: Camera, weight: F64 | None = None) -> Reconstruction:
+    """A reconstruction of a model's arrays, image k with id `image_id[k]`; `feature` is made anew.
+
+    COLMAP's adjustment has one loss for all sights. So `weight` (K,) of the images becomes a camera
+    for each weight whose pixels are so much smaller: the same rays, with residuals scaled. Without
+    it there is one camera, that of the database.
+    """
+    pinhole = _pinhole(camera)
+    weights = np.ones(len(model.names)) if weight is None else np.asarray(weight, np.float64)
+    levels, camera_of = np.unique(weights, return_inverse=True)
+    result = pycolmap.Reconstruction()
+    for number, level in enumerate(levels.tolist()):
+        result.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=_CAMERA_ID + number,
+                model="PINHOLE",
+                width=int(np.ceil(level * camera.width_px)),
+                height=int(np.ceil(level * camera.height_px)),
+                params=level * np.asarray(pinhole.params),
+                has_prior_focal_length=True,
+            )
+        )
+    order = np.argsort(model.image, kind="stable")
+    offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order)) - offset[model.image[order]]
+    cTw = np.linalg.inv(model.wTc) if len(model.wTc) else model.wTc
+    for k, name in enumerate(model.names):
+        pixels = (model.pixel_px[order[offset[k] : offset[k + 1]]] + HALF_PIXEL) * weights[k]
+        result.add_image_with_trivial_frame(
+            pycolmap.Image(
+                name=name,
+                keypoints=pixels,
+                camera_id=_CAMERA_ID + int(camera_of[k]),
+                image_id=int(model.image_id[k]),
+            ),
+            pycolmap.Rigid3d(cTw[k, :3]),
+        )
+    by_point = np.argsort(model.point, kind="stable")
+    tracks = np.searchsorted(model.point[by_point], np.arange(len(model.position) + 1)).tolist()
+    sights = np.stack([model.image_id[model.image], place], axis=1)[by_point].tolist()
+    for m, point_id in enumerate(model.point_id.tolist()):
+        track = [pycolmap.TrackElement(*sight) for sight in sights[tracks[m] : tracks[m + 1]]]
+        point = pycolmap.Point3D(xyz=model.position[m], track=pycolmap.Track(track))
+        result.add_point3D_with_id(point_id, point)
+    return result
+
+
+def positions(reconstruction: Reconstruction, model: Model) -> tuple[F64, F64]:
+    """Where a reconstruction has a model's images, wTc (K, 4, 4), and its points (M, 3)."""
+    wTc = np.tile(np.eye(4), (len(model.names), 1, 1))
+    for k, image_id in enumerate(model.image_id.tolist()):
+        wTc[k, :3] = reconstruction.images[image_id].cam_from_world().inverse().matrix()
+    points = [reconstruction.points3D[point_id].xyz for point_id in model.point_id.tolist()]
+    return wTc, np.array(points).reshape(-1, 3)
 
 
 def to_arrays(model: Reconstruction) -> Model:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import itertools
 import os
 import shutil
 from collections.abc import Iterator
@@ -33,16 +35,25 @@ def check_target(folder: Path) -> None:
         )
 
 
+def kept_name(folder: Path) -> Path:
+    """The first free name for a map that is replaced and kept: NAME.before, NAME.before-2, …"""
+    names = (f"{folder.name}.before" + (f"-{n}" if n > 1 else "") for n in itertools.count(1))
+    return next(path for path in map(folder.with_name, names) if not os.path.lexists(path))
+
+
 @contextmanager
-def replacing(folder: Path) -> Iterator[Path]:
+def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
     """Gives an empty folder beside `folder`, which takes its place when the block ends well.
 
-    Files in `folder` that are not part of a map (recordings, the floor plan) stay. Raises
-    `MapError` as `check_target` does, and when the disk refuses.
+    Files in `folder` that are not part of a map (recordings, the floor plan) stay. What was there
+    is kept as `keep`, a free name beside it, where given. Where the system can, the two change
+    places at once, so that a program killed at any moment leaves a whole map. Raises `MapError` as
+    `check_target` does, and when the disk refuses.
     """
     folder = Path(folder).absolute()
     check_target(folder)
-    part, old = folder.with_name(folder.name + ".part"), folder.with_name(folder.name + ".old")
+    part = folder.with_name(folder.name + ".part")
+    old = keep.absolute() if keep is not None else folder.with_name(folder.name + ".old")
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
@@ -51,20 +62,41 @@ def replacing(folder: Path) -> Iterator[Path]:
             for entry in folder.iterdir():
                 if entry.name not in _OURS and not (part / entry.name).exists():
                     _keep(entry, part / entry.name)
-            shutil.rmtree(old, ignore_errors=True)
-            folder.rename(old)
-            try:
-                part.rename(folder)
-            except OSError:
-                old.rename(folder)
-                raise
-            shutil.rmtree(old, ignore_errors=True)
+            if keep is None:
+                shutil.rmtree(old, ignore_errors=True)
+            _swap(part, folder, old)
+            if keep is None:
+                shutil.rmtree(old, ignore_errors=True)
         else:
             part.rename(folder)
     except OSError as error:
         raise MapError(f"{error.filename or folder}: {error.strerror or error}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _swap(part: Path, folder: Path, old: Path) -> None:
+    """Puts `part` in the place of `folder`, which becomes `old`, a name that is free."""
+    part.rename(old)
+    if _exchange(old, folder):
+        return
+    old.rename(part)
+    folder.rename(old)
+    try:
+        part.rename(folder)
+    except BaseException:  # Ctrl-C between the two, too
+        old.rename(folder)
+        raise
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Lets two names change places at once, by Linux's renameat2; False where that is unknown."""
+    here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of linux/fs.h
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (OSError, AttributeError):
+        return False
+    return bool(rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0)
 
 
 def _keep(source: Path, target: Path) -> None:

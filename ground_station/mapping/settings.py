@@ -76,6 +76,47 @@ class SfmSettings:
 
 
 @dataclass(frozen=True)
+class RefineSettings:
+    """Which frames of a flight `blimp map refine` takes, and what it believes of them."""
+
+    min_interval_s: float = config.key(
+        0.25, "between two frames that are taken", unit="s", low=0.0, high=60.0
+    )
+    min_parallax_deg: float = config.key(
+        2.0, "a frame is taken when it moved so far, seen from what it sees", unit="deg",
+        low=0.0, high=90.0,
+    )  # fmt: skip
+    min_turn_deg: float = config.key(
+        8.0, "or turned so far, since the last one taken", unit="deg", low=0.0, high=180.0
+    )
+    max_frames: int = config.key(
+        400, "of all flights together; more are thinned evenly", unit="frames", low=1, high=5000
+    )
+    min_sights: int = config.key(30, "of a frame that is taken", unit="sights", low=6, high=10000)
+    max_misfit_px: float = config.key(
+        5.0, "median error of a frame's sights in the map as it was", unit="px", low=0.1, high=100.0
+    )
+    max_shift_px: float = config.key(
+        10.0, "a frame in which the readout moved one pixel in ten further is too fast", unit="px",
+        low=0.0, high=1000.0,
+    )  # fmt: skip
+    twist_reach_s: float = config.key(
+        0.1, "a frame's velocity comes from poses so near", unit="s", low=0.0, high=10.0
+    )
+    twist_gap_s: float = config.key(
+        0.25, "or from its neighbours, where they are so near", unit="s", low=0.0, high=10.0
+    )
+    keyframe_gap_s: float = config.key(
+        1.0, "a keyframe's velocity comes from its neighbours, where they are so near", unit="s",
+        low=0.0, high=10.0,
+    )  # fmt: skip
+    correlation: float = config.key(
+        0.5, "share of a sight's error that all sights of a landmark in one flight have in common",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class MappingSettings:
     """How `blimp map build` works."""
 
@@ -95,6 +136,7 @@ class MappingSettings:
     quantise: bool = config.key(True, "keep descriptors as one byte a number")
     match: MatchSettings = field(default_factory=MatchSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
 
 
 def load_settings(path: str | Path | None = None) -> MappingSettings:

@@ -1,0 +1,181 @@
+"""The graph of `blimp map refine`: a map's keyframes, flights' frames and what they all saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry.camera import Camera
+from ground_station.mapping import colmap, landmarks, shutter
+from ground_station.mapping.chosen import Chosen
+from ground_station.mapping.store import Map
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+_ROUND_STEPS, _MOST_ROUNDS = 10, 10
+"""Steps of the adjustment between two signs of life, and how often."""
+
+_MAD_TO_SIGMA = 1.4826
+"""The median of a normal distribution's absolute values, to its standard deviation."""
+
+_LEAST_SIGMA_PX = 0.05
+"""No group of sights is believed to be better than this."""
+
+
+@dataclass(frozen=True)
+class Graph:
+    """What is adjusted: `model`, whose images are the keyframes and then the flights' frames.
+
+    `group` (K,) of each image, 0 for the keyframes that the map was built of and 1, 2, … for the
+    flights; `time_ns` (K,); `sigma_px` (groups,), the standard deviation that a sight counts with.
+    """
+
+    model: colmap.Model
+    group: I64
+    time_ns: I64
+    sigma_px: F64
+
+    def error_px(self) -> F64:
+        """Reprojection errors of all sights (O,), undistorted pixels; inf behind the camera."""
+        return np.asarray(np.linalg.norm(landmarks.residuals_px(self.model), axis=1))
+
+    def group_of_sights(self) -> I64:
+        """The group of each sight (O,)."""
+        return np.asarray(self.group[self.model.image])
+
+
+def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen]) -> Graph:
+    """The graph of a map and flights.
+
+    The map's sights are at `pixel_px` (O, 2), undistorted, and its K keyframes belong to `group`
+    (K,); every flight becomes a group of its own.
+    """
+    camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
+    starts = len(kf) + np.concatenate([[0], np.cumsum([len(f) for f in flights])]).astype(np.int64)
+    names = list(kf.names)
+    for flight in flights:
+        names += [f"{flight.name}/{time_ns}" for time_ns in flight.time_ns.tolist()]
+    image = [np.repeat(np.arange(len(kf)), np.diff(kf.offset))]
+    image += [f.frame + start for f, start in zip(flights, starts, strict=False)]
+    sights = np.concatenate(image)
+    model = colmap.Model(
+        names=names,
+        image_id=np.arange(len(names)) + 1,
+        wTc=np.concatenate([kf.wTc, *(f.wTc for f in flights)]),
+        point_id=lm.id,
+        position=np.array(lm.position_m),
+        image=sights,
+        feature=np.zeros(len(sights), np.int64),
+        point=np.concatenate([kf.landmark, *(f.landmark for f in flights)]).astype(np.int64),
+        pixel_px=np.concatenate([pixel_px, *(f.pixel_px for f in flights)]),
+        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+    )
+    first = int(group.max(initial=0)) + 1
+    groups = [group, *(np.full(len(f), first + k) for k, f in enumerate(flights))]
+    times = [kf.time_ns, *(f.time_ns for f in flights)]
+    return Graph(
+        model, np.concatenate(groups), np.concatenate(times), np.ones(first + len(flights))
+    )
+
+
+def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
+    """A map's sights without the readout's shift (O, 2), and how many keyframes that concerns.
+
+    A keyframe's velocity is that of its neighbours, where they are within `gap_s`.
+    """
+    camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
+    pixel = camera.undistort_to_pinhole(kf.pixel_px)
+    # Two keyframes of one time, or inputs that overlap in time, have no velocity.
+    order = np.argsort(kf.time_ns, kind="stable")
+    alone = np.concatenate([np.diff(kf.time_ns[order]) > 0, [True]])
+    order = order[alone]
+    twist = np.full((len(kf), 6), np.nan)
+    if camera.readout_s > 0:
+        twist[order] = shutter.twists(kf.time_ns[order], kf.wTc[order], 0.0, gap_s)
+    image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
+    X = shutter.in_cameras(kf.wTc[image], lm.position_m[kf.landmark])
+    row_s = shutter.row_times_s(kf.pixel_px[:, 1], camera)
+    known = np.isfinite(twist[image]).all(axis=1)
+    shift = shutter.shift_px(X[known], twist[image[known]], row_s[known], camera)
+    pixel[known] -= np.nan_to_num(shift)
+    return pixel, int(np.isfinite(twist).all(axis=1).sum())
+
+
+def drop(graph: Graph, bad: Flags) -> Graph:
+    """The graph without some sights (O,)."""
+    model, keep = graph.model, ~bad
+    rows = {name: getattr(model, name)[keep] for name in ("image", "feature", "point", "pixel_px")}
+    return replace(graph, model=replace(model, **rows))
+
+
+def drop_points(graph: Graph, bad: Flags) -> Graph:
+    """The graph without some points (M,) and their sights."""
+    graph, kept = drop(graph, bad[graph.model.point]), ~bad
+    model, new = graph.model, np.cumsum(kept) - 1
+    points = replace(
+        model,
+        point_id=model.point_id[kept],
+        position=model.position[kept],
+        point=new[model.point],
+    )
+    return replace(graph, model=points)
+
+
+def drop_images(graph: Graph, bad: Flags) -> Graph:
+    """The graph without some images (K,) and their sights."""
+    graph, kept = drop(graph, bad[graph.model.image]), ~bad
+    model, new = graph.model, np.cumsum(kept) - 1
+    images = replace(
+        model,
+        names=[name for name, gone in zip(model.names, bad.tolist(), strict=True) if not gone],
+        image_id=model.image_id[kept],
+        wTc=model.wTc[kept],
+        image=new[model.image],
+    )
+    return replace(graph, group=graph.group[kept], time_ns=graph.time_ns[kept], model=images)
+
+
+def spread_px(graph: Graph) -> F64:
+    """A robust standard deviation of a pixel coordinate in each group (groups,).
+
+    By the median absolute deviation; NaN for a group without sights.
+    """
+    size, group = np.abs(landmarks.residuals_px(graph.model)), graph.group_of_sights()
+    found = [size[group == g] for g in range(len(graph.sigma_px))]
+    median = [np.median(values) if len(values) else np.nan for values in found]
+    return np.maximum(_MAD_TO_SIGMA * np.array(median), _LEAST_SIGMA_PX)
+
+
+def solve(
+    graph: Graph,
+    camera: Camera,
+    *,
+    loss_px: float,
+    threads: int,
+    on_round: Callable[[], None] = lambda: None,
+) -> Graph:
+    """The graph with all poses and points at the optimum, in free gauge.
+
+    A Cauchy loss of scale `loss_px`, in pixels of the first group; the other groups' weigh by their
+    standard deviations. `on_round` is called every few steps, between which Ctrl-C can stop it.
+    """
+    weight = graph.sigma_px[0] / graph.sigma_px[graph.group]
+    reconstruction = colmap.from_arrays(graph.model, camera, weight)
+    for _ in range(_MOST_ROUNDS):
+        done = colmap.adjust(
+            reconstruction,
+            loss_px=loss_px,
+            refine_camera=False,
+            threads=threads,
+            max_iterations=_ROUND_STEPS,
+        )
+        on_round()
+        if done:
+            break
+    wTc, position = colmap.positions(reconstruction, graph.model)
+    return replace(graph, model=replace(graph.model, wTc=wTc, position=position))
