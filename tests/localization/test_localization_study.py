@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from study import metrics
 from study.feeding import QUEUE_FRAMES, dark_frames, feed, feed_paced, joined
-from study.recovering import draw_places
+from study.recovering import SETTLED, Settled, draw_places
 from study.row import Line
 from study.run import NEEDS, ROWS, main, table
 
@@ -208,3 +208,15 @@ def test_a_missing_flight_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_reasons_are_counted_without_their_numbers() -> None:
     assert metrics.without_numbers("entropy 6.12 below 7 bits") == "entropy # below # bits"
     assert json.dumps(metrics.without_numbers("12 of 30")) == '"# of #"'
+
+
+def test_a_jump_is_over_when_tracking_near_the_truth_has_settled() -> None:
+    first = 10
+    truth = np.tile(np.eye(4), (100, 1, 1))
+    truth[:15, 0, 3] = 5.0  # the localizer says the origin: near only from the 15th frame on
+    localizer: Any = Slow(set(), 0)
+    run = feed(localizer, frames(100), Settled(first, truth))
+    assert len(run.frames) == first + 15 + SETTLED
+    away = np.tile(np.eye(4), (100, 1, 1))
+    away[:, 0, 3] = 5.0
+    assert len(feed(localizer, frames(100), Settled(first, away)).frames) == 100

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -115,18 +116,32 @@ def close(localizer: Localizer) -> None:
         end()
 
 
-Feed = Callable[[Localizer, Iterable[Frame]], Run]
+class Feed(Protocol):
+    """Gives frames to a localizer, until `enough` is true of the run so far, or to their end."""
+
+    def __call__(
+        self,
+        localizer: Localizer,
+        frames: Iterable[Frame],
+        enough: Callable[[Run], bool] | None = None,
+    ) -> Run: ...
 
 
-def feed(localizer: Localizer, frames: Iterable[Frame]) -> Run:
+def feed(
+    localizer: Localizer, frames: Iterable[Frame], enough: Callable[[Run], bool] | None = None
+) -> Run:
     """Gives frame after frame, as fast as they are taken."""
     run = Run()
     for frame in frames:
         _give(localizer, frame, run)
+        if enough is not None and enough(run):
+            break
     return run
 
 
-def feed_paced(localizer: Localizer, frames: Iterable[Frame]) -> Run:
+def feed_paced(
+    localizer: Localizer, frames: Iterable[Frame], enough: Callable[[Run], bool] | None = None
+) -> Run:
     """Gives each frame at its time; what piles up is queued, and lost as a receiver loses it."""
     run, queue = Run(), deque[tuple[float, Frame]]()
     ahead = iter(frames)
@@ -145,6 +160,8 @@ def feed_paced(localizer: Localizer, frames: Iterable[Frame]) -> Run:
             due_s, frame = queue.popleft()
             _give(localizer, frame, run)
             run.late_s.append(time.perf_counter() - start_s - due_s)
+            if enough is not None and enough(run):
+                break
         elif upcoming is not None:
             time.sleep(max(0.0, (upcoming.time_ns - first_ns) / 1e9 - now_s))
     return run

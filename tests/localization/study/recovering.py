@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from study.feeding import Flight, close, dark_frames, joined, make_localizer
+from study.feeding import Flight, Run, close, dark_frames, joined, make_localizer
 from study.metrics import (
     NEAR_DEG,
     NEAR_M,
@@ -26,8 +26,10 @@ from ground_station.localization.relocalization import Relocalizer
 
 BEFORE = 30
 """Frames of a flight before a jump: a second."""
-AFTER = 75
-"""And after it: two and a half."""
+AFTER = 150
+"""And after it at most: five seconds."""
+SETTLED = 20
+"""Frames that say TRACKING near the truth one after the other: a jump is over."""
 DARK = 150
 """Frames of a blackout: five seconds."""
 _RATE_HZ = 30.0
@@ -42,6 +44,22 @@ def draw_places(
     i = int(rng.integers(max(1, len(flights[a].frames) - before)))
     j = int(rng.integers(max(1, len(flights[b].frames) - after)))
     return a, i, b, j
+
+
+class Settled:
+    """Whether a run has said TRACKING near the truth for `SETTLED` frames since a jump."""
+
+    def __init__(self, first: int, truth: np.ndarray) -> None:
+        self._first, self._truth, self._count = first, truth, 0
+
+    def __call__(self, run: Run) -> bool:
+        frame, estimate = run.frames[-1], run.estimates[-1]
+        near = False
+        if frame.index >= self._first and estimate.wTc is not None:
+            m, deg = pose_errors(estimate.wTc, self._truth[frame.index - self._first])
+            near = bool(m[0] <= NEAR_M and deg[0] <= NEAR_DEG)
+        self._count = self._count + 1 if near and estimate.state is State.TRACKING else 0
+        return self._count >= SETTLED
 
 
 def kidnapping(study: Study) -> Row:
@@ -89,12 +107,12 @@ def _jump(study: Study, before: Flight, i: int, after: Flight, j: int) -> dict[s
     stream = joined([old, new], _RATE_HZ)
     localizer = make_localizer(study.map_, after.camera, study.settings)
     localizer.set_initial_pose(before.true_wTc(old[:1])[0], stream[0].time_ns)
-    run = study.feed(localizer, stream)
+    true_wTc = after.true_wTc(new)
+    run = study.feed(localizer, stream, Settled(len(old), true_wTc))
     close(localizer)
     there = np.array([frame.index >= len(old) for frame in run.frames], bool)
     kept = [frame.index - len(old) for frame in run.frames if frame.index >= len(old)]
-    truth = after.true_wTc([new[k] for k in kept])
-    m, deg = (values[there] for values in run.errors(_padded(truth, there)))
+    m, deg = (values[there] for values in run.errors(_padded(true_wTc[kept], there)))
     late_s = np.array(run.late_s)[there] if run.late_s else 0.0
     found = recovery(np.array(kept) / _RATE_HZ + late_s, run.says(State.TRACKING)[there], m, deg)
     return {
@@ -125,7 +143,8 @@ def blackout(study: Study) -> Row:
         stream = joined([old, dark, new], _RATE_HZ)
         localizer = make_localizer(study.map_, flights[b].camera, study.settings)
         localizer.set_initial_pose(flights[a].true_wTc(old[:1])[0], stream[0].time_ns)
-        run = study.feed(localizer, stream)
+        true_wTc = flights[b].true_wTc(new)
+        run = study.feed(localizer, stream, Settled(len(old) + len(dark), true_wTc))
         close(localizer)
         index = np.array([frame.index for frame in run.frames])
         late_s = np.array(run.late_s) if run.late_s else np.zeros(len(index))
@@ -133,8 +152,8 @@ def blackout(study: Study) -> Row:
         day = index >= len(old) + len(dark)
         lost = run.says(State.LOST) & night
         seconds = (index - len(old)) / _RATE_HZ + late_s
-        truth = flights[b].true_wTc([new[k - len(old) - len(dark)] for k in index[day]])
-        m, deg = (values[day] for values in run.errors(_padded(truth, day)))
+        kept = index[day] - len(old) - len(dark)
+        m, deg = (values[day] for values in run.errors(_padded(true_wTc[kept], day)))
         light_s = seconds[day] - DARK / _RATE_HZ
         found: Recovery = recovery(light_s, run.says(State.TRACKING)[day], m, deg)
         each.append(
