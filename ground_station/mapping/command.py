@@ -1,4 +1,4 @@
-"""`blimp map build|register|info`."""
+"""`blimp map build|register|refine|info`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ground_station.errors import CameraError, InputError, MapError
 from ground_station.files import write_json
+from ground_station.mapping import refine_command
 
 if TYPE_CHECKING:
     from ground_station.geometry.camera import Camera
@@ -33,7 +34,7 @@ example:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds `build`, `register` and `info` to the parser of `blimp map`."""
+    """Adds `build`, `register`, `refine` and `info` to the parser of `blimp map`."""
     commands = parser.add_subparsers(dest="map_command", required=True, metavar="COMMAND")
 
     def add(name: str, text: str, epilog: str) -> argparse.ArgumentParser:
@@ -64,6 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     register.add_argument("--seed", type=int, default=0, help="of the robust fit (default 0)")
     register.add_argument("--json", metavar="FILE", help="write what was measured, too")
 
+    refine_command.add_arguments(add("refine", refine_command.HELP, refine_command.EXAMPLE))
+
     info = add("info", "Says what a map holds.", _INFO_EXAMPLE)
     info.add_argument("map", metavar="MAP", help="folder of the map")
     info.add_argument("--json", metavar="FILE", help="write it as JSON, too")
@@ -71,6 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the subcommand; raises `BlimpError` for what a person can mend."""
+    if args.map_command == "refine":
+        return refine_command.run(args, _print_table)
     return {"build": _build, "register": _register, "info": _info}[args.map_command](args)
 
 
@@ -214,11 +219,13 @@ def _info(args: argparse.Namespace) -> int:
 
 def _describe(map_: Map) -> dict[str, Any]:
     """What `info` says, as plain values."""
+    from ground_station.mapping.refined import Refined
+
     info, lm, kf = map_.info, map_.landmarks, map_.keyframes
     camera, built = info.camera, info.built
     folder = map_.folder
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) if folder else 0
-    registration = info.registration
+    registration, flights = info.registration, Refined.of(map_).flights
     return {
         "name": info.name,
         "frame": info.frame,
@@ -238,6 +245,7 @@ def _describe(map_: Map) -> dict[str, Any]:
         "registration": registration.get("method", "none"),
         "residual_rms_m": registration.get("residual_rms_m"),
         "held_out_rms_m": registration.get("held_out_rms_m"),
+        "refined": [f"{flight['name']} ({flight['frames']} frames)" for flight in flights],
         "seed": built.get("settings", {}).get("seed"),
         "stage_s": built.get("stage_s", {}),
         "size_mb": round(size / 1e6, 2),
@@ -246,7 +254,7 @@ def _describe(map_: Map) -> dict[str, Any]:
 
 def _print_table(document: dict[str, Any]) -> None:
     for name, value in document.items():
-        if value is None or value == {}:
+        if value is None or value == {} or value == []:
             continue
         if isinstance(value, float):
             value = f"{value:.6g}"

@@ -51,11 +51,12 @@ def sigma_px(model: Model) -> float:
     return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
 
 
-def covariances(model: Model, sigma: float) -> F64:
+def covariances(model: Model, sigma: float | F64) -> F64:
     """Position covariances of the points (M, 3, 3) in the model's units squared.
 
-    (Σ Jᵀ J / σ²)⁻¹ over a point's observations, J the derivative of the pixel by the position; the
-    poses count as known, so this is the landmark's own part of the uncertainty only.
+    (Σ Jᵀ J / σ²)⁻¹ over a point's observations, J the derivative of the pixel by the position and σ
+    one for all or one for each (O,); the poses count as known, so this is the landmark's own part
+    of the uncertainty only.
     """
     X = _in_camera(model)
     fx, fy = model.pinhole[:2]
@@ -64,8 +65,9 @@ def covariances(model: Model, sigma: float) -> F64:
     J[:, 0, 0], J[:, 0, 2] = fx / z, -fx * X[:, 0] / z**2
     J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * X[:, 1] / z**2
     J = J @ np.swapaxes(model.wTc[model.image, :3, :3], 1, 2)
+    J /= np.broadcast_to(sigma, len(J))[:, None, None]
     information = np.zeros((len(model.position), 3, 3))
-    np.add.at(information, model.point, np.einsum("oki,okj->oij", J, J) / sigma**2)
+    np.add.at(information, model.point, np.einsum("oki,okj->oij", J, J))
     return np.asarray(np.linalg.inv(information), np.float64)
 
 

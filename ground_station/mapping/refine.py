@@ -1,0 +1,258 @@
+"""`refine_map`: flights' sights join a map's graph, and a better map takes the old one's place."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import MapError
+from ground_station.mapping import colmap, landmarks, store
+from ground_station.mapping import graph as graphs
+from ground_station.mapping.adjust import adjust
+from ground_station.mapping.chosen import Chosen, choose_frames, thin
+from ground_station.mapping.folder import kept_name, replacing
+from ground_station.mapping.graph import Graph
+from ground_station.mapping.observations import FlightObservations, landmarks_sha256
+from ground_station.mapping.refined import FRAME_TIME, Refined
+from ground_station.mapping.settings import MappingSettings
+from ground_station.progress import Progress
+
+F64 = npt.NDArray[np.float64]
+
+_FLOORPLAN = ("floorplan.png", "floorplan.yaml")
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What came of it: `report`, plain values, and where the old map is `kept`, if it is."""
+
+    report: dict[str, Any]
+    kept: Path | None = None
+
+
+def refine_map(
+    folder: str | Path,
+    flights: Sequence[FlightObservations] = (),
+    settings: MappingSettings | None = None,
+    out: str | Path | None = None,
+) -> tuple[store.Map, Refinement]:
+    """Refines a map on disk by what flights saw of it, and writes it to `out` or in its place.
+
+    Without flights the map's own sights are adjusted anew. In place, the old map is kept beside it
+    (NAME.before); the new one appears when it is whole. Raises `MapError` when the sights are those
+    of another map, are in it already or do not fit it, and when the map has no sights itself.
+    """
+    settings, folder = settings or MappingSettings(), Path(folder)
+    map_ = store.load(folder)
+    past = Refined.of(map_)
+    _check_map(map_)
+    chosen = [_choose(flight, map_, past, settings) for flight in flights]
+    chosen = thin(chosen, settings.refine.max_frames)
+    _check_new(chosen, map_)
+    target = folder if out is None else Path(out)
+    kept = kept_name(folder.absolute()) if out is None else None
+    with replacing(target, kept) as part:
+        with Progress("adjustment, rounds", None) as progress:
+            pixel_px, shutter = _keyframe_sights(map_, past, settings, progress.step)
+            groups = past.groups(len(map_.keyframes))
+            start = graphs.build_graph(map_, pixel_px, groups, chosen)
+            graph = adjust(start, map_, settings, progress.step)
+        refined = _assemble(map_, graph)
+        report = {
+            "images": len(refined.keyframes),
+            "landmarks": len(refined.landmarks),
+            "sights": len(refined.keyframes.landmark),
+            "sights_dropped": len(start.model.point) - len(graph.model.point),
+            "frames_dropped": len(start.group) - len(graph.group),
+            "landmarks_dropped": len(map_.landmarks) - len(refined.landmarks),
+            "rolling_shutter": shutter,
+            "keyframes": _keyframe_report(map_, past, graph),
+            "flights": [
+                _flight_report(flight, start, graph, len(past.flights) + 1 + k)
+                for k, flight in enumerate(chosen)
+            ],
+        }
+        refined.info.refined = _table(map_, past, report)
+        if out is not None:
+            refined.info.name = target.absolute().name
+            _carry_floorplan(folder, part)
+        colmap.write(colmap.from_arrays(graph.model, map_.info.camera), part / "sparse")
+        quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
+        store.save_tables(part, refined, quantise=quantise)
+    refined.folder = target
+    return refined, Refinement(report, kept)
+
+
+def _check_map(map_: store.Map) -> None:
+    if len(map_.keyframes) < 2 or not len(map_.keyframes.landmark):
+        raise MapError(f"{map_.folder}: it holds no keyframes' sights that could be adjusted")
+    if len(np.unique(map_.landmarks.id)) != len(map_.landmarks):
+        raise MapError(f"{map_.folder}: two of its landmarks have the same id")
+
+
+def _choose(
+    flight: FlightObservations, map_: store.Map, past: Refined, settings: MappingSettings
+) -> Chosen:
+    known = [landmarks_sha256(map_.landmarks), *past.landmarks_sha256]
+    if flight.landmarks_sha256 not in known:
+        raise MapError(
+            f"the flight '{flight.name}' was localized in another map ('{flight.map}'), "
+            f"whose landmarks are not those of {map_.folder}"
+        )
+    chosen = choose_frames(flight, map_, settings.refine)
+    if not len(chosen):
+        why = ", ".join(f"{reason}: {count}" for reason, count in chosen.left.items() if count)
+        raise MapError(
+            f"the flight '{flight.name}' has no frame that could be added"
+            + (f" ({why})" if why else "")
+        )
+    return chosen
+
+
+def _check_new(chosen: Sequence[Chosen], map_: store.Map) -> None:
+    names = set(map_.keyframes.names)
+    for flight in chosen:
+        mine = {f"{flight.name}/{time_ns}" for time_ns in flight.time_ns.tolist()}
+        if names & mine:
+            raise MapError(f"the flight '{flight.name}' is in the map already, or given twice")
+        names |= mine
+
+
+def _keyframe_sights(
+    map_: store.Map, past: Refined, settings: MappingSettings, on_round: Callable[[], None]
+) -> tuple[F64, dict[str, Any]]:
+    """The map's sights (O, 2), undistorted, at their frame's time where that fits better."""
+    seen_px = map_.info.camera.undistort_to_pinhole(map_.keyframes.pixel_px)
+    if past.runs:
+        return seen_px, {"keyframes": 0, "undone": past.pixels_at == FRAME_TIME}
+    moved_px, count = graphs.keyframe_pixels(map_, settings.refine.keyframe_gap_s)
+    if not count:
+        return seen_px, {"keyframes": 0, "undone": map_.info.camera.readout_s == 0}
+    sigma = []
+    for pixel_px in (seen_px, moved_px):
+        graph = graphs.build_graph(map_, pixel_px, past.groups(len(map_.keyframes)), [])
+        graph = graphs.solve(
+            graph,
+            map_.info.camera,
+            loss_px=settings.sfm.loss_px,
+            threads=settings.threads,
+            on_round=on_round,
+        )
+        sigma.append(float(graphs.spread_px(graph)[0]))
+    better = sigma[1] < sigma[0]
+    report = {
+        "keyframes": count,
+        "undone": better,
+        "sigma_with_px": round(sigma[0], 4),
+        "sigma_without_px": round(sigma[1], 4),
+    }
+    return (moved_px if better else seen_px), report
+
+
+def _assemble(map_: store.Map, graph: Graph) -> store.Map:
+    """The map in memory: old descriptors, everything else from the graph."""
+    model, old = graph.model, map_.landmarks
+    sigma_px = graph.sigma_px[graph.group_of_sights()] * _unit_weight(graph)
+    made = landmarks.make_landmarks(model, np.zeros((len(model.point), 0), np.float32))
+    kept = np.isin(old.id, model.point_id)
+    covariance = landmarks.covariances(model, sigma_px)
+    lm = dataclasses.replace(
+        made,
+        covariance_m2=covariance.astype(np.float32),
+        descriptor=old.descriptor if kept.all() else old.descriptor[np.flatnonzero(kept)],
+        spread=old.spread[kept],
+    )
+    camera = map_.info.camera
+    order = np.argsort(model.image, kind="stable")
+    rays = (model.pixel_px[order] - model.pinhole[2:]) / model.pinhole[:2]
+    offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
+    keyframes = store.Keyframes(
+        names=model.names,
+        time_ns=graph.time_ns,
+        wTc=model.wTc,
+        offset=offset.astype(np.int64),
+        landmark=model.point[order].astype(np.int32),
+        pixel_px=camera.distort(rays).astype(np.float32),
+    )
+    return store.Map(store.MapInfo(**vars(map_.info)), lm, keyframes)
+
+
+def _unit_weight(graph: Graph) -> float:
+    """The standard deviation of unit weight: what residuals say of the deviations assumed.
+
+    Residual sum of squares over the degrees of freedom, as in `landmarks.sigma_px`.
+    """
+    model = graph.model
+    r = landmarks.residuals_px(model) / graph.sigma_px[graph.group_of_sights()][:, None]
+    freedom = 2 * len(r) - 3 * len(model.position) - 6 * len(model.names) + 7
+    return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
+
+
+def _keyframe_report(map_: store.Map, past: Refined, graph: Graph) -> dict[str, Any]:
+    """How the map's own sights fitted and fit, and how far landmarks and keyframes moved."""
+    built = graph.group_of_sights() == 0
+    kept = np.isin(map_.landmarks.id, graph.model.point_id)
+    pixel_px = map_.info.camera.undistort_to_pinhole(map_.keyframes.pixel_px)
+    before = graphs.build_graph(map_, pixel_px, past.groups(len(map_.keyframes)), [])
+    built_before = before.group_of_sights() == 0
+    unit = "m" if map_.info.registered else map_.info.units
+    moved = np.linalg.norm(graph.model.position - map_.landmarks.position_m[kept], axis=1)
+    old = {name: k for k, name in enumerate(map_.keyframes.names)}
+    pairs = [(old[n], k) for k, n in enumerate(graph.model.names) if n in old]
+    a, b = np.array(pairs).T
+    stepped = np.linalg.norm(map_.keyframes.wTc[a, :3, 3] - graph.model.wTc[b, :3, 3], axis=1)
+    return {
+        "sigma_px": round(float(graph.sigma_px[0]), 4),
+        "median_before_px": _median(before.error_px()[built_before]),
+        "median_px": _median(graph.error_px()[built]),
+        "moved_unit": unit,
+        "landmarks_moved_median": _median(moved),
+        "landmarks_moved_p95": round(float(np.percentile(moved, 95)), 5),
+        "keyframes_moved_median": _median(stepped),
+    }
+
+
+def _flight_report(flight: Chosen, start: Graph, graph: Graph, group: int) -> dict[str, Any]:
+    mine, given = graph.group_of_sights() == group, start.group_of_sights() == group
+    return {
+        "name": flight.name,
+        "frames": int((graph.group == group).sum()),
+        "sights": int(mine.sum()),
+        "sights_given": int(given.sum()),
+        "sights_a_landmark": round(flight.sights_per_landmark, 2),
+        "sigma_px": round(float(graph.sigma_px[group]), 4),
+        "median_before_px": _median(start.error_px()[given]),
+        "median_px": _median(graph.error_px()[mine]),
+        "frames_left_out": {reason: count for reason, count in flight.left.items() if count},
+    }
+
+
+def _median(values: F64) -> float:
+    return round(float(np.median(values)), 5) if len(values) else 0.0
+
+
+def _table(map_: store.Map, past: Refined, report: dict[str, Any]) -> dict[str, Any]:
+    """`refined` of map.toml: the flights that are in the map, and the last run's report."""
+    hashes = [*past.landmarks_sha256, landmarks_sha256(map_.landmarks)]
+    undone = report["rolling_shutter"]["undone"]
+    last = {name: value for name, value in report.items() if name != "flights"}
+    return Refined(
+        runs=past.runs + 1,
+        pixels_at=FRAME_TIME if undone else "",
+        flights=[*past.flights, *report["flights"]],
+        landmarks_sha256=list(dict.fromkeys(hashes)),
+        last=last,
+    ).as_dict()
+
+
+def _carry_floorplan(folder: Path, part: Path) -> None:
+    for name in _FLOORPLAN:
+        if (folder / name).is_file():
+            shutil.copy2(folder / name, part / name)

@@ -1,0 +1,84 @@
+"""`blimp map refine`: its arguments and what it prints. Heavy modules are imported when it runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+HELP = "Adds what flights saw to a map, and adjusts it."
+
+EXAMPLE = """\
+example:
+  blimp localize flight.mcap --map maps/atrium --out out/est.txt \\
+    --observations out/flight.observations.safetensors
+  blimp map refine maps/atrium out/flight.observations.safetensors
+  blimp map register maps/atrium --pairs maps/atrium/PAIRS.csv
+
+Poses and landmarks move together until all sights fit best; the map stays where it is registered,
+and registering it again with the same points takes it nearer still. The old map is kept beside the
+new one, as MAP.before, until you delete it. Without EST the map's own sights are adjusted anew,
+with the rolling shutter taken out."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of `blimp map refine`."""
+    parser.add_argument("map", metavar="MAP", help="folder of the map")
+    parser.add_argument(
+        "observations",
+        nargs="*",
+        metavar="EST",
+        help="what 'blimp localize --observations' wrote, one file a flight",
+    )
+    parser.add_argument("--out", metavar="NEWMAP", help="write here and leave MAP as it is")
+    parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
+    parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
+
+
+def run(args: argparse.Namespace, print_table: Callable[[dict[str, Any]], None]) -> int:
+    """Refines; raises `BlimpError` for what a person can mend."""
+    from ground_station.errors import InputError, MapError
+    from ground_station.files import write_json
+    from ground_station.mapping.observations import load_observations
+    from ground_station.mapping.refine import refine_map
+    from ground_station.mapping.settings import load_settings
+
+    settings = load_settings(args.settings)
+    if args.out and Path(args.out).resolve() == Path(args.map).resolve():
+        raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
+    for path in (args.json, args.out):
+        if path and not Path(path).resolve().parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist")
+    flights = [load_observations(path) for path in args.observations]
+    refined, result = refine_map(args.map, flights, settings, args.out)
+    report = result.report
+    print_table(_shown(report))
+    if result.kept is not None:
+        print(f"the old map is kept in {result.kept}")
+    method = refined.info.registration.get("method")
+    if method:
+        print(f"registered by {method} as before; registering again uses what was gained")
+    if not report["rolling_shutter"]["undone"]:
+        print(
+            "note: the keyframes' rolling shutter is still in the map: "
+            "they are too far apart in time, or fit no better without it",
+            file=sys.stderr,
+        )
+    if args.json:
+        write_json(args.json, report)
+    return 0
+
+
+def _shown(report: dict[str, Any]) -> dict[str, Any]:
+    """The report with a line for each flight and none for what is empty."""
+    shown = {k: v for k, v in report.items() if k not in ("flights", "keyframes")}
+    shown |= {f"keyframes_{name}": value for name, value in report["keyframes"].items()}
+    for flight in report["flights"]:
+        left = ", ".join(f"{n} {why}" for why, n in flight["frames_left_out"].items())
+        shown[f"flight {flight['name']}"] = (
+            f"{flight['frames']} frames ({left or 'none'} left out), {flight['sights']} sights, "
+            f"median {flight['median_before_px']:.3f} -> {flight['median_px']:.3f} px"
+        )
+    return shown
