@@ -14,11 +14,13 @@ def grown(map_: Map, times: int) -> Map:
 
     Their descriptors mix two of its own each: as crowded, and alike only by chance.
     """
-    lm, kf, rng = map_.landmarks, map_.keyframes, np.random.default_rng(times)
+    kf, rng = map_.keyframes, np.random.default_rng(times)
+    lm = replace(map_.landmarks, descriptor=np.asarray(map_.landmarks.descriptor, np.float32))
     landmarks, keyframes = [lm], [kf]
     for k in range(1, times):
         one, other = rng.permutation(len(lm)), rng.permutation(len(lm))
-        mixed = lm.descriptor[one] + lm.descriptor[other]
+        described = np.asarray(lm.descriptor)
+        mixed = described[one] + described[other]
         mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
         aside = np.array([40.0 * k, 0, 0])
         landmarks.append(replace(lm, position_m=lm.position_m + aside, descriptor=mixed))

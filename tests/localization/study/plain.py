@@ -24,7 +24,7 @@ class PlainLocalizer:
 
     def __init__(self, map_: Map, camera: Camera, max_features: int = 1500) -> None:
         self._points = np.asarray(map_.landmarks.position_m, np.float64)
-        self._descriptors = np.ascontiguousarray(map_.landmarks.descriptor.T)
+        self._descriptors = np.ascontiguousarray(np.asarray(map_.landmarks.descriptor).T)
         self._camera = camera
         self._extractor = RootSift(max_features)
 

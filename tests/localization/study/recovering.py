@@ -139,7 +139,7 @@ def blackout(study: Study) -> Row:
     for _ in range(study.repetitions):
         a, i, b, j = draw_places(flights, rng, 2 * BEFORE, AFTER)
         old, new = flights[a].frames[i : i + 2 * BEFORE], flights[b].frames[j : j + AFTER]
-        dark = dark_frames(old[0].image.shape, DARK, rng)  # type: ignore[arg-type]
+        dark = dark_frames(old[0].image.shape, DARK, rng)
         stream = joined([old, dark, new], _RATE_HZ)
         localizer = make_localizer(study.map_, flights[b].camera, study.settings)
         localizer.set_initial_pose(flights[a].true_wTc(old[:1])[0], stream[0].time_ns)
