@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-import numpy.typing as npt
-
-from ground_station.features.extractor import Features
 from ground_station.localization.estimate import Counts, no_observations
-
-Array = npt.NDArray[np.float64]
+from ground_station.localization.kinematics import Kinematics
 
 
 class Stopwatch:
@@ -32,14 +27,11 @@ class Stopwatch:
 class Attempt:
     """One frame on its way to a pose."""
 
-    def __init__(
-        self, time_ns: int, index: int, watch: Stopwatch, entropy: float = float("nan")
-    ) -> None:
-        self.time_ns, self.index, self.watch, self.entropy = time_ns, index, watch, entropy
-        self.predicted: Array | None = None
+    def __init__(self, time_ns: int, index: int = 0, exposure_s: float | None = None) -> None:
+        self.time_ns, self.index, self.exposure_s = time_ns, index, exposure_s
+        self.watch = Stopwatch()
+        self.entropy = float("nan")
+        self.sharpness = 1.0
+        self.predicted: Kinematics | None = None
         self.counts = Counts()
         self.observations = no_observations()
-        self.features = Features(
-            np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 0), np.float32)
-        )
-        self.normalized = np.empty((0, 2))

@@ -65,13 +65,15 @@ def no_observations() -> Observations:
 class PoseEstimate:
     """One frame's pose, or why there is none.
 
-    `wTc` (4, 4) is only there when the frame was solved from its own observations. `covariance`
-    (6, 6) is of the right tangent wTc·exp(ξ) in the camera's axes, rotation (rad) before
-    translation (m), as of GTSAM's Pose3. `predicted_wTc` is the motion model's, for drawing only.
-    `stage_ms` has entropy, track, features, projection, association, pose, relocalization, wait and
-    total, those that ran; a keyframe's features landed in a frame with `background`, the time they
-    took beside the frames, which is no part of the total. `tracked`: solved from a keyframe's
-    points found again in this frame, and not from features of its own.
+    `wTc` (4, 4) is only there when the frame was solved from its own observations. `twist` (6,) is
+    the velocity in the camera's axes, rotation (rad/s) before translation (m/s); zero where the
+    preset does not estimate it. `covariance` (6, 6) is of the right tangent wTc·exp(ξ) in the
+    camera's axes, rotation (rad) before translation (m), as of GTSAM's Pose3. `predicted_wTc` is
+    the motion model's, for drawing only. `stage_ms` has entropy, track, features, projection,
+    association, pose, relocalization, wait, catch_up and total, those that ran; a keyframe's
+    features landed in a frame with `background`, the time they took beside the frames, which is no
+    part of the total. `sharpness` is against the frames before, 0 to 1. `tracked`: solved from a
+    keyframe's points found again in this frame, and not from features of its own.
     """
 
     time_ns: int
@@ -79,12 +81,14 @@ class PoseEstimate:
     state: State
     reason: str = ""
     wTc: Array | None = None
+    twist: Array | None = None
     covariance: Array | None = None
     predicted_wTc: Array | None = None
     counts: Counts = Counts()
     observations: Observations = field(default_factory=no_observations)
     stage_ms: dict[str, float] = field(default_factory=dict)
     entropy_bits: float = float("nan")
+    sharpness: float = 1.0
     gated: bool = False
     relocalized: bool = False
     tracked: bool = False

@@ -103,6 +103,9 @@ class ProjectionSettings:
     max_distance_ratio: float = config.key(
         2.5, "how much nearer or farther than any keyframe was, with the cone", low=1, high=100
     )
+    covisibility: bool = config.key(
+        False, "drop landmarks that no keyframe near or covisible with the last frame's saw"
+    )
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,9 @@ class AssociationSettings:
     )
     refine_radius_px: float = config.key(
         0.0, "associate again this near after a first solution; 0: no", unit="px", low=0, high=500
+    )
+    learn_thresholds: bool = config.key(
+        False, "each landmark's largest distance is learned, up to max_descriptor_distance"
     )
 
 
@@ -197,6 +203,10 @@ class TrackingSettings:
     keyframe_min_share: float = config.key(
         0.6, "and one of which a smaller share of points is found again", low=0, high=1
     )
+    describe_gap_s: float = config.key(
+        0.12, "a frame this long after the one before is described itself: there is time",
+        unit="s", low=0, high=1000,
+    )  # fmt: skip
     features_lag_frames: int = config.key(
         6, "frames after which a keyframe's features land, waited for; 0: when ready",
         low=0, high=30,
@@ -249,10 +259,13 @@ class StateSettings:
         high=60,
     )
     confirm_frames: int = config.key(
-        1, "frames after a relocalization that must agree before TRACKING", low=0, high=100
+        1,
+        "frames that must agree with a relocalization, by other features, before TRACKING",
+        low=0,
+        high=100,
     )
     recover_frames: int = config.key(
-        0, "good frames in a row from DEGRADED back to TRACKING, less one", low=0, high=100
+        0, "good frames in a row from DEGRADED back to TRACKING", low=0, high=100
     )
     good_inliers: int = config.key(25, "fewer inliers: DEGRADED", low=4, high=1000)
     good_inlier_share: float = config.key(

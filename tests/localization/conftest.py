@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,8 @@ from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
 
 DIMENSION = 64
+CAMERA = replace(THESIS_CAMERA, readout_s=0.0)
+"""All rows at once, as the synthetic frames have them."""
 
 
 class FakeExtractor:
@@ -117,12 +119,12 @@ def room() -> Room:
         FakeExtractor.name,
         FakeExtractor.sha256,
         DIMENSION,
-        THESIS_CAMERA,
+        CAMERA,
         name="room",
         frame="world",
         units="m",
     )
-    return Room(Map(info, landmarks, keyframes), THESIS_CAMERA, rng)
+    return Room(Map(info, landmarks, keyframes), CAMERA, rng)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ class Wall:
 
     def __init__(self, seed: int = 5) -> None:
         rng = np.random.default_rng(seed)
-        self.camera = THESIS_CAMERA
+        self.camera = dataclasses.replace(THESIS_CAMERA, readout_s=0.0)
         self.texture = cv2.GaussianBlur(
             rng.uniform(0, 255, (1800, 2400)).astype(np.float32), (0, 0), 3
         )
@@ -189,7 +189,7 @@ def test_the_same_frames_give_the_same_poses_again(wall):
         assert np.array_equal(a.wTc, b.wTc) and np.array_equal(a.covariance, b.covariance)
 
 
-def test_a_black_frame_falls_back_to_its_own_features_and_the_next_comes_back(wall):
+def test_a_black_frame_is_searched_beside_and_the_next_is_followed_again(wall):
     localizer, extractor = make(wall)
     times, truth = path(12)
     localizer.set_initial_pose(truth[0], times[0])
@@ -197,19 +197,52 @@ def test_a_black_frame_falls_back_to_its_own_features_and_the_next_comes_back(wa
         localizer.process(times[k], wall.picture(truth[k]), k)
     black = localizer.process(times[8], np.zeros((480, 640), np.uint8), 8)
     assert not black.localized and not black.tracked and black.state is State.DEGRADED
-    assert extractor.threads[-1] == threading.current_thread().name
+    assert "features" not in black.stage_ms and "points found" in black.reason
     back = localizer.process(times[9], wall.picture(truth[9]), 9)
-    assert back.localized and not back.tracked
-    assert localizer.process(times[10], wall.picture(truth[10]), 10).tracked
+    assert back.localized and back.tracked and back.state is State.DEGRADED
+    assert back.reason.startswith("just recovered")
+    assert localizer.process(times[10], wall.picture(truth[10]), 10).state is State.TRACKING
+    assert extractor.threads.count(threading.current_thread().name) == 1
+
+
+def test_a_blackout_is_lost_and_found_beside_the_frames(wall):
+    localizer, extractor = make(wall)
+    times, truth = path(70)
+    localizer.set_initial_pose(truth[0], times[0])
+    dark = np.zeros((480, 640), np.uint8)
+    pictures = [dark if 10 <= k < 35 else wall.picture(truth[k]) for k in range(70)]
+    frames = [localizer.process(times[k], pictures[k], k) for k in range(70)]
+    states = [frame.state for frame in frames]
+    assert State.LOST not in states[:15] and set(states[22:35]) == {State.LOST}
+    found = next(k for k in range(35, 70) if frames[k].localized)
+    assert frames[found].relocalized and found < 50
+    assert frames[found].reason.startswith("relocalized, to be confirmed")
+    sure = states.index(State.TRACKING, 35)
+    assert found < sure < 62 and all(state is State.TRACKING for state in states[sure:])
+    for k in range(found, 70):
+        assert np.linalg.norm(frames[k].wTc[:3, 3] - truth[k][:3, 3]) < 0.02
+    assert extractor.threads.count(threading.current_thread().name) == 1
+    assert all("features" not in frame.stage_ms for frame in frames[1:])
 
 
 def test_a_relocalization_is_not_confirmed_by_its_own_points(wall):
     localizer, _ = make(wall)
-    times, truth = path(3)
-    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(3)]
-    assert frames[0].relocalized
-    assert frames[1].state is State.TRACKING and not frames[1].tracked
-    assert frames[2].tracked
+    times, truth = path(10)
+    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(10)]
+    assert frames[0].relocalized and all(frame.tracked for frame in frames[1:])
+    landed = next(k for k, frame in enumerate(frames) if "background" in frame.stage_ms)
+    assert landed >= 6
+    for frame in frames[:landed]:
+        assert frame.state is State.DEGRADED and "to be confirmed" in frame.reason
+    assert frames[-1].state is State.TRACKING
+
+
+def test_frames_far_apart_are_described_themselves(wall):
+    localizer, extractor = make(wall)
+    times, truth = path(31)
+    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(0, 31, 6)]
+    assert all(frame.localized and not frame.tracked for frame in frames)
+    assert len(extractor.threads) == len(frames)
 
 
 def test_a_time_that_jumps_back_is_refused_while_tracking(wall):

@@ -1,0 +1,201 @@
+"""What takes longer than a frame: keyframes from features, and the way back when lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.extractor import Extractor
+from ground_station.localization.attempt import Stopwatch
+from ground_station.localization.estimate import Observations, no_observations
+from ground_station.localization.estimator import Estimator
+from ground_station.localization.kinematics import Kinematics, Solution, no_solution
+from ground_station.localization.matching import Described, Matcher, Matches, describe
+from ground_station.localization.relocalization import Relocalizer
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.tracking import Keyframe, spread_out
+from ground_station.mapping.store import Map
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Located:
+    """A frame solved from features of its own, or why not.
+
+    `relocalized`: found in the whole map, without a prediction.
+    """
+
+    solution: Solution
+    matches: Matches
+    observations: Observations
+    features: int
+    relocalized: bool = False
+
+
+@dataclass(frozen=True)
+class Acquired:
+    """What a job beside the frames brings: a keyframe, or None and the reason.
+
+    `state` is what the frame was found to be. `searched`: it had none before; `relocalized`: it was
+    found in the whole map.
+    """
+
+    time_ns: int
+    keyframe: Keyframe | None
+    state: Kinematics | None
+    searched: bool
+    relocalized: bool
+    reason: str
+    background_ms: float
+
+
+class Acquirer:
+    """Solves frames from their own features. It keeps nothing of them: safe beside the tracking."""
+
+    def __init__(
+        self, map_: Map, matcher: Matcher, extractor: Extractor, settings: LocalizerSettings
+    ) -> None:
+        self.matcher, self._extractor, self._settings = matcher, extractor, settings
+        self._landmarks = map_.landmarks
+        recovery = settings.recovery
+        self._relocalizer = (
+            Relocalizer(map_, matcher.camera, recovery, settings.seed)
+            if recovery.relocalize
+            else None
+        )
+
+    def describe(self, image: Image) -> Described:
+        """The features of a grey frame (H, W)."""
+        return describe(self._extractor.extract(image), self.matcher.camera)
+
+    def locate(
+        self, seen: Described, expected: Kinematics, estimator: Estimator, watch: Stopwatch
+    ) -> Located:
+        """Matches around a prediction and solves; once more, closer, if the settings say."""
+        found = self._locate_once(seen, expected, expected, estimator, None, watch)
+        closer_px = self._settings.association.refine_radius_px
+        if found.solution.state is not None and closer_px > 0:
+            state = found.solution.state
+            found = self._locate_once(seen, state, expected, estimator, closer_px, watch)
+        return found
+
+    def relocalize(
+        self, seen: Described, time_ns: int, make: Callable[[], Estimator], watch: Stopwatch
+    ) -> Located:
+        """The frame anywhere in the map, solved with an estimator that knows of nothing else."""
+        assert self._relocalizer is not None, "the settings say whether it may be asked"
+        found = self._relocalizer.find(seen.features, seen.normalized)
+        watch.lap("relocalization")
+        if isinstance(found, str):
+            return _nothing(seen, found)
+        estimator = make()
+        estimator.restart(time_ns, found.wTc)
+        expected = estimator.predict(time_ns)
+        assert expected is not None
+        return replace(self.locate(seen, expected, estimator, watch), relocalized=True)
+
+    def keyframe(self, time_ns: int, image: Image, wTc: Array, seen: Observations) -> Keyframe:
+        """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed."""
+        pixel, landmark = seen.pixel_px[seen.inlier], seen.landmark[seen.inlier]
+        chosen = spread_out(pixel, self._settings.tracking.max_points)
+        pixel, landmark = pixel[chosen], landmark[chosen]
+        points = np.asarray(self._landmarks.position_m[landmark], np.float64)
+        return Keyframe(time_ns, image, wTc, pixel, landmark, points)
+
+    def promote(
+        self, time_ns: int, image: Image, state: Kinematics, estimator: Estimator
+    ) -> Callable[[], Acquired]:
+        """The job that makes a tracked frame of a known state the next keyframe."""
+
+        def job() -> Acquired:
+            watch = Stopwatch()
+            seen = self.describe(image)
+            closer_px = self._settings.association.refine_radius_px
+            radius_px = closer_px or self._settings.association.radius_px
+            found = self._locate_once(seen, state, state, estimator, radius_px, watch)
+            return self._acquired(time_ns, image, found, watch, searched=False)
+
+        return job
+
+    def search(
+        self,
+        time_ns: int,
+        image: Image,
+        expected: Kinematics | None,
+        make: Callable[[], Estimator],
+    ) -> Callable[[], Acquired]:
+        """The job that finds a frame near its prediction, or else anywhere."""
+
+        def job() -> Acquired:
+            watch = Stopwatch()
+            seen = self.describe(image)
+            found = _nothing(seen, "no prediction")
+            if expected is not None:
+                found = self.locate(seen, expected, make(), watch)
+            if found.solution.state is None and self._relocalizer is not None:
+                found = self.relocalize(seen, time_ns, make, watch)
+            return self._acquired(time_ns, image, found, watch, searched=True)
+
+        return job
+
+    def _acquired(
+        self, time_ns: int, image: Image, found: Located, watch: Stopwatch, *, searched: bool
+    ) -> Acquired:
+        keyframe, state = None, found.solution.state
+        reason, count = found.solution.reason, int(found.observations.inlier.sum())
+        if state is not None:
+            if count >= self._settings.tracking.keyframe_min_points:
+                keyframe = self.keyframe(time_ns, image, state.wTc, found.observations)
+            else:
+                reason = f"{count} inliers"
+        spent_ms = watch.finish()["total"]
+        return Acquired(time_ns, keyframe, state, searched, found.relocalized, reason, spent_ms)
+
+    def _locate_once(
+        self,
+        seen: Described,
+        around: Kinematics,
+        expected: Kinematics,
+        estimator: Estimator,
+        radius_px: float | None,
+        watch: Stopwatch,
+    ) -> Located:
+        settings = self._settings.pose
+        matches = self.matcher.match(seen, around, radius_px, watch)
+        pixel = seen.features.keypoints_px[matches.feature]
+        if len(matches) < settings.min_observations:
+            solution = no_solution(len(matches), f"{len(matches)} observations")
+        else:
+            sights = self.matcher.sights(pixel, matches.landmark, settings.sigma_px)
+            solution = believed(estimator.solve(expected, sights, settings), self._settings)
+        watch.lap("pose")
+        observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)
+        return Located(solution, matches, observations, len(seen))
+
+
+def believed(solution: Solution, settings: LocalizerSettings, least: int | None = None) -> Solution:
+    """The solution, or none when too few of its own observations agree with it.
+
+    `least` inliers, instead of those that a described frame needs.
+    """
+    pose, total = settings.pose, len(solution.inlier)
+    least = pose.min_inliers if least is None else least
+    inliers = int(solution.inlier.sum())
+    if solution.state is None or inliers >= max(least, pose.min_inlier_share * total):
+        return solution
+    return no_solution(total, f"{inliers} inliers of {total} observations", solution.iterations)
+
+
+def _nothing(seen: Described, reason: str) -> Located:
+    none = np.empty(0, np.intp)
+    return Located(
+        no_solution(0, reason),
+        Matches(none, none, np.empty(0, np.float32), 0, 0),
+        no_observations(),
+        len(seen),
+    )

@@ -1,0 +1,134 @@
+"""From one frame's sights to the state: as the thesis does it, or as a filter with covariance."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry.camera import Camera
+from ground_station.localization.kinematics import Kinematics, Sights, Solution, no_solution
+from ground_station.localization.motion import MotionModel
+from ground_station.localization.pose_direct import solve_direct
+from ground_station.localization.pose_graph import solve_graph
+from ground_station.localization.pose_rolling import solve_rolling
+from ground_station.localization.settings import LocalizerSettings, PoseSettings
+from ground_station.localization.smoother import FixedLagSmoother
+
+Array = npt.NDArray[np.float64]
+
+_POSE_SOLVERS = {"graph": solve_graph, "direct": solve_direct}
+
+
+class Estimator(Protocol):
+    """What the localizer believes about the camera between two frames."""
+
+    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+        """A pose (4, 4) from elsewhere with its covariance (6, 6), and no known velocity."""
+        ...
+
+    def predict(self, time_ns: int) -> Kinematics | None:
+        """What is expected at a time; None when no pose was ever known."""
+        ...
+
+    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
+        """The state that explains the sights; changes nothing."""
+        ...
+
+    def update(self, solution: Solution) -> Kinematics:
+        """Takes a solution for true and returns what is then believed of its time."""
+        ...
+
+    def smoothed(self) -> list[Kinematics]:
+        """States that later frames helped to estimate, each once, when they are final."""
+        ...
+
+
+class PoseEstimator:
+    """Each frame's pose from its own sights alone; the last two poses predict the next (thesis)."""
+
+    def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
+        self._camera = camera
+        self._solve = _POSE_SOLVERS[settings.pose.solver]
+        self._motion = MotionModel(settings.motion)
+
+    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+        self._motion.restart(time_ns, wTc)
+
+    def predict(self, time_ns: int) -> Kinematics | None:
+        wTc = self._motion.predict(time_ns)
+        # Nothing is known of how good the prediction is.
+        return None if wTc is None else Kinematics(time_ns, wTc, np.zeros(6), _UNKNOWN)
+
+    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
+        if len(sights):
+            settings = dataclasses.replace(settings, sigma_px=float(sights.sigma_px.mean()))
+        found = self._solve(
+            predicted.wTc, sights.points_m, sights.pinhole_px, self._camera, settings
+        )
+        if found.wTc is None or found.covariance is None:
+            return no_solution(len(sights), found.reason, found.iterations)
+        covariance = np.zeros((12, 12))
+        covariance[:6, :6] = found.covariance
+        state = Kinematics(predicted.time_ns, found.wTc, np.zeros(6), covariance)
+        return Solution(
+            state, np.zeros((12, 12)), np.zeros(12), found.residual_px, found.inlier,
+            iterations=found.iterations,
+        )  # fmt: skip
+
+    def update(self, solution: Solution) -> Kinematics:
+        assert solution.state is not None
+        self._motion.update(solution.state.time_ns, solution.state.wTc)
+        return solution.state
+
+    def smoothed(self) -> list[Kinematics]:
+        return []
+
+
+_UNKNOWN = np.full((12, 12), np.nan)
+
+
+class FilterEstimator:
+    """Pose and velocity from prediction and sights together, rows at their own times."""
+
+    def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
+        self._camera, self._settings = camera, settings
+        self._smoother = FixedLagSmoother(settings.motion)
+
+    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+        start = self._settings.start
+        sigma = np.r_[
+            np.full(3, np.deg2rad(start.sigma_deg)), np.full(3, start.sigma_m),
+            np.full(3, np.deg2rad(start.turn_deg_s)), np.full(3, start.speed_m_s),
+        ]  # fmt: skip
+        full = np.diag(sigma**2)
+        if covariance is not None:
+            full[:6, :6] = covariance
+        self._smoother.restart(Kinematics(time_ns, wTc, np.zeros(6), full))
+
+    def predict(self, time_ns: int) -> Kinematics | None:
+        return self._smoother.predict(time_ns)
+
+    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
+        return solve_rolling(predicted, sights, self._camera, settings)
+
+    def update(self, solution: Solution) -> Kinematics:
+        state = solution.state
+        assert state is not None
+        latest = self._smoother.latest
+        if latest is None or state.time_ns <= latest.time_ns:
+            # A given pose's own frame: the solution already holds what was given.
+            self._smoother.restart(state)
+            return state
+        return self._smoother.update(state.time_ns, solution)
+
+    def smoothed(self) -> list[Kinematics]:
+        return self._smoother.smoothed()
+
+
+def make_estimator(camera: Camera, settings: LocalizerSettings) -> Estimator:
+    """The one that `pose.solver` names."""
+    kind = FilterEstimator if settings.pose.solver == "rolling" else PoseEstimator
+    return kind(camera, settings)

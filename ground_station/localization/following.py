@@ -1,0 +1,106 @@
+"""Frames solved from a keyframe's points, found again by KLT."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.localization.acquisition import Acquired, believed
+from ground_station.localization.attempt import Attempt
+from ground_station.localization.estimate import Counts, Observations
+from ground_station.localization.estimator import Estimator
+from ground_station.localization.kinematics import Kinematics, Solution, no_solution
+from ground_station.localization.matching import Matcher
+from ground_station.localization.settings import LocalizerSettings, PoseSettings
+from ground_station.localization.tracking import Keyframe, track
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+REMEMBERED = 12
+"""Frames kept for catching up with a search's result: it may take 0.4 s at 30 Hz."""
+
+_STEPS = 3
+"""Frames of those in between that are solved on the way: KLT needs steps within its reach."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A frame solved from the keyframe's points.
+
+    `moved_px` is the median way of the points since the keyframe, taken at `support_ns`.
+    """
+
+    solution: Solution
+    counts: Counts
+    observations: Observations
+    moved_px: float
+    support_ns: int
+
+
+def follow(
+    keyframe: Keyframe,
+    attempt: Attempt,
+    image: Image,
+    predicted: Kinematics,
+    matcher: Matcher,
+    estimator: Estimator,
+) -> Followed:
+    """The keyframe's points in a frame (H, W), and the state that explains them."""
+    settings = matcher.settings
+    tracks = track(keyframe, image, predicted.wTc, matcher.camera, settings.tracking)
+    attempt.watch.lap("track")
+    found = len(tracks.point)
+    landmark = keyframe.landmark[tracks.point]
+    if found < settings.tracking.min_inliers:
+        solution = no_solution(found, f"{found} points found again")
+    else:
+        sights = matcher.sights(tracks.pixel_px, landmark, settings.tracking.sigma_px)
+        solution = estimator.solve(predicted, sights, _tracked(settings))
+        solution = believed(solution, settings, settings.tracking.min_inliers)
+    attempt.watch.lap("pose")
+    way = np.linalg.norm(tracks.pixel_px - keyframe.pixel_px[tracks.point], axis=1)
+    return Followed(
+        solution,
+        Counts(found, tracks.sought, found, int(solution.inlier.sum())),
+        Observations(tracks.pixel_px, landmark, solution.residual_px, solution.inlier),
+        float(np.median(way)) if found else 0.0,
+        keyframe.time_ns,
+    )
+
+
+def _tracked(settings: LocalizerSettings) -> PoseSettings:
+    return replace(settings.pose, min_inliers=6)
+
+
+def better(landed: Keyframe, present: Keyframe | None, followed: Followed | None) -> Keyframe:
+    """The new keyframe, unless it carries far fewer points than the present one still gives."""
+    if present is None or followed is None:
+        return landed
+    return present if len(landed) < 0.5 * followed.counts.inliers else landed
+
+
+def catch_up(
+    landed: Acquired,
+    recent: list[tuple[int, Image]],
+    matcher: Matcher,
+    estimator: Estimator,
+) -> bool:
+    """Brings a fresh estimator from a found frame through some of the frames since.
+
+    False when its points cannot be followed that far.
+    """
+    assert landed.state is not None and landed.keyframe is not None
+    estimator.restart(landed.time_ns, landed.state.wTc, landed.state.covariance[:6, :6])
+    since = [frame for frame in recent if frame[0] > landed.time_ns]
+    for step in np.unique(np.linspace(0, len(since) - 1, _STEPS + 1).astype(int))[1:]:
+        time_ns, image = since[step]
+        predicted = estimator.predict(time_ns)
+        assert predicted is not None
+        found = follow(landed.keyframe, Attempt(time_ns, 0), image, predicted, matcher, estimator)
+        if found.solution.state is None:
+            return False
+        estimator.update(found.solution)
+    return True

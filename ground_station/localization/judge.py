@@ -1,0 +1,126 @@
+"""What a localizer may say about a pose: its state, and why it is not better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.localization.estimate import State
+from ground_station.localization.settings import StateSettings
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for or against a solved frame.
+
+    `inliers` of `observations`; `spread` of the inliers (RMS over the image's diagonal);
+    `residual_px` the inliers' RMS; `covariance` (6, 6) of the pose as it is published;
+    `innovation` the squared Mahalanobis distance from the prediction, NaN without one; `support_ns`
+    the time of the features it rests on: its keyframe's, or its own; `sharpness` against the frames
+    before, 0 to 1.
+    """
+
+    inliers: int
+    observations: int
+    spread: float
+    residual_px: float
+    covariance: Array
+    innovation: float = float("nan")
+    support_ns: int = 0
+    sharpness: float = 1.0
+
+
+class Judge:
+    """The state machine. Down at once, up again only after several good frames in a row."""
+
+    def __init__(self, settings: StateSettings) -> None:
+        self.settings = settings
+        self.state = State.INITIALIZING
+        self._last_solved_ns: int | None = None
+        self._good = 0
+        self._owed = 0
+        self._owed_for = ""
+        self._doubtful_ns: int | None = None
+
+    @property
+    def last_solved_ns(self) -> int | None:
+        """The time of the last frame that was solved."""
+        return self._last_solved_ns
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the pose rests on a relocalization that no other features confirmed."""
+        return self._doubtful_ns is not None
+
+    def relocalized(self, time_ns: int) -> None:
+        """A frame was found in the whole map: others with features of their own must agree."""
+        self._owe(self.settings.confirm_frames, "relocalized, to be confirmed")
+        self._doubtful_ns = time_ns
+
+    def _owe(self, frames: int, why: str) -> None:
+        """Before TRACKING so many good frames in a row are needed, `why` is said until then."""
+        self._owed, self._owed_for, self._good = frames, why, 0
+
+    def solved(self, time_ns: int, evidence: Evidence) -> tuple[State, str]:
+        """The state of a solved frame, and what is wrong with it if it is not TRACKING."""
+        self._last_solved_ns = time_ns
+        fault = self._fault(time_ns, evidence)
+        if fault:
+            self._good = 0
+            if self.state is State.TRACKING:
+                self._owe(self.settings.recover_frames, "just recovered")
+            self.state = State.DEGRADED
+            return self.state, fault
+        doubtful = self._doubtful_ns is not None and evidence.support_ns <= self._doubtful_ns
+        self._good += not doubtful
+        if doubtful or self._good < self._owed:
+            self.state = State.DEGRADED
+            return self.state, f"{self._owed_for}; {self._good} of {self._owed} frames agree"
+        self._owed, self._doubtful_ns = 0, None
+        self.state = State.TRACKING
+        return self.state, ""
+
+    def _fault(self, time_ns: int, seen: Evidence) -> str:
+        s = self.settings
+        if seen.inliers < s.good_inliers:
+            return f"few inliers: {seen.inliers}"
+        if seen.spread < s.good_spread:
+            return f"poor spread: {seen.spread:.3f}"
+        sigma_m = float(np.sqrt(np.trace(seen.covariance[3:, 3:])))
+        sigma_deg = float(np.rad2deg(np.sqrt(np.trace(seen.covariance[:3, :3]))))
+        if not sigma_m <= s.good_sigma_m:
+            return f"uncertain position: {sigma_m:.2f} m"
+        if not sigma_deg <= s.good_sigma_deg:
+            return f"uncertain direction: {sigma_deg:.1f} deg"
+        if seen.residual_px > s.good_residual_px:
+            return f"high residual: {seen.residual_px:.1f} px"
+        if seen.inliers < s.good_inlier_share * seen.observations:
+            return f"few agree: {seen.inliers} of {seen.observations}"
+        if seen.innovation > s.max_innovation:
+            return f"jump: {np.sqrt(seen.innovation):.1f} sigma from the prediction"
+        age_s = (time_ns - seen.support_ns) / 1e9
+        if age_s > s.max_support_s:
+            return f"stale keyframe: {age_s:.1f} s old"
+        if seen.sharpness < s.good_sharpness:
+            return f"blur: {seen.sharpness:.2f} of the usual sharpness"
+        return ""
+
+    def unsolved(self, time_ns: int, patience_s: float | None = None) -> State:
+        """The state of a frame without a pose of its own; DEGRADED for `patience_s`, then LOST."""
+        self.state = self.after_gap(time_ns, patience_s)
+        self._good = 0
+        if self._owed == 0 and self.state is not State.INITIALIZING:
+            self._owe(self.settings.recover_frames, "just recovered")
+        return self.state
+
+    def after_gap(self, time_ns: int, patience_s: float | None = None) -> State:
+        """What an unsolved frame would leave behind; changes nothing."""
+        if self._last_solved_ns is None:
+            return State.INITIALIZING
+        patience_s = self.settings.lost_after_s if patience_s is None else patience_s
+        recent = time_ns - self._last_solved_ns <= patience_s * 1e9
+        return State.DEGRADED if recent and self.state is not State.LOST else State.LOST

@@ -1,0 +1,160 @@
+"""A frame's features against the map's landmarks, around where they are predicted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.extractor import Features
+from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
+from ground_station.localization.association import associate
+from ground_station.localization.attempt import Stopwatch
+from ground_station.localization.kinematics import Kinematics, Sights
+from ground_station.localization.projection import Lens, project
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.visibility import LandmarkIndex
+from ground_station.mapping.store import Landmarks
+
+Array = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.intp]
+
+_REACH = 3.0
+"""Standard deviations of a landmark's predicted pixel that a feature may be away."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """A frame's finite features; `normalized` (F, 2) and `pinhole_px` (F, 2) are without lens."""
+
+    features: Features
+    normalized: Array
+    pinhole_px: Array
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def describe(features: Features, camera: Camera) -> Described:
+    """Features without those that are not finite, and where they are without the lens."""
+    finite = np.isfinite(features.keypoints_px).all(axis=1)
+    finite &= np.isfinite(features.descriptors).all(axis=1)
+    if not finite.all():
+        features = Features(
+            features.keypoints_px[finite], features.scores[finite], features.descriptors[finite]
+        )
+    normalized = camera.undistort(features.keypoints_px)
+    focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
+    return Described(features, normalized, normalized * focal + centre)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """N features that are landmarks: `feature` (N,) and `landmark` (N,) indices, nearest first.
+
+    `distance` (N,) of descriptors; `projected` landmarks were looked for and `associated` found.
+    """
+
+    feature: Indices
+    landmark: Indices
+    distance: F32
+    projected: int
+    associated: int
+
+    def __len__(self) -> int:
+        return len(self.feature)
+
+
+class Matcher:
+    """One map as seen through one camera."""
+
+    def __init__(self, landmarks: Landmarks, camera: Camera, settings: LocalizerSettings) -> None:
+        self.landmarks, self.camera, self.settings = landmarks, camera, settings
+        self._lens = Lens(camera)
+        self._index = LandmarkIndex(landmarks)
+        self._rolling = settings.pose.solver == "rolling"
+        self._readout_s = camera.readout_s if settings.pose.rolling_shutter else 0.0
+
+    def match(
+        self, seen: Described, expected: Kinematics, radius_px: float | None, watch: Stopwatch
+    ) -> Matches:
+        """Which features are which landmarks near where `expected` projects them.
+
+        Without a radius it follows the expected covariance, up to `association.radius_px`.
+        """
+        settings, landmarks = self.settings, self.landmarks
+        among = self._index.near(expected.wTc, self._lens, settings.projection)
+        projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
+        where = projected.pinhole_px
+        radius: float | Array = radius_px or settings.association.radius_px
+        if self._rolling and len(where):
+            points = landmarks.position_m[projected.landmark]
+            where = self._at_rows(points, where, expected)
+            if radius_px is None:
+                radius = self._radius_px(points, expected)
+        watch.lap("projection")
+        pairs = associate(
+            seen.pinhole_px,
+            seen.features.descriptors,
+            where,
+            landmarks.descriptor[projected.landmark],
+            settings.association,
+            radius,
+        )
+        best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
+        watch.lap("association")
+        return Matches(
+            pairs.feature[best],
+            projected.landmark[pairs.candidate[best]],
+            pairs.distance[best],
+            len(projected.landmark),
+            len(pairs),
+        )
+
+    def sights(self, pixel_px: npt.ArrayLike, landmark: Indices, sigma_px: npt.ArrayLike) -> Sights:
+        """Landmarks (N,) seen at distorted pixels (N, 2) with standard deviations (N,) or one."""
+        pixel = np.asarray(pixel_px, np.float64)
+        floor = np.eye(3) * self.settings.pose.landmark_sigma_m**2
+        return Sights(
+            np.asarray(self.landmarks.position_m[landmark], np.float64),
+            self.camera.undistort_to_pinhole(pixel),
+            self.row_s(pixel),
+            np.broadcast_to(np.asarray(sigma_px, np.float64), (len(pixel),)),
+            self.landmarks.covariance_m2[landmark].astype(np.float64) + floor,
+        )
+
+    def row_s(self, pixel_px: Array) -> Array:
+        """When the rows of distorted pixels (N, 2) are exposed after the frame's time, seconds."""
+        last = self.camera.height_px - 1
+        return np.asarray((pixel_px[:, 1] - last / 2) / last * self._readout_s)
+
+    def _at_rows(self, points_m: Array, pinhole_px: Array, expected: Kinematics) -> Array:
+        """Pinhole pixels (N, 2) moved by what the camera moves until their rows are exposed."""
+        if self._readout_s == 0 or not np.any(expected.twist):
+            return pinhole_px
+        flow = pixel_jacobian(points_m, expected.wTc, self.camera) @ expected.twist
+        row_s = (pinhole_px[:, 1] / (self.camera.height_px - 1) - 0.5) * self._readout_s
+        return np.asarray(pinhole_px + flow * np.clip(row_s, -1, 1)[:, None])
+
+    def _radius_px(self, points_m: Array, expected: Kinematics) -> Array:
+        """How far from its prediction each landmark (N, 3) is looked for, by the covariance."""
+        settings = self.settings
+        J = pixel_jacobian(points_m, expected.wTc, self.camera)
+        variance = np.einsum("nij,jk,nik->ni", J, expected.covariance[:6, :6], J).sum(axis=1)
+        radius = _REACH * np.sqrt(variance + 2 * settings.pose.sigma_px**2)
+        least = settings.association.refine_radius_px or settings.association.radius_px
+        return np.clip(np.nan_to_num(radius, nan=np.inf), least, settings.association.radius_px)
+
+
+def pixel_jacobian(points_m: Array, wTc: Array, camera: Camera) -> Array:
+    """∂(pinhole pixel)/∂ξ (N, 2, 6) of points (N, 3), ξ the right tangent of wTc; z is kept > 0."""
+    x, y, z = poses.transform(poses.inverse(wTc), points_m).T
+    z = np.maximum(z, 1e-3)
+    u, v, none = x / z, y / z, np.zeros_like(z)
+    J = np.empty((len(z), 2, 6))
+    J[:, 0] = camera.fx_px * np.stack([u * v, -1 - u * u, v, -1 / z, none, u / z], axis=1)
+    J[:, 1] = camera.fy_px * np.stack([1 + v * v, -u * v, -u, none, -1 / z, v / z], axis=1)
+    return J

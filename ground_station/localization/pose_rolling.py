@@ -1,0 +1,142 @@
+"""Pose and velocity of one frame of a rolling shutter, from a prediction and what it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
+from ground_station.localization.kinematics import Kinematics, Sights, Solution, no_solution
+from ground_station.localization.pose_newton import Prior, Reprojection, descend, solve2
+from ground_station.localization.settings import PoseSettings
+
+Array = npt.NDArray[np.float64]
+
+_WIDENING = 9.0
+"""A sight may miss by three standard deviations of its landmark and of the pose on top of
+`inlier_px`; squared."""
+
+_SMALLEST = 1e-9
+"""A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
+
+
+def solve_rolling(
+    predicted: Kinematics, sights: Sights, camera: Camera, settings: PoseSettings
+) -> Solution:
+    """The pose and twist at the frame's time that best explain its sights and the prediction.
+
+    The maximum a posteriori of the prediction's Gaussian (its pose, twist and 12×12 covariance) and
+    N sights, each seen from wTc·exp(twist·row_s): constant velocity during the readout, as in
+    Hedborg et al. (CVPR 2012). A residual is whitened by its pixel noise and its landmark's
+    covariance, and Huber's loss with `settings.huber_k` is that of a graph with a variable for each
+    landmark. With `settings.reject_outliers` it is solved once more from the inliers alone: sights
+    that miss by less than `settings.inlier_px`, widened by their landmarks' and the pose's
+    covariance. Of `settings`, also `max_iterations` and `min_inliers` are used.
+
+    Never raises: bad or too few sights, a covariance that is none and no convergence are a
+    `Solution` without a state, with the reason.
+    """
+    count = len(sights)
+    if reason := _refused(predicted, sights):
+        return no_solution(count, reason)
+    prior = _prior(predicted)
+    if prior is None:
+        return no_solution(count, "the prediction's covariance is not positive definite")
+    every = Reprojection(
+        points_m=np.ascontiguousarray(sights.points_m.T, np.float64),
+        pinhole_px=np.ascontiguousarray(sights.pinhole_px.T, np.float64),
+        covariance_m2=np.ascontiguousarray(sights.covariance_m2.transpose(1, 2, 0), np.float64),
+        variance_px2=np.square(sights.sigma_px, dtype=np.float64),
+        row_s=np.asarray(sights.row_s, np.float64),
+        camera=camera,
+        huber_k=settings.huber_k,
+    )
+    chosen, inlier, iterations = every, np.ones(count, bool), 0
+    wTc, twist = np.asarray(predicted.wTc, np.float64), np.asarray(predicted.twist, np.float64)
+    with np.errstate(all="ignore"):  # what is not finite is a reason below
+        for last in (False, True) if settings.reject_outliers else (True,):
+            if (left := int(inlier.sum())) < settings.min_inliers:
+                return no_solution(count, f"{left} inliers", iterations)
+            chosen = every if left == count else every.where(inlier)
+            found = descend(chosen, wTc, twist, prior, settings.max_iterations, rough=not last)
+            iterations += found.iterations
+            if found.reason:
+                return no_solution(count, found.reason, iterations)
+            wTc, twist, linear = found.wTc, found.twist, found.linear
+            covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
+            if covariance is None:
+                return no_solution(count, "singular", iterations)
+            residual_px, inlier = _judge(every, wTc, twist, covariance, settings.inlier_px)
+    if (left := int(inlier.sum())) < settings.min_inliers:
+        return no_solution(count, f"{left} inliers", iterations)
+    apart = prior.apart(wTc, twist)
+    return Solution(
+        Kinematics(predicted.time_ns, wTc, twist, covariance),
+        linear.information,
+        linear.gradient,
+        residual_px,
+        inlier,
+        float(apart @ prior.information @ apart),
+        iterations,
+    )
+
+
+def _refused(predicted: Kinematics, sights: Sights) -> str:
+    """Why these cannot be solved at all, or nothing."""
+    count = len(sights)
+    shapes = {
+        "points_m": (count, 3),
+        "pinhole_px": (count, 2),
+        "row_s": (count,),
+        "sigma_px": (count,),
+        "covariance_m2": (count, 3, 3),
+    }
+    for name, shape in shapes.items():
+        values = getattr(sights, name)
+        if values.shape != shape:
+            return f"{name} has the shape {values.shape}, not {shape}"
+        if not np.isfinite(values).all():
+            return f"{name} is not finite"
+    if not (sights.sigma_px > 0).all():
+        return "sigma_px is not positive"
+    for name, values in vars(predicted).items():
+        if not np.isfinite(values).all():
+            return f"the prediction's {name} is not finite"
+    return ""
+
+
+def _prior(predicted: Kinematics) -> Prior | None:
+    """The prediction as information; None when its covariance is not positive definite."""
+    sigma = np.sqrt(np.maximum(np.diag(predicted.covariance), _SMALLEST**2))
+    # Of the correlations: a matrix without units inverts however far apart the variances are.
+    correlation = predicted.covariance / sigma / sigma[:, None]
+    correlation.flat[:: len(sigma) + 1] = 1 + 1e-12
+    try:
+        np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        return None
+    information = np.linalg.inv(correlation) / sigma / sigma[:, None]
+    information = 0.5 * (information + information.T)
+    return Prior(poses.inverse(predicted.wTc), predicted.twist, information)
+
+
+def _inverse(information: Array) -> Array | None:
+    """The covariance of an information matrix (12, 12); None when it is singular."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    try:
+        result = np.linalg.inv(information * scale * scale[:, None]) * scale * scale[:, None]
+    except np.linalg.LinAlgError:
+        return None
+    return 0.5 * (result + result.T) if np.isfinite(result).all() else None
+
+
+def _judge(
+    sights: Reprojection, wTc: Array, twist: Array, covariance: Array, inlier_px: float
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Distances (N,) from sights to projected landmarks, pixels, and which are inliers (N,)."""
+    view = sights.view(wTc, twist)
+    allowed = _WIDENING * sights.uncertainty(view, covariance)
+    share = (solve2(inlier_px**2, allowed, view.residual_px)[0] * view.residual_px).sum(axis=0)
+    residual_px = np.where(view.front, np.sqrt((view.residual_px**2).sum(axis=0)), np.inf)
+    return residual_px, view.front & (share < 1)

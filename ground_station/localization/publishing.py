@@ -1,0 +1,81 @@
+"""What is said about a frame: evidence for the judge, and the estimate that goes out."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry.camera import Camera
+from ground_station.localization.attempt import Attempt
+from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.localization.judge import Evidence
+from ground_station.localization.kinematics import Kinematics, Solution
+from ground_station.localization.relocalization import spread
+from ground_station.localization.settings import CovarianceSettings, LocalizerSettings
+
+Array = npt.NDArray[np.float64]
+
+
+def published_covariance(covariance: Array, settings: CovarianceSettings) -> Array:
+    """The pose's covariance (6, 6) as it goes out: scaled, and with what frames share added.
+
+    A filter takes the errors of two frames for independent; those of the map are the same again.
+    """
+    floor = np.r_[np.full(3, np.deg2rad(settings.floor_deg)), np.full(3, settings.floor_m)]
+    return np.asarray(settings.scale**2 * covariance[:6, :6] + np.diag(floor**2))
+
+
+def evidence_of(
+    attempt: Attempt,
+    solution: Solution,
+    state: Kinematics,
+    camera: Camera,
+    settings: CovarianceSettings,
+    support_ns: int,
+) -> Evidence:
+    """What speaks for a solved frame, whose observations the attempt holds."""
+    seen = attempt.observations
+    residual = solution.residual_px[solution.inlier]
+    return Evidence(
+        inliers=int(solution.inlier.sum()),
+        observations=len(seen),
+        spread=spread(seen.pixel_px[solution.inlier], camera),
+        residual_px=float(np.sqrt(np.mean(residual**2))) if len(residual) else np.inf,
+        covariance=published_covariance(state.covariance, settings),
+        innovation=solution.innovation,
+        support_ns=support_ns,
+        sharpness=attempt.sharpness,
+    )
+
+
+def publish(
+    attempt: Attempt,
+    state: State,
+    reason: str,
+    settings: LocalizerSettings,
+    *,
+    found: Kinematics | None = None,
+    relocalized: bool = False,
+    gated: bool = False,
+    tracked: bool = False,
+) -> PoseEstimate:
+    """The estimate of a frame that was `found`, or that has no pose."""
+    predicted = attempt.predicted
+    return PoseEstimate(
+        time_ns=attempt.time_ns,
+        index=attempt.index,
+        state=state,
+        reason=reason,
+        wTc=found.wTc if found else None,
+        twist=found.twist if found else None,
+        covariance=published_covariance(found.covariance, settings.covariance) if found else None,
+        predicted_wTc=predicted.wTc if predicted else None,
+        counts=attempt.counts,
+        observations=attempt.observations,
+        stage_ms=attempt.watch.finish(),
+        entropy_bits=attempt.entropy,
+        sharpness=attempt.sharpness,
+        gated=gated,
+        relocalized=relocalized,
+        tracked=tracked,
+    )
