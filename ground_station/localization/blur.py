@@ -11,8 +11,9 @@ and across its path, px, by median absolute deviation, the landmarks' own error 
     across, 5       1.04   0.90   0.98   0.96   0.85   0.99   0.97   1.11
 
 What is added in quadrature is 0.16 of the blur along and 0.06 across: 0.12 of a coordinate. Points
-followed by KLT over 3 and 6 frames grow alike. At the same expected blur a frame of less gradient
-energy was not worse, down to 0.65 of its neighbours' amplitude: energy says something only beyond.
+followed by KLT grow alike over 6 frames, and less over 3. At the same expected blur a frame of less
+gradient energy was not worse, down to 0.65 of its neighbours' amplitude: energy says something only
+beyond.
 """
 
 from __future__ import annotations

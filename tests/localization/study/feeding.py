@@ -72,11 +72,16 @@ def load_flight(spec: str, limit: int | None = None, frame_range: str = "") -> F
 
 @dataclass
 class Run:
-    """What a localizer said of each frame it got; `late_s` from capture to pose, when paced."""
+    """What a localizer said of each frame it got.
+
+    `took_ms`, from picture to pose; `done_s`, by `time.perf_counter`, when the pose was there;
+    `late_s`, when paced, from capture to pose.
+    """
 
     frames: list[Frame] = field(default_factory=list)
     estimates: list[PoseEstimate] = field(default_factory=list)
     took_ms: list[float] = field(default_factory=list)
+    done_s: list[float] = field(default_factory=list)
     late_s: list[float] = field(default_factory=list)
     dropped: int = 0
 
@@ -173,7 +178,8 @@ def _give(localizer: Localizer, frame: Frame, run: Run) -> None:
         extra["exposure_s"] = frame.exposure_s
     begin = time.perf_counter()
     estimate = localizer.process(frame.time_ns, frame.image, frame.index, **extra)
-    run.took_ms.append(1e3 * (time.perf_counter() - begin))
+    run.done_s.append(time.perf_counter())
+    run.took_ms.append(1e3 * (run.done_s[-1] - begin))
     run.frames.append(frame)
     run.estimates.append(estimate)
 

@@ -11,6 +11,7 @@ also be `FOLDER@CAMERA.toml`. Each row prints its bound, its figure and the seed
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from dataclasses import asdict
@@ -74,6 +75,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--count", type=int, default=1000, help="frames asked on their own (1000)")
     p.add_argument("--grow", type=int, default=1, help="the map, this many times over (1)")
     p.add_argument("--seed", type=int, default=0, help="of the places that are drawn (0)")
+    p.add_argument("--cores", type=int, default=2, help="processor cores it may use (2)")
     p.add_argument("--json", metavar="F", help="write everything measured to this file")
     return p
 
@@ -120,6 +122,7 @@ def main(words: list[str] | None = None) -> int:
         if name in NEEDS and not getattr(args, NEEDS[name]):
             print(f"study: the row '{name}' needs --{NEEDS[name]}", file=sys.stderr)
             return 2
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: max(1, args.cores)])
     result: dict[str, Any] = {"machine": machine(), "paced": args.paced, "seed": args.seed}
     try:
         study = study_of(args)
