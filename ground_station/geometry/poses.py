@@ -5,6 +5,8 @@ Tangent vectors are rotation first, then translation (rad, metres), as in GTSAM'
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -46,39 +48,76 @@ def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> Array:
     return np.asarray(points_b) @ T[:3, :3].T + T[:3, 3]
 
 
-def _hat(w: Array) -> Array:
-    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-
-
 def exp(xi: npt.ArrayLike) -> Array:
-    """SE(3) exponential of a tangent vector (6,), rotation first. Barfoot 2017, eq. 7.26."""
-    xi = np.asarray(xi, dtype=np.float64)
-    w, v = xi[:3], xi[3:]
-    theta = float(np.linalg.norm(w))
-    W = _hat(w)
-    if theta < 1e-5:  # series to third order: the closed forms lose digits here
-        V = np.eye(3) + W / 2 + W @ W / 6
+    """SE(3) exponential of a tangent vector (6,), rotation first. Barfoot 2017, eq. 7.26.
+
+    On plain numbers: arrays of three cost several times as much, and trackers call this often.
+    """
+    a, b, c, x, y, z = np.asarray(xi, dtype=np.float64).tolist()
+    square = a * a + b * b + c * c
+    theta = math.sqrt(square)
+    if theta < 1e-2:  # series: the closed forms lose digits here
+        first = 1 - square / 6 * (1 - square / 20)
+        second = 0.5 - square / 24 * (1 - square / 30)
+        third = 1 / 6 - square / 120 * (1 - square / 42)
+    elif theta < math.inf:
+        first = math.sin(theta) / theta
+        second = (1 - math.cos(theta)) / square
+        third = (theta - math.sin(theta)) / (square * theta)
     else:
-        V = (
-            np.eye(3)
-            + (1 - np.cos(theta)) / theta**2 * W
-            + (theta - np.sin(theta)) / theta**3 * (W @ W)
-        )
-    return pose(Rotation.from_rotvec(w).as_matrix(), V @ v)
+        first = second = third = math.nan
+    # ω × v and ω × (ω × v)
+    d, e, f = b * z - c * y, c * x - a * z, a * y - b * x
+    g, h, i = b * f - c * e, c * d - a * f, a * e - b * d
+    return np.array(
+        [
+            [
+                1 - second * (b * b + c * c),
+                second * a * b - first * c,
+                second * a * c + first * b,
+                x + second * d + third * g,
+            ],
+            [
+                second * a * b + first * c,
+                1 - second * (a * a + c * c),
+                second * b * c - first * a,
+                y + second * e + third * h,
+            ],
+            [
+                second * a * c - first * b,
+                second * b * c + first * a,
+                1 - second * (a * a + b * b),
+                z + second * f + third * i,
+            ],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def log(aTb: npt.ArrayLike) -> Array:
     """The inverse of `exp`: the tangent vector (6,) of one pose (4, 4). Barfoot 2017, eq. 7.35."""
     T = np.asarray(aTb, dtype=np.float64)
-    w = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    theta = float(np.linalg.norm(w))
-    W = _hat(w)
-    if theta < 1e-5:
-        V_inv = np.eye(3) - W / 2 + W @ W / 12
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.tolist()
+    # Twice the axis times the angle's sine, and twice its cosine.
+    a, b, c = r21 - r12, r02 - r20, r10 - r01
+    sine, cosine = math.sqrt(a * a + b * b + c * c), r00 + r11 + r22 - 1
+    theta = math.atan2(sine, cosine)
+    if not theta > 3.0:  # also when it is not a number
+        scale = theta / sine if sine > 1e-12 else 0.5
+        a, b, c = a * scale, b * scale, c * scale
+    else:  # near half a turn, where that axis loses digits
+        a, b, c = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
+        theta = math.sqrt(a * a + b * b + c * c)
+    square = theta * theta
+    if theta < 1e-2:
+        second = 1 / 12 + square / 720
     else:
-        half = theta / 2
-        V_inv = np.eye(3) - W / 2 + (1 - half / np.tan(half)) / theta**2 * (W @ W)
-    return np.concatenate([w, V_inv @ T[:3, 3]])
+        second = (1 - theta / 2 / math.tan(theta / 2)) / square
+    d, e, f = b * z - c * y, c * x - a * z, a * y - b * x
+    g, h, i = b * f - c * e, c * d - a * f, a * e - b * d
+    return np.array(
+        [a, b, c, x - d / 2 + second * g, y - e / 2 + second * h, z - f / 2 + second * i]
+    )
 
 
 def rotation_angle(aRb: npt.ArrayLike) -> Array:

@@ -29,7 +29,6 @@ NEAREST_M = 1e-3
 _BEHIND_COST = 1e6
 """What such a point costs, so that no step gains by turning away from it."""
 
-DBG=[]
 _NEAR = 0.5
 """Newton's decrement (a step's squared length in standard deviations of the solution) from which
 on the landmarks are moved along: costs on two of their linearisations do not compare, and so near
@@ -66,7 +65,7 @@ class Prior:
 
 
 def adjoint(xi: Array) -> Array:
-    """The 6×6 matrix of the Lie bracket [xi, ·] of se(3), rotation first. Barfoot 2017, eq. 7.32."""
+    """The 6×6 matrix of the Lie bracket [xi, ·] of se(3), rotation first; Barfoot, eq. 7.32."""
     a, b, c, x, y, z = xi.tolist()
     return np.array(
         [
@@ -376,7 +375,7 @@ def descend(
             return Descent(wTc, twist, linear, iteration, "singular")
         if not np.isfinite(step).all():
             return Descent(wTc, twist, linear, iteration, "not finite")
-        decrement = -float(step @ gradient); DBG.append((near,decrement))
+        decrement = -float(step @ gradient)
         if decrement < _NOTHING:
             # Nothing left to gain but rounding, which a cost cannot tell from a rise.
             return Descent(wTc, twist, linear, iteration)
