@@ -14,17 +14,19 @@ Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.intp]
 
-_BAND_PX = 40.0
-"""Least height of a band of features; with twice the radius, where that is more (measured)."""
+_BAND_PX = 80.0
+"""Least height of a band of features; four times the radius, where that is more (measured)."""
 
 _CHUNK = 32
 """Features of a band in one product with the landmarks around them (measured)."""
 
-_PREFIX = 128
-"""Components that are compared before all are: half the work with descriptors of 256."""
+_PREFIX, _WHOLE = 96, 128
+"""Components that are compared before all are, of descriptors longer than 128 (measured)."""
 
 _SLACK = 1e-4
 """Of the bound on the cosine, for float32's rounding."""
+
+_LOW_BITS = np.uint64(0xFFFFFFFF)
 
 _GATE = 9.21
 """The 99 % quantile of chi-square with two degrees of freedom."""
@@ -73,9 +75,11 @@ def associate(
         limit = np.asarray(max_distance, np.float32)
     # NaN would spoil the largest of them; no pair is nearer than -1.
     radius, limit = (np.where(np.isfinite(each), each, -1.0) for each in (radius, limit))
-    empty = np.empty(0, np.intp)
     if not len(feature_px) or not len(candidate_px):
+        empty = np.empty(0, np.intp)
         return Associations(empty, empty, np.empty(0, np.float32))
+    feature_descriptors = np.asarray(feature_descriptors, np.float32)
+    candidate_descriptors = np.asarray(candidate_descriptors, np.float32)
     # A second landmark farther off than this can neither win nor spoil a winner's ratio.
     farthest = np.clip(limit / settings.max_ratio, 0.0, 2.0)
     feature, candidate = _near_in_both(
@@ -86,15 +90,17 @@ def associate(
         float(radius.max()),
         1.0 - 0.5 * farthest**2 - _SLACK,
     )
-    near = _near(feature_px[feature] - candidate_px[candidate], candidate, radius, innovation_px2)
+    offset_px = feature_px.take(feature, axis=0) - candidate_px.take(candidate, axis=0)
+    near = _near(offset_px, candidate, radius, innovation_px2)
     feature, candidate = feature[near], candidate[near]
-    apart = feature_descriptors[feature] - candidate_descriptors[candidate]
-    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart)).astype(np.float32)
+    apart = feature_descriptors.take(feature, axis=0)
+    apart -= candidate_descriptors.take(candidate, axis=0)
+    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
     if limit.ndim:
         plausible = distance <= farthest[candidate]
         feature, candidate, distance = feature[plausible], candidate[plausible], distance[plausible]
         limit = limit[candidate]
-    order = np.lexsort((candidate, distance, feature))
+    order = _by_feature_and_distance(feature, distance, candidate)
     feature, candidate, distance = feature[order], candidate[order], distance[order]
     limit = limit[order] if limit.ndim else limit
     new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
@@ -104,10 +110,28 @@ def associate(
         second[:-1] = np.where(new[1:], np.inf, distance[1:])
         wins &= distance <= settings.max_ratio * second
     rows = np.flatnonzero(wins)
-    rows = rows[np.argsort(distance[rows], kind="stable")]
-    _, kept = np.unique(candidate[rows], return_index=True)
-    rows = np.sort(rows[kept])
+    # Farthest first, of equals the later feature: the last to claim a landmark keeps it.
+    key = np.sort(_ordered(distance[rows]) | rows.astype(np.uint64))[::-1]
+    rows = (key & _LOW_BITS).astype(np.intp)
+    owner = np.empty(len(candidate_px), np.intp)
+    owner[candidate[rows]] = rows
+    rows = np.sort(rows[owner[candidate[rows]] == rows])
     return Associations(feature[rows], candidate[rows], distance[rows])
+
+
+def _ordered(distance: F32) -> npt.NDArray[np.uint64]:
+    """Distances (N,) as upper halves of integers of the same order: their bits, none negative."""
+    return np.left_shift(distance.view(np.uint32).astype(np.uint64), np.uint64(32))
+
+
+def _by_feature_and_distance(feature: Indices, distance: F32, candidate: Indices) -> Indices:
+    """The order (N,) by feature, then distance, then candidate; one key where none are equal."""
+    key = _ordered(distance) >> np.uint64(32) | feature.astype(np.uint64) << np.uint64(32)
+    order = np.argsort(key)
+    key = key[order]
+    if (key[1:] == key[:-1]).any():
+        return np.lexsort((candidate, distance, feature))
+    return order
 
 
 def _bounding(descriptors: F32) -> F32:
@@ -116,12 +140,13 @@ def _bounding(descriptors: F32) -> F32:
     The first components, then the norm of those left out: what these add to a product is at most
     the product of their norms (Cauchy and Schwarz).
     """
-    rows = np.asarray(descriptors, np.float32)
-    if rows.shape[1] <= _PREFIX:
-        return rows
-    rest = rows[:, _PREFIX:]
-    norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
-    return np.concatenate([rows[:, :_PREFIX], norm[:, None]], axis=1)
+    if descriptors.shape[1] <= _WHOLE:
+        return descriptors
+    rest = descriptors[:, _PREFIX:]
+    rows = np.empty((len(descriptors), _PREFIX + 1), np.float32)
+    rows[:, :_PREFIX] = descriptors[:, :_PREFIX]
+    np.sqrt(np.einsum("ij,ij->i", rest, rest), out=rows[:, _PREFIX])
+    return rows
 
 
 def _near_in_both(
@@ -140,34 +165,43 @@ def _near_in_both(
     in its band's order of x, so that each chunk is one small matrix product: far cheaper than all
     products, and than gathering two rows for each pair.
     """
-    each = least_product.ndim > 0
-    height = max(2 * radius_px, _BAND_PX)
-    band = np.floor(feature_px[:, 1] / height)
-    features = np.lexsort((feature_px[:, 0], band))
+    height = max(4 * radius_px, _BAND_PX)
+    # Features are in the image, so that no band is as far as the clip; 16 bits are sorted quickly.
+    band = np.clip(np.floor(feature_px[:, 1] / height), -30_000, 30_000).astype(np.int16)
+    features = np.argsort(feature_px[:, 0])
+    features = features[np.argsort(band[features], kind="stable")]
+    A, x = feature_rows.take(features, axis=0), feature_px[features, 0]
     edges = np.concatenate([[0], np.flatnonzero(np.diff(band[features])) + 1, [len(features)]])
     by_x = np.argsort(candidate_px[:, 0])
-    y = candidate_px[by_x, 1]
-    pairs: list[tuple[Indices, Indices]] = []
+    xs, ys = candidate_px.take(by_x, axis=0).T
+    least = least_product.astype(np.float32)
+    bands, hits, chunks, base = [], [], [], 0
     for begin, end in itertools.pairwise(edges.tolist()):
-        top = band[features[begin]] * height
-        around = by_x[(y >= top - radius_px) & (y <= top + height + radius_px)]
-        mine = features[begin:end]
-        x, xs = feature_px[mine, 0], candidate_px[around, 0]
-        A, B = feature_rows[mine], candidate_rows[around]
-        least = least_product[around, None] if each else least_product
-        starts = np.arange(0, len(mine), _CHUNK)
-        stops = np.minimum(starts + _CHUNK, len(mine))
-        lefts = np.searchsorted(xs, x[starts] - radius_px, "left")
-        rights = np.searchsorted(xs, x[stops - 1] + radius_px, "right")
+        top = float(band[features[begin]]) * height
+        rows = np.flatnonzero((ys >= top - radius_px) & (ys <= top + height + radius_px))
+        around = by_x[rows]
+        B, limit = candidate_rows.take(around, axis=0), least
+        if least.ndim:
+            limit = least[around, None]
+        starts = np.arange(begin, end, _CHUNK)
+        stops = np.minimum(starts + _CHUNK, end)
+        lefts = np.searchsorted(xs[rows], x[starts] - radius_px, "left")
+        rights = np.searchsorted(xs[rows], x[stops - 1] + radius_px, "right")
         for start, stop, left, right in zip(
             starts.tolist(), stops.tolist(), lefts.tolist(), rights.tolist(), strict=True
         ):
             product = B[left:right] @ A[start:stop].T
-            flat = np.flatnonzero(product >= (least[left:right] if each else least))
-            row, column = np.divmod(flat, stop - start)
-            pairs.append((mine[start + column], around[left + row]))
-    feature, candidate = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return feature, candidate
+            hits.append(np.flatnonzero(product >= (limit[left:right] if least.ndim else limit)))
+            chunks.append((len(hits[-1]), stop - start, start, base + left))
+        bands.append(around)
+        base += len(around)
+    # Every chunk's flat indices at once: of its columns the features, of its rows the candidates.
+    count, width, start_, left_ = np.array(chunks).T
+    row, column = np.divmod(np.concatenate(hits), np.repeat(width, count))
+    return (
+        features[np.repeat(start_, count) + column],
+        np.concatenate(bands)[np.repeat(left_, count) + row],
+    )
 
 
 def _near(
@@ -175,7 +209,7 @@ def _near(
 ) -> npt.NDArray[np.bool_]:
     """Whether offsets (N, 2) from candidates (N,) are within their radius and their ellipse."""
     radius = radius_px[candidate] if radius_px.ndim else radius_px
-    near = np.einsum("ij,ij->i", offset_px, offset_px) <= np.where(radius < 0, -1, radius**2)
+    near = np.einsum("ij,ij->i", offset_px, offset_px) <= np.copysign(radius**2, radius)
     if innovation_px2 is None:
         return near
     S = np.asarray(innovation_px2, np.float64)[candidate]
