@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +15,7 @@ from study import metrics
 from study.feeding import QUEUE_FRAMES, dark_frames, feed, feed_paced, joined
 from study.recovering import SETTLED, Settled, draw_places
 from study.row import Line
-from study.run import NEEDS, ROWS, main, table
+from study.run import NEEDS, ROWS, parser, run, table
 
 from ground_station.geometry import poses
 from ground_station.localization.estimate import PoseEstimate, State
@@ -33,19 +32,16 @@ def frames(count: int, step_ns: int = 33_333_333) -> list[Frame]:
     return [Frame(k, str(k), 5 + k * step_ns, image, 0.01) for k in range(count)]
 
 
-class Slow:
-    """A localizer that takes its time over some frames and remembers what it was given."""
+class Still:
+    """A localizer that is always at the origin and remembers what it was given."""
 
-    def __init__(self, slow: set[int], seconds: float) -> None:
-        self.slow, self.seconds = slow, seconds
+    def __init__(self) -> None:
         self.given: list[tuple[int, float | None]] = []
 
     def process(
         self, time_ns: int, image: np.ndarray, index: int, exposure_s: float | None = None
     ) -> PoseEstimate:
         self.given.append((index, exposure_s))
-        if index in self.slow:
-            time.sleep(self.seconds)
         return PoseEstimate(time_ns, index, State.TRACKING, wTc=np.eye(4))
 
 
@@ -139,23 +135,35 @@ def test_what_is_no_covariance_holds_nothing() -> None:
 
 
 def test_every_frame_is_given_with_its_exposure() -> None:
-    localizer: Any = Slow(set(), 0)
-    run = feed(localizer, frames(5))
+    localizer: Any = Still()
+    flown = feed(localizer, frames(5))
     assert localizer.given == [(k, 0.01) for k in range(5)]
-    assert run.dropped == 0 and run.says(State.TRACKING).all() and run.wTc.shape == (5, 4, 4)
+    assert flown.dropped == 0 and flown.says(State.TRACKING).all() and flown.wTc.shape == (5, 4, 4)
 
 
 def test_paced_a_slow_frame_is_late_and_a_full_queue_loses_its_oldest() -> None:
-    localizer: Any = Slow({1}, 0.5)
-    run = feed_paced(localizer, frames(30, 20_000_000))
+    now_s = [100.0]
+
+    class Clocked(Still):
+        """Every frame takes 1 ms of a clock of its own, the slow one half a second."""
+
+        def process(self, *args: Any, **kwargs: Any) -> PoseEstimate:
+            estimate = super().process(*args, **kwargs)
+            now_s[0] += 0.5 if estimate.index == 1 else 0.001
+            return estimate
+
+    def sleep(seconds: float) -> None:
+        now_s[0] += seconds + 1e-9
+
+    localizer: Any = Clocked()
+    flown = feed_paced(localizer, frames(40, 20_000_000), clock=lambda: now_s[0], sleep=sleep)
+    # Frame 1 is there from 20 ms on and done by 520 ms: 2 to 26 have come, the last four wait.
     given = [index for index, _ in localizer.given]
-    assert given == sorted(given) and given[:2] == [0, 1] and given[-1] == 29
-    assert run.dropped == 30 - len(given) > 0
-    assert run.late_s[1] >= 0.5
-    # What was lost follows the slow frame, and the queue's worth before it went on is kept.
-    assert given[2] > 2 and given[2 : 2 + QUEUE_FRAMES] == list(
-        range(given[2], given[2] + QUEUE_FRAMES)
-    )
+    assert QUEUE_FRAMES == 4 and given == [0, 1, *range(23, 40)]
+    assert flown.dropped == 21
+    assert flown.late_s[1] == pytest.approx(0.5, abs=0.001)
+    assert flown.late_s[2] == pytest.approx(0.5 + 0.02 - 23 * 0.02 + 0.001, abs=0.001)
+    assert flown.late_s[-1] == pytest.approx(0.001, abs=1e-4)
 
 
 def test_a_jump_joins_two_flights_with_times_that_go_on() -> None:
@@ -191,7 +199,7 @@ def test_a_table_tells_what_is_met_and_missed() -> None:
 def test_a_row_without_its_flights_is_refused_in_one_line(
     row: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert row in ROWS and main([row]) == 2
+    assert row in ROWS and run(parser().parse_args([row])) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and f"--{NEEDS[row]}" in error
 
@@ -200,7 +208,7 @@ def test_a_missing_flight_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     sample = Path(__file__).parents[2] / "maps/atrium"
     out = tmp_path / "a.json"
     words = ["fast", "--map", str(sample), "--fast", str(tmp_path / "none.mcap")]
-    assert main([*words, "--json", str(out)]) == 2
+    assert run(parser().parse_args([*words, "--json", str(out)])) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "none.mcap" in error
 
@@ -214,9 +222,9 @@ def test_a_jump_is_over_when_tracking_near_the_truth_has_settled() -> None:
     first = 10
     truth = np.tile(np.eye(4), (100, 1, 1))
     truth[:15, 0, 3] = 5.0  # the localizer says the origin: near only from the 15th frame on
-    localizer: Any = Slow(set(), 0)
-    run = feed(localizer, frames(100), Settled(first, truth))
-    assert len(run.frames) == first + 15 + SETTLED
+    localizer: Any = Still()
+    flown = feed(localizer, frames(100), Settled(first, truth))
+    assert len(flown.frames) == first + 15 + SETTLED
     away = np.tile(np.eye(4), (100, 1, 1))
     away[:, 0, 3] = 5.0
     assert len(feed(localizer, frames(100), Settled(first, away)).frames) == 100

@@ -145,16 +145,20 @@ def feed(
 
 
 def feed_paced(
-    localizer: Localizer, frames: Iterable[Frame], enough: Callable[[Run], bool] | None = None
+    localizer: Localizer,
+    frames: Iterable[Frame],
+    enough: Callable[[Run], bool] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> Run:
     """Gives each frame at its time; what piles up is queued, and lost as a receiver loses it."""
     run, queue = Run(), deque[tuple[float, Frame]]()
     ahead = iter(frames)
     upcoming = next(ahead, None)
     first_ns = upcoming.time_ns if upcoming else 0
-    start_s = time.perf_counter()
+    start_s = clock()
     while upcoming is not None or queue:
-        now_s = time.perf_counter() - start_s
+        now_s = clock() - start_s
         while upcoming is not None and (upcoming.time_ns - first_ns) / 1e9 <= now_s:
             queue.append(((upcoming.time_ns - first_ns) / 1e9, upcoming))
             upcoming = next(ahead, None)
@@ -164,11 +168,11 @@ def feed_paced(
         if queue:
             due_s, frame = queue.popleft()
             _give(localizer, frame, run)
-            run.late_s.append(time.perf_counter() - start_s - due_s)
+            run.late_s.append(clock() - start_s - due_s)
             if enough is not None and enough(run):
                 break
         elif upcoming is not None:
-            time.sleep(max(0.0, (upcoming.time_ns - first_ns) / 1e9 - now_s))
+            sleep(max(0.0, (upcoming.time_ns - first_ns) / 1e9 - now_s))
     return run
 
 

@@ -115,14 +115,13 @@ def study_of(args: argparse.Namespace) -> Study:
     )
 
 
-def main(words: list[str] | None = None) -> int:
-    args = parser().parse_args(words)
+def run(args: argparse.Namespace) -> int:
+    """Runs the rows that are asked for; 0, or 2 with one line of what cannot be."""
     rows = list(ROWS) if "all" in args.rows else list(dict.fromkeys(args.rows))
     for name in rows:
         if name in NEEDS and not getattr(args, NEEDS[name]):
             print(f"study: the row '{name}' needs --{NEEDS[name]}", file=sys.stderr)
             return 2
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: max(1, args.cores)])
     result: dict[str, Any] = {"machine": machine(), "paced": args.paced, "seed": args.seed}
     try:
         study = study_of(args)
@@ -143,4 +142,6 @@ def main(words: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    arguments = parser().parse_args()
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: max(1, arguments.cores)])
+    sys.exit(run(arguments))
