@@ -101,8 +101,10 @@ def log(aTb: npt.ArrayLike) -> Array:
     # Twice the axis times the angle's sine, and twice its cosine.
     a, b, c = r21 - r12, r02 - r20, r10 - r01
     sine, cosine = math.sqrt(a * a + b * b + c * c), r00 + r11 + r22 - 1
+    if not math.isfinite(sine + cosine):
+        return np.full(6, np.nan)
     theta = math.atan2(sine, cosine)
-    if not theta > 3.0:  # also when it is not a number
+    if theta < 3.0:
         scale = theta / sine if sine > 1e-12 else 0.5
         a, b, c = a * scale, b * scale, c * scale
     else:  # near half a turn, where that axis loses digits

@@ -29,16 +29,14 @@ NEAREST_M = 1e-3
 _BEHIND_COST = 1e6
 """What such a point costs, so that no step gains by turning away from it."""
 
-_NEAR = 0.5
+_NEAR = 20.0
 """Newton's decrement (a step's squared length in standard deviations of the solution) from which
 on the landmarks are moved along: costs on two of their linearisations do not compare, and so near
 no step needs the comparison."""
 
-_NOTHING = 1e-15
-"""A decrement of rounding errors only."""
-
-_CONVERGED = 1e-6
-"""Newton's decrement of the last step: a thousandth of a standard deviation."""
+_CONVERGED = 1e-4
+"""Newton's decrement of the last step: a hundredth of a standard deviation, and what is left after
+a step of Newton's is far less."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +84,7 @@ class Linear:
     `information` (D, D), `gradient` (D,) for steps of pose and twist (D = 12) or of the pose alone
     (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
     image (uu, uv, vv), and `reach` (2, 3, N) what moves them: their covariance by each coordinate.
+    `excess` (N,) is the variance, px², that reweighting adds beyond Huber's reach.
     """
 
     information: Array
@@ -94,17 +93,19 @@ class Linear:
     moved_m: Array
     spread_px2: Array
     reach: Array
+    excess: Array
 
 
 @dataclass(frozen=True)
 class Reprojection:
     """The robust reprojection cost of N landmarks in one frame; arrays with N last.
 
+    `offset_px` (2, N) is from the principal point to the undistorted pixel of each sight.
     `row_s` (N,) is None for a global shutter: then the pose is all that is asked for.
     """
 
     points_m: Array
-    pinhole_px: Array
+    offset_px: Array
     covariance_m2: Array
     variance_px2: Array
     row_s: Array | None
@@ -121,7 +122,7 @@ class Reprojection:
         return replace(
             self,
             points_m=self.points_m[:, keep],
-            pinhole_px=self.pinhole_px[:, keep],
+            offset_px=self.offset_px[:, keep],
             covariance_m2=self.covariance_m2[:, :, keep],
             variance_px2=self.variance_px2[keep],
             row_s=None if self.row_s is None else self.row_s[keep],
@@ -139,9 +140,9 @@ class Reprojection:
         all_front = bool(front.all())
         inverse_z = 1.0 / (z if all_front else np.where(front, z, 1.0))
         uv = points[:2] * inverse_z
-        camera, residual = self.camera, np.empty_like(uv)
-        residual[0] = camera.fx_px * uv[0] + (camera.cx_px - self.pinhole_px[0])
-        residual[1] = camera.fy_px * uv[1] + (camera.cy_px - self.pinhole_px[1])
+        camera = self.camera
+        residual = uv * np.array([[camera.fx_px], [camera.fy_px]])
+        residual -= self.offset_px
         return View(camera, wTc[:3, :3], motion, uv, inverse_z, residual, front, all_front)
 
     def reach(self, view: View) -> tuple[Array, Array, Array]:
@@ -154,82 +155,97 @@ class Reprojection:
             np.einsum("in,in->n", rows[i], reach[j], out=spread[k])
         return rows, reach, spread
 
-    def uncertainty(self, view: View, covariance: Array) -> Array:
-        """Covariance in the image (3, N), px² (uu, uv, vv), of landmarks and of the pose or the
-        pose and twist, given theirs (D, D)."""
-        J = view.jacobian()
-        spread = self.reach(view)[2]
-        weighted = (covariance @ J.reshape(len(J), -1)).reshape(J.shape)
-        for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
-            spread[k] += np.einsum("dn,dn->n", J[:, i], weighted[:, j])
-        return spread
-
     def linearize(
-        self, wTc: Array, twist: Array, moved_m: Array | None, frozen: Linear | None = None
+        self,
+        wTc: Array,
+        twist: Array,
+        last: Linear | None = None,
+        *,
+        move: bool = False,
+        sharp: bool = False,
     ) -> Linear:
-        """The cost at a pose (4, 4) and twist (6,), landmarks linearised where `moved_m` has them.
+        """The cost at a pose (4, 4) and twist (6,).
 
-        With `frozen` their covariances in the image stay what they were there, so that both costs
-        compare.
+        After the `last` one, landmarks' covariances in the image stay what they were there, so that
+        both costs compare; with `move` they are linearised anew, where `last` moved the landmarks.
+        With `sharp` the information is the cost's second derivative, which is less than that of the
+        reweighted sights beyond Huber's reach and makes for longer steps.
         """
-        view = self.view(wTc, twist, moved_m)
+        moved = last.moved_m if move and last is not None else None
+        view = self.view(wTc, twist, moved)
         r = view.residual_px
-        if frozen is None:
+        if last is None or move:
             rows, reach, spread = self.reach(view)
-            if moved_m is not None:
-                r = r - np.einsum("ain,in->an", rows, moved_m)
+            if moved is not None:
+                r = r - np.einsum("ain,in->an", rows, moved)
         else:
-            reach, spread = frozen.reach, frozen.spread_px2
-        y, excess, factor = self._whiten(r, spread)
+            reach, spread = last.reach, last.spread_px2
+        y, excess, factor = self._whiten(r, spread, None if last is None else last.excess, sharp)
         if not view.all_front:
             y, factor = y * view.front, factor * view.front
-        cost = 0.5 * float((y * r).sum() + excess @ (y * y).sum(axis=0))
+        cost = 0.5 * float(np.vdot(y, r) + excess @ (y[0] * y[0] + y[1] * y[1]))
         cost += _BEHIND_COST * (self.count - np.count_nonzero(view.front))
         J = view.jacobian()
-        # Whitened by the transposed Cholesky factor of each sight's information.
+        gradient = J.reshape(len(J), -1) @ y.reshape(-1)
+        # Times the transposed factor of each sight's information.
         J[:, 0] *= factor[0]
         J[:, 0] += factor[1] * J[:, 1]
         J[:, 1] *= factor[2]
         flat = J.reshape(len(J), -1)
-        whitened = np.concatenate([factor[0] * r[0] + factor[1] * r[1], factor[2] * r[1]])
-        moved = -(reach[0] * y[0] + reach[1] * y[1])
-        return Linear(flat @ flat.T, flat @ whitened, cost, moved, spread, reach)
+        moved = reach[0] * y[0]
+        moved += reach[1] * y[1]
+        return Linear(flat @ flat.T, gradient, cost, -moved, spread, reach, excess)
 
-    def _whiten(self, r: Array, spread: Array) -> tuple[Array, Array, Array]:
-        """y (2, N) of the module's text, (t − 1)·sigma² (N,), and L's ll, lu, uu.
+    def _whiten(
+        self, r: Array, spread: Array, excess: Array | None, sharp: bool
+    ) -> tuple[Array, Array, Array]:
+        """y (2, N) of the module's text, (t − 1)·sigma² (N,), and L's uu, vu, vv (3, N).
 
-        L Lᵀ is (t·sigma²·I + S)⁻¹; S is `spread` (3, N).
+        L Lᵀ is (t·sigma²·I + S)⁻¹ or, with `sharp`, ∂y/∂r; S is `spread` (3, N). `excess` is what
+        another pose near had of the second.
         """
         variance = self.variance_px2
         y, inverse, uu, vv = solve2(variance, spread, r)
-        far = np.flatnonzero(variance * (y * y).sum(axis=0) > self.huber_k**2)
-        excess = np.zeros_like(variance)
+        far = np.flatnonzero(variance * (y[0] * y[0] + y[1] * y[1]) > self.huber_k**2)
+        start, excess = excess, np.zeros_like(variance)
         if len(far):
-            excess[far] = self._excess(r[:, far], spread[:, far], variance[far])
+            total = self._reweigh(r[:, far], spread[:, far], variance[far])
+            if start is not None:
+                total = np.where(start[far] > 0, variance[far] + start[far], total)
+            total = self._newton(total, r[:, far], spread[:, far], variance[far])
+            excess[far] = total - variance[far]
             y, inverse, uu, vv = solve2(variance + excess, spread, r)
         factor = np.empty((3, len(variance)))
-        factor[0] = np.sqrt(vv * inverse)
-        factor[1] = factor[0] * spread[1] / -vv
-        factor[2] = 1.0 / np.sqrt(vv)
+        np.sqrt(vv * inverse, out=factor[0])
+        np.divide(factor[0] * spread[1], -vv, out=factor[1])
+        np.divide(1.0, np.sqrt(vv), out=factor[2])
+        if sharp and len(far):
+            # M⁻¹ − z zᵀ/(y·z) with z = M⁻¹ y: nothing along y, where the force stays the same.
+            (a, b), inverse, uu, vv = y[:, far], inverse[far], uu[far], vv[far]
+            uv = spread[1, far]
+            z0, z1 = (vv * a - uv * b) * inverse, (uu * b - uv * a) * inverse
+            rest = (uu + vv) * inverse - (z0 * z0 + z1 * z1) / (a * z0 + b * z1)
+            rest = np.sqrt(np.maximum(rest, 0) / (a * a + b * b))
+            factor[0, far], factor[1, far], factor[2, far] = -rest * b, rest * a, 0.0
         return y, excess, factor
 
-    def _excess(self, r: Array, spread: Array, variance: Array) -> Array:
-        """(t − 1)·sigma² (N,) of sights beyond Huber's reach: Newton on 1/‖y‖ = sigma/k.
+    def _reweigh(self, r: Array, spread: Array, variance: Array) -> Array:
+        """t·sigma² (N,) as if S were in all directions what it is along r: exact when it is."""
+        square = r[0] * r[0] + r[1] * r[1]
+        along = (spread[0] * r[0] + 2 * spread[1] * r[1]) * r[0] + spread[2] * r[1] * r[1]
+        total = np.sqrt(square * variance) / self.huber_k - along / square
+        return np.asarray(np.maximum(total, variance))
+
+    def _newton(self, total: Array, r: Array, spread: Array, variance: Array) -> Array:
+        """A t·sigma² (N,) nearer to sigma·‖y‖ = k: one step of Newton's on the inverse of both.
 
         Moré and Sorensen's iteration for the same equation in a trust region; nearly linear in t.
         """
-        square = (r * r).sum(axis=0)
-        limit = self.huber_k / np.sqrt(variance)
-        # As if S were in all directions what it is along r.
-        along = (spread[0] * r[0] + 2 * spread[1] * r[1]) * r[0] + spread[2] * r[1] * r[1]
-        total = np.maximum(np.sqrt(square) / limit - along / square, variance)
-        for _ in range(2):
-            y, inverse, uu, vv = solve2(total, spread, r)
-            square = (y * y).sum(axis=0)
-            curved = (vv * y[0] - 2 * spread[1] * y[1]) * y[0] + uu * y[1] * y[1]
-            total += square * (np.sqrt(square) / limit - 1) / (curved * inverse)
-            np.maximum(total, variance, out=total)
-        return total - variance
+        y, inverse, uu, vv = solve2(total, spread, r)
+        square = y[0] * y[0] + y[1] * y[1]
+        curved = (vv * y[0] - 2 * spread[1] * y[1]) * y[0] + uu * y[1] * y[1]
+        over = np.sqrt(square * variance) / self.huber_k - 1
+        return np.asarray(np.maximum(total + square * over / (curved * inverse), variance))
 
 
 def solve2(variance: Array | float, spread: Array, r: Array) -> tuple[Array, Array, Array, Array]:
@@ -294,30 +310,49 @@ class _Motion:
 
     def __init__(self, row_s: Array, twist: Array) -> None:
         self.row_s, self.ad = row_s, adjoint(twist)
-        self.hat, velocity = self.ad[:3, :3], twist[3:]
+        self.hat = self.ad[:3, :3]
         self.square = self.hat @ self.hat
         rate = math.sqrt(float(twist[:3] @ twist[:3]))
-        # Rodrigues' formula of exp(∓twist·row_s), with the row's time in its coefficients.
+        # Rodrigues' formula of exp(−twist·row_s), with the row's time in its coefficients.
+        coefficients = np.empty((3, len(row_s)))
         if rate > 1e-6:
             angle = rate * row_s
-            self.first = np.sin(angle) / rate
-            self.second = 2 * np.square(np.sin(0.5 * angle) / rate)
-            third = (row_s - self.first) / rate**2
+            np.divide(np.sin(angle), -rate, out=coefficients[0])
+            half = np.sin(0.5 * angle)
+            np.multiply(2 / rate**2, half * half, out=coefficients[1])
+            np.add(row_s, coefficients[0], out=coefficients[2])
+            coefficients[2] *= -1 / rate**2
         else:
-            self.first, self.second = row_s, 0.5 * row_s * row_s
-            third = self.second * row_s / 3
-        drift = np.stack([velocity, self.hat @ velocity, self.square @ velocity], axis=1)
-        self.drift = drift @ np.stack([-row_s, self.second, -third])
+            np.negative(row_s, out=coefficients[0])
+            np.multiply(0.5 * row_s, row_s, out=coefficients[1])
+            np.multiply(-row_s / 3, coefficients[1], out=coefficients[2])
+        self.first, self.second = coefficients[0], coefficients[1]
+        drift = np.empty((3, 3))
+        drift[:, 0] = twist[3:]
+        np.matmul(self.hat, drift[:, 0], out=drift[:, 1])
+        np.matmul(self.square, drift[:, 0], out=drift[:, 2])
+        self.drift = drift @ coefficients
 
     def forward(self, points: Array) -> Array:
         """Points (3, N) of the frame's camera in those of the rows: exp(−twist·row_s)·p."""
-        turned = self.second * (self.square @ points) - self.first * (self.hat @ points)
-        return points + turned + self.drift
+        result = self.hat @ points
+        result *= self.first
+        turned = self.square @ points
+        turned *= self.second
+        result += turned
+        result += points
+        result += self.drift
+        return result
 
     def turned_back(self, directions: Array) -> Array:
         """Directions (A, 3, N) of the rows' cameras in the frame's."""
-        turn = self.second * (self.square @ directions) + self.first * (self.hat @ directions)
-        return directions + turn
+        result = self.square @ directions
+        result *= self.second
+        turned = self.hat @ directions
+        turned *= self.first
+        result -= turned
+        result += directions
+        return result
 
     def jacobian(self, J: Array) -> Array:
         """Columns (6, 2, N) for steps of the rows' poses to (12, 2, N) for pose and twist.
@@ -355,15 +390,15 @@ def descend(
 ) -> Descent:
     """The minimum of the sights' cost and the prior's, from a pose (4, 4) and twist (6,).
 
-    Gauss-Newton, with Levenberg's damping when a step would raise the cost; near the minimum the
-    landmarks are linearised anew at each step. A rough one ends there.
+    Gauss-Newton on reweighted sights, with Levenberg's damping when a step would raise the cost;
+    near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends before
+    that, and its `linear` is of the step before.
     """
     damping = 0.0
-    linear = sights.linearize(wTc, twist, None)
+    linear = sights.linearize(wTc, twist)
     information, gradient, cost = _with(prior, linear, wTc, twist)
-    near = False
     for iteration in range(1, max_iterations + 1):
-        scale = np.diag(information).copy()
+        scale = information.diagonal()
         if not (scale > 0).all():  # also when it is not a number
             return Descent(wTc, twist, linear, iteration, "singular")
         scale = 1.0 / np.sqrt(scale)
@@ -376,28 +411,24 @@ def descend(
         if not np.isfinite(step).all():
             return Descent(wTc, twist, linear, iteration, "not finite")
         decrement = -float(step @ gradient)
-        if decrement < _NOTHING:
-            # Nothing left to gain but rounding, which a cost cannot tell from a rise.
-            return Descent(wTc, twist, linear, iteration)
         candidate = wTc @ poses.exp(step[:6])
         speed = twist + step[6:] if len(step) > 6 else twist
-        if near:
-            trial = sights.linearize(candidate, speed, linear.moved_m)
-        else:
-            trial = sights.linearize(candidate, speed, None, linear)
-        information_, gradient_, cost_ = _with(prior, trial, candidate, speed)
-        if not near and not cost_ <= cost * (1 + 1e-12):
+        near = damping == 0 and decrement < _NEAR
+        if near and rough:
+            return Descent(candidate, speed, linear, iteration)
+        done = near and decrement < _CONVERGED
+        trial = sights.linearize(candidate, speed, linear, move=near, sharp=near and not done)
+        model = _with(prior, trial, candidate, speed)
+        if not near and not model[2] <= cost * (1 + 1e-12):
             damping = max(10 * damping, 1e-4)
             if damping > 1e8:
                 return Descent(wTc, twist, linear, iteration, "diverged")
             continue
         damping = damping / 10 if damping > 1e-6 else 0.0
         wTc, twist, linear = candidate, speed, trial
-        information, gradient, cost = information_, gradient_, cost_
-        if damping == 0.0 and decrement < _NEAR:
-            if rough or (near and decrement < _CONVERGED):
-                return Descent(wTc, twist, linear, iteration)
-            near = True
+        information, gradient, cost = model
+        if done:
+            return Descent(wTc, twist, linear, iteration)
     reason = f"not converged in {max_iterations} iterations"
     return Descent(wTc, twist, linear, max_iterations, reason)
 

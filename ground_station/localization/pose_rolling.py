@@ -14,8 +14,7 @@ from ground_station.localization.settings import PoseSettings
 Array = npt.NDArray[np.float64]
 
 _WIDENING = 9.0
-"""A sight may miss by three standard deviations of its landmark and of the pose on top of
-`inlier_px`; squared."""
+"""Squared: a sight may miss by three standard deviations of its landmark beside `inlier_px`."""
 
 _SMALLEST = 1e-9
 """A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
@@ -31,8 +30,8 @@ def solve_rolling(
     Hedborg et al. (CVPR 2012). A residual is whitened by its pixel noise and its landmark's
     covariance, and Huber's loss with `settings.huber_k` is that of a graph with a variable for each
     landmark. With `settings.reject_outliers` it is solved once more from the inliers alone: sights
-    that miss by less than `settings.inlier_px`, widened by their landmarks' and the pose's
-    covariance. Of `settings`, also `max_iterations` and `min_inliers` are used.
+    that miss by less than `settings.inlier_px`, widened by their landmarks' covariance. Of
+    `settings`, `max_iterations` and `min_inliers` are used besides.
 
     Never raises: bad or too few sights, a covariance that is none and no convergence are a
     `Solution` without a state, with the reason.
@@ -45,7 +44,7 @@ def solve_rolling(
         return no_solution(count, "the prediction's covariance is not positive definite")
     every = Reprojection(
         points_m=np.ascontiguousarray(sights.points_m.T, np.float64),
-        pinhole_px=np.ascontiguousarray(sights.pinhole_px.T, np.float64),
+        offset_px=np.ascontiguousarray((sights.pinhole_px - [camera.cx_px, camera.cy_px]).T),
         covariance_m2=np.ascontiguousarray(sights.covariance_m2.transpose(1, 2, 0), np.float64),
         variance_px2=np.square(sights.sigma_px, dtype=np.float64),
         row_s=np.asarray(sights.row_s, np.float64),
@@ -64,10 +63,12 @@ def solve_rolling(
             if found.reason:
                 return no_solution(count, found.reason, iterations)
             wTc, twist, linear = found.wTc, found.twist, found.linear
-            covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
-            if covariance is None:
-                return no_solution(count, "singular", iterations)
-            residual_px, inlier = _judge(every, wTc, twist, covariance, settings.inlier_px)
+            if chosen is every:
+                spread = linear.spread_px2
+            residual_px, inlier = _judge(every, wTc, twist, spread, settings.inlier_px)
+    covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
+    if covariance is None:
+        return no_solution(count, "singular", iterations)
     if (left := int(inlier.sum())) < settings.min_inliers:
         return no_solution(count, f"{left} inliers", iterations)
     apart = prior.apart(wTc, twist)
@@ -132,11 +133,11 @@ def _inverse(information: Array) -> Array | None:
 
 
 def _judge(
-    sights: Reprojection, wTc: Array, twist: Array, covariance: Array, inlier_px: float
+    sights: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: float
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Distances (N,) from sights to projected landmarks, pixels, and which are inliers (N,)."""
     view = sights.view(wTc, twist)
-    allowed = _WIDENING * sights.uncertainty(view, covariance)
-    share = (solve2(inlier_px**2, allowed, view.residual_px)[0] * view.residual_px).sum(axis=0)
-    residual_px = np.where(view.front, np.sqrt((view.residual_px**2).sum(axis=0)), np.inf)
+    r = view.residual_px
+    share = (solve2(inlier_px**2, _WIDENING * spread_px2, r)[0] * r).sum(axis=0)
+    residual_px = np.where(view.front, np.sqrt((r * r).sum(axis=0)), np.inf)
     return residual_px, view.front & (share < 1)
