@@ -22,6 +22,7 @@ _SHORTEST_S = 1e-4
 """No two frames are nearer: a shorter step would give a noise that can't be inverted."""
 
 _ZERO, _ONE = np.zeros((6, 6)), np.eye(6)
+_POSE, _TWIST = np.arange(6), np.arange(6, 12)
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,12 @@ def _transition(step: Array, by_twist: Array) -> Array:
 
 def _integrated(density: Density, dt_s: float) -> Array:
     """(12, 12): the white acceleration of `dt_s` in pose and twist. Barfoot 2017, eq. 3.129."""
-    q = np.diag(density.diagonal())
-    return np.block([[q * dt_s**3 / 3, q * dt_s**2 / 2], [q * dt_s**2 / 2, q * dt_s]])
+    q = density.diagonal()
+    result = np.zeros((12, 12))
+    result[_POSE, _POSE] = q * (dt_s**3 / 3)
+    result[_POSE, _TWIST] = result[_TWIST, _POSE] = q * (dt_s**2 / 2)
+    result[_TWIST, _TWIST] = q * dt_s
+    return result
 
 
 def _blimp(

@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 _ZERO = np.zeros(12)
 _UNIT = gtsam.noiseModel.Unit.Create(12)
-_ROTATION = np.array([True, False]).repeat(3)
+_ROTATION, _TRANSLATION = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
 
 _VAGUE = np.array([0.3] * 3 + [1.0] * 3 + [1.0] * 3 + [2.0] * 3)
 """Standard deviations (rad, m, rad/s, m/s) of a start whose covariance can't be used."""
@@ -47,8 +47,8 @@ class FixedLagSmoother:
 
     Each state is one 12-vector of GTSAM: its step from the solution it came with. Factors are
     linear at that solution, a frame's sights as a Hessian, the process as a Jacobian, so that ISAM2
-    never calls back into Python. `failures` counts updates that could not be used and restarted the graph,
-    `failure` says why the last one could not.
+    never calls back into Python. `failures` counts the updates that could not be used and restarted
+    the graph; `failure` says why the last one could not.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
@@ -56,6 +56,7 @@ class FixedLagSmoother:
         self.failures = 0
         self.failure = ""
         self._latest: Kinematics | None = None
+        self._expected: Step | None = None
         self._left: list[Kinematics] = []
         self._adaptation = _Adaptation(settings)
         self._clear()
@@ -76,8 +77,7 @@ class FixedLagSmoother:
         A covariance that is none is replaced by a vague one. Raises `ValueError` when the pose or
         the twist is not finite.
         """
-        if not (np.isfinite(state.wTc).all() and np.isfinite(state.twist).all()):
-            raise ValueError("the state to start from is not finite")
+        self._check(state)
         self._left = []
         self._start(state)
 
@@ -89,39 +89,37 @@ class FixedLagSmoother:
         """
         if self._latest is None:
             return None
-        return self._advance(self._latest, time_ns, self.density).state
+        return self._expect(self._latest, time_ns).state
 
     def update(self, time_ns: int, solution: Solution) -> Kinematics:
         """Adds a solved frame and returns the newest state with its covariance, causal.
 
         `solution.information` and `.gradient` are of the frame's sights alone, at `solution.state`.
         When they can't be used, or the graph becomes singular, it restarts from the solution's own
-        state and covariance; when that is not finite either, the prediction is returned and nothing
-        is added. Raises `ValueError` when there is no state, or its time is not after the newest.
+        state and covariance; when that is not finite either, from the prediction. Raises
+        `ValueError` when there is no state, or its time is not after the newest.
         """
         state = solution.state
         if state is None:
             raise ValueError("a solution without a state can't be added")
         state = Kinematics(time_ns, state.wTc, state.twist, state.covariance)
         latest = self._latest
-        if latest is not None and time_ns <= latest.time_ns:
-            raise ValueError(f"time {time_ns} ns is not after the newest, {latest.time_ns} ns")
         if latest is None:
-            self.restart(state)
-            return state if self._latest is None else self._latest
+            self._check(state)
+            return self._start(state)
+        if time_ns <= latest.time_ns:
+            raise ValueError(f"time {time_ns} ns is not after the newest, {latest.time_ns} ns")
         self._leave(time_ns)
         try:
-            self._latest = self._add(latest, state, solution)
+            return self._add(latest, state, solution)
         except (_Refused, RuntimeError, np.linalg.LinAlgError, ValueError) as error:
             # GTSAM raises RuntimeError for a singular system, and its graph is then unusable.
             self.failures += 1
             self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
-            if not (np.isfinite(state.wTc).all() and np.isfinite(state.twist).all()):
+            if not _finite(state):
                 state = self._advance(latest, time_ns, self.density).state
             self._drain()
-            self._start(state)
-        assert self._latest is not None
-        return self._latest
+            return self._start(state)
 
     def smoothed(self) -> list[Kinematics]:
         """The states that have left the lag since last asked, oldest first: each used the frames of
@@ -130,16 +128,18 @@ class FixedLagSmoother:
         return left
 
     def flush(self) -> list[Kinematics]:
-        """At a recording's end: `smoothed()`, and the states still within the lag.
+        """`smoothed()` and the states still within the lag; all is then forgotten.
 
-        What was added before then stands only in `latest`: the next update starts from it.
+        For a recording's end, or before a restart from elsewhere.
         """
-        latest = self._latest
         self._drain()
-        if latest is not None:
-            self._start(latest)
-            self._nodes.clear()
+        self._latest = None
         return self.smoothed()
+
+    @staticmethod
+    def _check(state: Kinematics) -> None:
+        if not _finite(state):
+            raise ValueError("the state to start from is not finite")
 
     def _clear(self) -> None:
         parameters = gtsam.ISAM2Params()
@@ -148,22 +148,31 @@ class FixedLagSmoother:
         parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         parameters.setRelinearizeThreshold(1e12)
         parameters.relinearizeSkip = 1_000_000
+        parameters.findUnusedFactorSlots = True  # or its list grows for as long as we fly
         # A little longer than ours: a state is read by us before GTSAM drops it.
         lag_s = self.settings.smoother_lag_s + 1e-3
         self._graph = gtsam.IncrementalFixedLagSmoother(lag_s, parameters)
-        self._nodes: deque[_Node] = deque()
+        self._nodes: deque[_Node] = deque()  # those not yet read
         self._key = 0
+        self._sound = True
         self._up: Array | None = None
 
-    def _start(self, state: Kinematics) -> None:
+    def _start(self, state: Kinematics) -> Kinematics:
         self._clear()
         self._adaptation.restart()
         covariance, information = _usable(state.covariance)
         state = Kinematics(state.time_ns, state.wTc, state.twist, covariance)
         prior = gtsam.HessianFactor(X(0), information, _ZERO, 0.0)
         self._push(state, [prior])
-        self._latest = state
+        self._latest, self._expected = state, None
         self._up = state.wTc[2, :3].copy()
+        return state
+
+    def _expect(self, latest: Kinematics, time_ns: int) -> Step:
+        """The step from the newest state: a frame asks for it twice, to predict and to update."""
+        if self._expected is None or self._expected.state.time_ns != time_ns:
+            self._expected = self._advance(latest, time_ns, self.density)
+        return self._expected
 
     def _advance(self, state: Kinematics, time_ns: int, density: Density) -> Step:
         return process.advance(state, time_ns, self.settings, density, self._up)
@@ -172,7 +181,7 @@ class FixedLagSmoother:
         information = (solution.information + solution.information.T) / 2
         if not (np.isfinite(information).all() and np.isfinite(solution.gradient).all()):
             raise _Refused("the sights' information is not finite")
-        step = self._advance(latest, state.time_ns, self.density)
+        step = self._expect(latest, state.time_ns)
         error = process.difference(step.state, state)
         if not (np.isfinite(error).all() and np.isfinite(step.noise).all()):
             raise _Refused("the step from the last state is not finite")
@@ -180,7 +189,7 @@ class FixedLagSmoother:
             step = self._advance(latest, state.time_ns, self.density)
         by_state, by_latest = _error_jacobians(error, step.transition)
         whiten = np.linalg.inv(np.linalg.cholesky(step.noise))
-        before = self._nodes[-1]
+        before = self._newest
         # The process starts from the last state's estimate, which lies a step from its anchor.
         offset = self._graph.calculateEstimateVector(before.key)
         key = X(self._key)
@@ -189,8 +198,12 @@ class FixedLagSmoother:
             whiten @ (by_latest @ offset - error), _UNIT,
         )  # fmt: skip
         sights = gtsam.HessianFactor(key, information, -solution.gradient, 0.0)
+        self._sound = False
         self._push(state, [process_factor, sights])
-        result = self._estimate(self._nodes[-1])
+        result = self._estimate(self._newest)
+        np.linalg.cholesky(result.covariance)  # raises where it is no covariance
+        self._sound = True
+        self._latest, self._expected = result, None
         self._learn_rest(result, (state.time_ns - latest.time_ns) / 1e9)
         return result
 
@@ -202,7 +215,8 @@ class FixedLagSmoother:
             graph.add(gtsam.LinearContainerFactor(factor))
         self._graph.update(graph, start, {key: anchor.time_ns / 1e9})
         self._key += 1
-        self._nodes.append(_Node(key, anchor))
+        self._newest = _Node(key, anchor)
+        self._nodes.append(self._newest)
 
     def _estimate(self, node: _Node) -> Kinematics:
         step = self._graph.calculateEstimateVector(node.key)
@@ -214,16 +228,16 @@ class FixedLagSmoother:
     def _leave(self, time_ns: int) -> None:
         """Reads the states that the coming frame pushes out: their lag is over."""
         oldest_ns = time_ns - self.settings.smoother_lag_s * 1e9
-        while len(self._nodes) > 1 and self._nodes[0].anchor.time_ns < oldest_ns:
+        while self._nodes and self._nodes[0].anchor.time_ns < oldest_ns:
             self._take(self._nodes.popleft())
 
     def _drain(self) -> None:
-        for node in self._nodes:
+        # A graph that failed on its way answers anything, or nothing: its states are left out.
+        for node in self._nodes if self._sound else ():
             self._take(node)
         self._nodes.clear()
 
     def _take(self, node: _Node) -> None:
-        # A graph that has failed may not answer any more: its states are then left out.
         with contextlib.suppress(RuntimeError, _Refused, ValueError):
             self._left.append(self._estimate(node))
 
@@ -268,19 +282,19 @@ class _Adaptation:
     def learn(self, latest: Kinematics, step: Step, error: Array, information: Array) -> bool:
         """Takes one frame's deviation (12,) into account; whether the densities have changed."""
         limit = self.settings.density_limit
-        if limit <= 1.0 or self.settings.model == "static":
+        dt_s = (step.state.time_ns - latest.time_ns) / 1e9
+        # What is not carried on is no work of the densities.
+        if limit <= 1.0 or self.settings.model == "static" or dt_s > self.settings.coast_s:
             return False
         precision = np.linalg.inv(step.state.covariance)
         # P⁻¹ − P⁻¹P⁺P⁻¹ with P⁺ = (P⁻¹ + I)⁻¹
         expected = precision - precision @ np.linalg.solve(precision + information, precision)
         pulled = precision @ error
-        dt_s = (step.state.time_ns - latest.time_ns) / 1e9
         share = min(0.5, dt_s / self.settings.density_time_s)
-        for i, rotates in enumerate((True, False)):
-            axes = np.tile(rotates == _ROTATION, 2)
-            noise = step.noise[np.ix_(axes, axes)]
+        for i, axes in enumerate((_ROTATION, _TRANSLATION)):
+            noise = step.noise[axes[:, None], axes]
             seen = float(pulled[axes] @ noise @ pulled[axes])
-            usual = float(np.sum(noise * expected[np.ix_(axes, axes)]))
+            usual = float(np.sum(noise * expected[axes[:, None], axes]))
             ratio = min(seen / usual, self._MOST) if usual > 1e-9 else 1.0
             self._factor[i] = np.clip(self._factor[i] * (1 + share * (ratio - 1)), 1.0, limit)
         return True
@@ -293,6 +307,10 @@ def _error_jacobians(error: Array, transition: Array) -> tuple[Array, Array]:
     by_state[:6, :6] = process.inverse_right_jacobian(error[:6])
     by_predicted[:6, :6] = -process.inverse_right_jacobian(-error[:6])
     return by_state, by_predicted @ transition
+
+
+def _finite(state: Kinematics) -> bool:
+    return bool(np.isfinite(state.wTc).all() and np.isfinite(state.twist).all())
 
 
 def _usable(covariance: Array) -> tuple[Array, Array]:
