@@ -44,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate-hz", type=float, default=30.0, metavar="R", help="of a folder of images (30)"
     )
     parser.add_argument("--json", metavar="F", help="write figures to this file")
+    parser.add_argument(
+        "--observations",
+        metavar="F",
+        help="write which landmarks each frame saw where, for 'blimp map refine'",
+    )
     parser.epilog = (
         "Example:\n"
         "  blimp localize flight.mcap --map maps/atrium --out out/est.txt --json out/est.json"
@@ -78,8 +83,13 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.trajectory import read_tum
     from ground_station.localization.localizer import LocalizationError, Localizer
-    from ground_station.localization.results import summary, write_estimates
+    from ground_station.localization.results import (
+        flight_observations,
+        summary,
+        write_estimates,
+    )
     from ground_station.mapping import store
+    from ground_station.mapping.observations import save_observations
     from ground_station.recording.open import open_input, parse_range
 
     settings = load_settings(args)
@@ -88,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         raise LocalizationError(
             f"the preset '{args.preset}' cannot find its first pose: --init TUM.txt is needed"
         )
-    for out in (args.out, args.json):
+    for out in (args.out, args.json, args.observations):
         if out and not Path(out).resolve().parent.is_dir():
             raise InputError(f"{out}: its folder does not exist")
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
@@ -111,6 +121,9 @@ def run(args: argparse.Namespace) -> int:
     for note in source.notes:
         _say(note)
     write_estimates(args.out, estimates)
+    if args.observations:
+        seen = flight_observations(estimates, Path(args.input).resolve().stem, map_, camera)
+        save_observations(args.observations, seen)
     if args.json:
         about = {
             "input": str(args.input),

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.settings import LocalizerSettings
+from ground_station.mapping.observations import FlightObservations, landmarks_sha256
+from ground_station.mapping.store import Map
 
 
 def trajectory(estimates: Sequence[PoseEstimate]) -> Trajectory:
@@ -23,6 +26,34 @@ def trajectory(estimates: Sequence[PoseEstimate]) -> Trajectory:
 def write_estimates(path: str | Path, estimates: Sequence[PoseEstimate]) -> None:
     """Writes them as TUM text; no other poses."""
     write_tum(path, trajectory(estimates))
+
+
+def flight_observations(
+    estimates: Sequence[PoseEstimate], name: str, map_: Map, camera: Camera
+) -> FlightObservations:
+    """What the frames of a flight saw of a map, for `blimp map refine`.
+
+    The inliers of the frames that were tracking; a relocalization is not confirmed yet.
+    """
+    told = [
+        (e.time_ns, e.wTc, e.observations)
+        for e in estimates
+        if e.wTc is not None and e.state is State.TRACKING and not e.relocalized
+    ]
+    landmark = [seen.landmark[seen.inlier] for _, _, seen in told]
+    pixel_px = [seen.pixel_px[seen.inlier] for _, _, seen in told]
+    ids = map_.landmarks.id[np.concatenate([*landmark, np.empty(0, np.intp)])]
+    return FlightObservations(
+        name="".join(c if c.isprintable() else "_" for c in name)[:100] or "flight",
+        map=map_.info.name,
+        landmarks_sha256=landmarks_sha256(map_.landmarks),
+        camera=camera,
+        time_ns=np.array([time_ns for time_ns, _, _ in told], np.int64),
+        wTc=np.array([wTc for _, wTc, _ in told], np.float64).reshape(-1, 4, 4),
+        offset=np.cumsum([0, *map(len, landmark)], dtype=np.int64),
+        landmark=ids,
+        pixel_px=np.concatenate([*pixel_px, np.empty((0, 2))]).astype(np.float32),
+    )
 
 
 def percentiles(values_ms: Sequence[float]) -> dict[str, float]:
