@@ -19,9 +19,11 @@ from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.association import associate
 from ground_station.localization.estimate import PoseEstimate
+from ground_station.localization.kinematics import Kinematics, Sights
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import solve_graph
+from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import (
     PRESETS,
@@ -118,7 +120,10 @@ def _unit(rows: npt.NDArray[Any]) -> F32:
 
 
 def pose(seed: int, repetitions: int) -> dict[str, Any]:
-    """Both solvers on the same observations, landmarks as good as known; and how far apart."""
+    """Both solvers on the same observations, landmarks free to move; and how far apart they are.
+
+    Beside them pose and velocity by rows, from a prediction as far off as the solvers' guess.
+    """
     rng = np.random.default_rng(seed)
     camera = THESIS_CAMERA
     depth = rng.uniform(2, 8, _OBSERVATIONS)
@@ -130,15 +135,33 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     wrong = rng.permutation(_OBSERVATIONS)[: round(_OUTLIERS * _OBSERVATIONS)]
     pixels[wrong] += rng.uniform(-40, 40, (len(wrong), 2))
     guess = wTc @ poses.exp([0.02, -0.03, 0.02, 0.08, -0.05, 0.06])
-    settings = PoseSettings(sigma_px=2.0, landmark_sigma_m=1e-5)
+    settings = PoseSettings(sigma_px=2.0, landmark_sigma_m=0.01)
     data = (guess, points, pixels, camera, settings)
     direct, graph = solve_direct(*data).wTc, solve_graph(*data).wTc
     assert direct is not None and graph is not None
-    ours, theirs = medians_ms(repetitions, lambda: solve_direct(*data), lambda: solve_graph(*data))
+    middle = 0.5 * (camera.height_px - 1)
+    sights = Sights(
+        points,
+        pixels,
+        camera.readout_s * (camera.distort(flat)[:, 1] - middle) / (2 * middle),
+        np.full(_OBSERVATIONS, settings.sigma_px),
+        np.tile(settings.landmark_sigma_m**2 * np.eye(3), (_OBSERVATIONS, 1, 1)),
+    )
+    sigma = np.repeat([0.05, 0.1, 0.5, 0.5], 3)
+    predicted = Kinematics(0, guess, np.zeros(6), np.diag(sigma**2))
+    assert solve_rolling(predicted, sights, camera, settings).state is not None
+    ours, theirs, rolling = medians_ms(
+        repetitions,
+        lambda: solve_direct(*data),
+        lambda: solve_graph(*data),
+        lambda: solve_rolling(predicted, sights, camera, settings),
+    )
     return {
         "direct_ms": ours,
         "graph_ms": theirs,
+        "rolling_ms": rolling,
         "ratio": theirs / ours,
+        "landmark_sigma_m": settings.landmark_sigma_m,
         "apart_m": float(np.linalg.norm(direct[:3, 3] - graph[:3, 3])),
     }
 

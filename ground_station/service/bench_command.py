@@ -89,6 +89,10 @@ def report(result: dict[str, Any]) -> list[str]:
     for name, ours_ms, other_ms, ratio in (
         (f"association, a loop over features ({same})", *_values(association, "ours", "loop")),
         (f"pose, the graph ({apart})", *_values(pose, "direct", "graph")),
+        (
+            "pose and velocity by rows, the graph",
+            *(pose["rolling_ms"], pose["graph_ms"], pose["graph_ms"] / pose["rolling_ms"]),
+        ),
     ):
         steps.append([name, *_numbers(ours_ms, other_ms), f"{ratio:.1f}"])
     lines = [
