@@ -9,13 +9,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.features.extractor import Extractor
-from ground_station.localization.attempt import Stopwatch
+from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Observations, no_observations
 from ground_station.localization.estimator import Estimator
 from ground_station.localization.kinematics import Kinematics, Solution, no_solution
-from ground_station.localization.matching import Described, Matcher, Matches, describe
+from ground_station.localization.matching import (
+    Described,
+    Matcher,
+    Matches,
+    describe,
+)
 from ground_station.localization.relocalization import Relocalizer
 from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.thresholds import DescriptorThresholds
 from ground_station.localization.tracking import Keyframe, spread_out
 from ground_station.mapping.store import Map
 
@@ -27,7 +33,8 @@ Image = npt.NDArray[np.uint8]
 class Located:
     """A frame solved from features of its own, or why not.
 
-    `relocalized`: found in the whole map, without a prediction.
+    Observations are in the order of the matches. `relocalized`: found in the whole map, without a
+    prediction.
     """
 
     solution: Solution
@@ -36,22 +43,36 @@ class Located:
     features: int
     relocalized: bool = False
 
+    def teach(self, thresholds: DescriptorThresholds | None) -> None:
+        """What a solved frame says about its landmarks' descriptors."""
+        if thresholds is not None and self.solution.state is not None:
+            matches = self.matches
+            thresholds.learn(matches.landmark, matches.distance, self.observations.inlier)
+
 
 @dataclass(frozen=True)
 class Acquired:
     """What a job beside the frames brings: a keyframe, or None and the reason.
 
-    `state` is what the frame was found to be. `searched`: it had none before; `relocalized`: it was
-    found in the whole map.
+    `searched`: the frame had no pose before.
     """
 
     time_ns: int
     keyframe: Keyframe | None
-    state: Kinematics | None
+    found: Located
     searched: bool
-    relocalized: bool
     reason: str
     background_ms: float
+
+    @property
+    def state(self) -> Kinematics | None:
+        """What the frame was found to be."""
+        return self.found.solution.state
+
+    @property
+    def relocalized(self) -> bool:
+        """Whether it was found in the whole map."""
+        return self.found.relocalized
 
 
 class Acquirer:
@@ -69,9 +90,9 @@ class Acquirer:
             else None
         )
 
-    def describe(self, image: Image) -> Described:
+    def describe(self, image: Image, taken: Conditions) -> Described:
         """The features of a grey frame (H, W)."""
-        return describe(self._extractor.extract(image), self.matcher.camera)
+        return describe(self._extractor.extract(image), self.matcher.camera, taken)
 
     def locate(
         self, seen: Described, expected: Kinematics, estimator: Estimator, watch: Stopwatch
@@ -108,13 +129,18 @@ class Acquirer:
         return Keyframe(time_ns, image, wTc, pixel, landmark, points)
 
     def promote(
-        self, time_ns: int, image: Image, state: Kinematics, estimator: Estimator
+        self,
+        time_ns: int,
+        image: Image,
+        state: Kinematics,
+        estimator: Estimator,
+        taken: Conditions,
     ) -> Callable[[], Acquired]:
         """The job that makes a tracked frame of a known state the next keyframe."""
 
         def job() -> Acquired:
             watch = Stopwatch()
-            seen = self.describe(image)
+            seen = self.describe(image, taken)
             closer_px = self._settings.association.refine_radius_px
             radius_px = closer_px or self._settings.association.radius_px
             found = self._locate_once(seen, state, state, estimator, radius_px, watch)
@@ -128,12 +154,13 @@ class Acquirer:
         image: Image,
         expected: Kinematics | None,
         make: Callable[[], Estimator],
+        taken: Conditions,
     ) -> Callable[[], Acquired]:
         """The job that finds a frame near its prediction, or else anywhere."""
 
         def job() -> Acquired:
             watch = Stopwatch()
-            seen = self.describe(image)
+            seen = self.describe(image, taken)
             found = _nothing(seen, "no prediction")
             if expected is not None:
                 found = self.locate(seen, expected, make(), watch)
@@ -154,7 +181,7 @@ class Acquirer:
             else:
                 reason = f"{count} inliers"
         spent_ms = watch.finish()["total"]
-        return Acquired(time_ns, keyframe, state, searched, found.relocalized, reason, spent_ms)
+        return Acquired(time_ns, keyframe, found, searched, reason, spent_ms)
 
     def _locate_once(
         self,
@@ -171,7 +198,9 @@ class Acquirer:
         if len(matches) < settings.min_observations:
             solution = no_solution(len(matches), f"{len(matches)} observations")
         else:
-            sights = self.matcher.sights(pixel, matches.landmark, settings.sigma_px)
+            sights = self.matcher.sights(
+                pixel, matches.landmark, settings.sigma_px, around, seen.taken
+            )
             solution = believed(estimator.solve(expected, sights, settings), self._settings)
         watch.lap("pose")
         observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.kinematics import Kinematics
+
+Indices = npt.NDArray[np.intp]
 
 
 class Stopwatch:
@@ -24,14 +30,27 @@ class Stopwatch:
         return self.stage_ms | {"total": 1e3 * (time.perf_counter() - self._begin)}
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """How a frame was taken.
+
+    `exposure_s`, None where the camera does not tell; `sharpness` against the frames before, 0 to
+    1; `recent` (R,), the landmarks seen just before, where any are known.
+    """
+
+    exposure_s: float | None = None
+    sharpness: float = 1.0
+    recent: Indices | None = None
+
+
 class Attempt:
     """One frame on its way to a pose."""
 
-    def __init__(self, time_ns: int, index: int = 0, exposure_s: float | None = None) -> None:
-        self.time_ns, self.index, self.exposure_s = time_ns, index, exposure_s
+    def __init__(self, time_ns: int, index: int = 0) -> None:
+        self.time_ns, self.index = time_ns, index
         self.watch = Stopwatch()
         self.entropy = float("nan")
-        self.sharpness = 1.0
+        self.taken = Conditions()
         self.predicted: Kinematics | None = None
         self.counts = Counts()
         self.observations = no_observations()

@@ -57,7 +57,9 @@ def follow(
     if found < settings.tracking.min_inliers:
         solution = no_solution(found, f"{found} points found again")
     else:
-        sights = matcher.sights(tracks.pixel_px, landmark, settings.tracking.sigma_px)
+        sights = matcher.sights(
+            tracks.pixel_px, landmark, settings.tracking.sigma_px, predicted, attempt.taken
+        )
         solution = estimator.solve(predicted, sights, _tracked(settings))
         solution = believed(solution, settings, settings.tracking.min_inliers)
     attempt.watch.lap("pose")

@@ -12,7 +12,8 @@ from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
 from ground_station.localization import following
 from ground_station.localization.acquisition import Acquired, Acquirer, Located
-from ground_station.localization.attempt import Attempt
+from ground_station.localization.attempt import Attempt, Conditions
+from ground_station.localization.blur import gradient_energy, sharpness
 from ground_station.localization.estimate import Counts, PoseEstimate, State, no_observations
 from ground_station.localization.estimator import Estimator, make_estimator
 from ground_station.localization.following import Followed
@@ -43,7 +44,7 @@ class Localizer:
         """Raises `MapError` when the map was built with other features than the extractor's."""
         check_features(map_.info, extractor.name, extractor.sha256)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
-        self._matcher = Matcher(map_.landmarks, camera, settings)
+        self._matcher = Matcher(map_, camera, settings)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
         self._worker: Worker[Acquired] = Worker(settings.tracking.features_lag_frames)
         self.reset()
@@ -56,6 +57,8 @@ class Localizer:
         self._keyframe: Keyframe | None = None
         self._followed: Followed | None = None
         self._recent: deque[tuple[int, Image]] = deque(maxlen=following.REMEMBERED)
+        self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
+        self._seen: npt.NDArray[np.intp] | None = None
         self._last_frame_ns: int | None = None
         self._last_search_ns: int | None = None
 
@@ -99,7 +102,7 @@ class Localizer:
             raise InputError(
                 f"frame {index} has {size} pixels, the camera {camera.width_px}x{camera.height_px}"
             )
-        attempt = Attempt(time_ns, index, exposure_s)
+        attempt = Attempt(time_ns, index)
         if (refused := self._refuse(attempt)) is not None:
             return refused
         attempt.entropy = entropy_bits(image)
@@ -109,6 +112,8 @@ class Localizer:
         limit = self.settings.gate.min_entropy_bits
         if attempt.entropy < limit:
             return self._gated(attempt, f"entropy {attempt.entropy:.2f} below {limit:g} bits")
+        attempt.taken = self._conditions(image, exposure_s)
+        attempt.watch.lap("sharpness")
         if unhurried:
             return self._describe(attempt, image)
         estimate = self._follow(attempt, image)
@@ -121,7 +126,15 @@ class Localizer:
         if (refused := self._refuse(attempt)) is not None:
             return refused
         self._last_frame_ns = time_ns
-        return self._locate(attempt, describe(features, self.camera))
+        return self._locate(attempt, describe(features, self.camera, self._conditions(None, None)))
+
+    def _conditions(self, image: Image | None, exposure_s: float | None) -> Conditions:
+        sharp = 1.0
+        if image is not None and self.settings.blur.enabled:
+            energy = gradient_energy(image)
+            sharp = sharpness(energy, self._energies)
+            self._energies.append(energy)
+        return Conditions(exposure_s, sharp, self._seen)
 
     def _fresh(self) -> Estimator:
         return make_estimator(self.camera, self.settings)
@@ -145,7 +158,7 @@ class Localizer:
 
     def _describe(self, attempt: Attempt, image: Image) -> PoseEstimate:
         self._worker.drop()
-        seen = self._acquirer.describe(image)
+        seen = self._acquirer.describe(image, attempt.taken)
         attempt.watch.lap("features")
         estimate = self._locate(attempt, seen)
         if self.settings.tracking.enabled and estimate.wTc is not None:
@@ -180,6 +193,7 @@ class Localizer:
         matches = found.matches
         attempt.counts = Counts(found.features, matches.projected, matches.associated, inliers)
         attempt.observations = found.observations
+        found.teach(self._matcher.thresholds)
 
     def _may_search(self, time_ns: int) -> bool:
         recovery, tried = self.settings.recovery, self._last_search_ns
@@ -222,7 +236,9 @@ class Localizer:
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
             self._worker.submit(
-                self._acquirer.promote(attempt.time_ns, image, state, self._estimator)
+                self._acquirer.promote(
+                    attempt.time_ns, image, state, self._estimator, attempt.taken
+                )
             )
 
     def _search(self, attempt: Attempt, image: Image) -> None:
@@ -234,7 +250,9 @@ class Localizer:
         self._last_search_ns = attempt.time_ns
         gone = self._judge.after_gap(attempt.time_ns) in (State.INITIALIZING, State.LOST)
         expected = None if gone else attempt.predicted
-        self._worker.submit(self._acquirer.search(attempt.time_ns, image, expected, self._fresh))
+        self._worker.submit(
+            self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken)
+        )
 
     def _land(self, attempt: Attempt) -> bool:
         """Takes what the job beside the frames brings; whether it was found in the whole map."""
@@ -243,6 +261,7 @@ class Localizer:
             return False
         attempt.watch.lap("wait")
         attempt.watch.stage_ms["background"] = landed.background_ms
+        landed.found.teach(self._matcher.thresholds)
         if landed.keyframe is None:
             return False
         solved_ns = self._judge.last_solved_ns
@@ -280,6 +299,7 @@ class Localizer:
         believed = self._estimator.update(solution) if not relocalized or followed else None
         state = believed or solution.state
         assert state is not None
+        self._seen = attempt.observations.landmark[solution.inlier]
         evidence = evidence_of(
             attempt, solution, state, self.camera, self.settings.covariance,
             followed.support_ns if followed else attempt.time_ns,
@@ -295,6 +315,7 @@ class Localizer:
         if verdict is State.LOST and self._keyframe is not None:
             # Found again by chance it would only repeat where the camera was.
             self._keyframe, self._followed, self._estimator = None, None, self._fresh()
+            self._seen = None
         attempt.observations = no_observations()
         return publish(attempt, verdict, reason, self.settings)
 

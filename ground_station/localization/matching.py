@@ -11,12 +11,14 @@ from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.association import associate
-from ground_station.localization.attempt import Stopwatch
+from ground_station.localization.attempt import Conditions, Stopwatch
+from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
 from ground_station.localization.kinematics import Kinematics, Sights
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.visibility import LandmarkIndex
-from ground_station.mapping.store import Landmarks
+from ground_station.localization.thresholds import DescriptorThresholds
+from ground_station.localization.visibility import Covisibility, LandmarkIndex
+from ground_station.mapping.store import Map
 
 Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
@@ -33,12 +35,13 @@ class Described:
     features: Features
     normalized: Array
     pinhole_px: Array
+    taken: Conditions
 
     def __len__(self) -> int:
         return len(self.features)
 
 
-def describe(features: Features, camera: Camera) -> Described:
+def describe(features: Features, camera: Camera, taken: Conditions) -> Described:
     """Features without those that are not finite, and where they are without the lens."""
     finite = np.isfinite(features.keypoints_px).all(axis=1)
     finite &= np.isfinite(features.descriptors).all(axis=1)
@@ -48,7 +51,7 @@ def describe(features: Features, camera: Camera) -> Described:
         )
     normalized = camera.undistort(features.keypoints_px)
     focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
-    return Described(features, normalized, normalized * focal + centre)
+    return Described(features, normalized, normalized * focal + centre, taken)
 
 
 @dataclass(frozen=True)
@@ -71,10 +74,21 @@ class Matches:
 class Matcher:
     """One map as seen through one camera."""
 
-    def __init__(self, landmarks: Landmarks, camera: Camera, settings: LocalizerSettings) -> None:
-        self.landmarks, self.camera, self.settings = landmarks, camera, settings
+    def __init__(self, map_: Map, camera: Camera, settings: LocalizerSettings) -> None:
+        self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
+        landmarks, keyframes = map_.landmarks, map_.keyframes
         self._lens = Lens(camera)
         self._index = LandmarkIndex(landmarks)
+        self._covisibility = (
+            Covisibility(len(landmarks), keyframes)
+            if settings.projection.covisibility and len(keyframes)
+            else None
+        )
+        self.thresholds = (
+            DescriptorThresholds(landmarks, settings.association)
+            if settings.association.learn_thresholds
+            else None
+        )
         self._rolling = settings.pose.solver == "rolling"
         self._readout_s = camera.readout_s if settings.pose.rolling_shutter else 0.0
 
@@ -87,6 +101,8 @@ class Matcher:
         """
         settings, landmarks = self.settings, self.landmarks
         among = self._index.near(expected.wTc, self._lens, settings.projection)
+        if self._covisibility is not None and seen.taken.recent is not None:
+            among = self._covisibility.covisible(seen.taken.recent, expected.wTc, among)
         projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
         where = projected.pinhole_px
         radius: float | Array = radius_px or settings.association.radius_px
@@ -103,6 +119,7 @@ class Matcher:
             landmarks.descriptor[projected.landmark],
             settings.association,
             radius,
+            self.thresholds.limits(projected.landmark) if self.thresholds else None,
         )
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
         watch.lap("association")
@@ -114,15 +131,28 @@ class Matcher:
             len(pairs),
         )
 
-    def sights(self, pixel_px: npt.ArrayLike, landmark: Indices, sigma_px: npt.ArrayLike) -> Sights:
-        """Landmarks (N,) seen at distorted pixels (N, 2) with standard deviations (N,) or one."""
-        pixel = np.asarray(pixel_px, np.float64)
+    def sights(
+        self,
+        pixel_px: npt.ArrayLike,
+        landmark: Indices,
+        sigma_px: float,
+        expected: Kinematics,
+        taken: Conditions,
+    ) -> Sights:
+        """Landmarks (N,) seen at distorted pixels (N, 2), less surely where motion blurs them."""
+        pixel, blur = np.asarray(pixel_px, np.float64), self.settings.blur
+        points = np.asarray(self.landmarks.position_m[landmark], np.float64)
+        sigma = np.full(len(pixel), sigma_px)
+        if blur.enabled and len(pixel):
+            points_c = poses.transform(poses.inverse(expected.wTc), points)
+            path = expected_blur_px(self.camera, points_c, expected.twist, taken.exposure_s)
+            sigma = blurred_sigma_px(sigma, path, taken.sharpness, blur)
         floor = np.eye(3) * self.settings.pose.landmark_sigma_m**2
         return Sights(
-            np.asarray(self.landmarks.position_m[landmark], np.float64),
+            points,
             self.camera.undistort_to_pinhole(pixel),
             self.row_s(pixel),
-            np.broadcast_to(np.asarray(sigma_px, np.float64), (len(pixel),)),
+            sigma,
             self.landmarks.covariance_m2[landmark].astype(np.float64) + floor,
         )
 

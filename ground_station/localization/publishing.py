@@ -44,7 +44,7 @@ def evidence_of(
         covariance=published_covariance(state.covariance, settings),
         innovation=solution.innovation,
         support_ns=support_ns,
-        sharpness=attempt.sharpness,
+        sharpness=attempt.taken.sharpness,
     )
 
 
@@ -74,7 +74,7 @@ def publish(
         observations=attempt.observations,
         stage_ms=attempt.watch.finish(),
         entropy_bits=attempt.entropy,
-        sharpness=attempt.sharpness,
+        sharpness=attempt.taken.sharpness,
         gated=gated,
         relocalized=relocalized,
         tracked=tracked,
