@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from collections.abc import Callable
@@ -24,15 +23,13 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import solve_graph
 from ground_station.localization.pose_rolling import solve_rolling
-from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import (
     PRESETS,
     AssociationSettings,
     PoseSettings,
     load_preset,
 )
-from ground_station.localization.visibility import LandmarkIndex
-from ground_station.mapping.store import Landmarks, Map
+from ground_station.mapping.store import Map
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
 from pi_firmware.wire.recording import TRUTH_TOPIC
@@ -43,8 +40,6 @@ Pairs = list[tuple[int, int]]
 
 _FEATURES, _LANDMARKS, _DIMENSION, _RADIUS_PX = 1000, 3000, 256, 40.0
 _OBSERVATIONS, _OUTLIERS = 400, 0.2
-_SIZE_M = 50.0
-"""Side of the square that holds the smaller map of the growth table; 3 m high."""
 
 
 def medians_ms(repetitions: int, *works: Callable[[], object]) -> list[float]:
@@ -218,71 +213,3 @@ def _rmse_m(estimates: list[PoseEstimate], truth: Trajectory) -> float:
         if e.wTc is not None
     ]
     return float(np.sqrt(np.mean(np.square(apart)))) if apart else float("nan")
-
-
-def growth(seed: int, repetitions: int, sizes: tuple[int, int]) -> list[dict[str, Any]]:
-    """Projection and association of a frame in a small map and in one that contains it.
-
-    The larger one goes on around the smaller with the same density, so that what is in view stays
-    the same. `plain_ms` looks at every landmark, `indexed_ms` through the index.
-    """
-    rng = np.random.default_rng(seed)
-    large = _building(rng, *sizes)
-    preset = load_preset("default")
-    camera, settings = THESIS_CAMERA, preset.projection
-    lens = Lens(camera)
-    views = []
-    for angle in rng.uniform(0, 2 * np.pi, repetitions):
-        z = np.array([np.cos(angle), np.sin(angle), 0.0])
-        R = np.stack([np.cross(z, [0, 0, 1.0]), [0, 0, -1.0], z], axis=1)
-        wTc = poses.pose(R, [*rng.uniform(-1, 1, 2), 1.5])
-        seen = project(large, wTc, lens, settings)
-        mine = rng.permutation(len(seen.landmark))[:_FEATURES]
-        noise = rng.normal(0, 0.05, (len(mine), large.descriptor.shape[1]))
-        described = _unit(large.descriptor[seen.landmark[mine]] + noise)
-        views.append((wTc, seen.pinhole_px[mine] + rng.normal(0, 3, (len(mine), 2)), described))
-    fields = [field.name for field in dataclasses.fields(Landmarks)]
-    maps = [Landmarks(**{name: getattr(large, name)[:size] for name in fields}) for size in sizes]
-    indices = [LandmarkIndex(map_) for map_ in maps]
-    spans = np.empty((len(views), len(sizes), 2))
-    in_view = np.empty((len(views), len(sizes)))
-    for v, (wTc, pixels, descriptors) in enumerate(views):
-        for m, (map_, index) in enumerate(zip(maps, indices, strict=True)):
-            for k in range(2):
-                begin = time.perf_counter()
-                among = index.near(wTc, lens, settings) if k else None
-                seen = project(map_, wTc, lens, settings, among)
-                expected = map_.descriptor[seen.landmark]
-                associate(pixels, descriptors, seen.pinhole_px, expected, preset.association)
-                spans[v, m, k] = 1e3 * (time.perf_counter() - begin)
-            in_view[v, m] = len(seen.landmark)
-    return [
-        {
-            "landmarks": size,
-            "in_view": float(np.median(in_view[:, m])),
-            "plain_ms": float(np.median(spans[:, m, 0])),
-            "indexed_ms": float(np.median(spans[:, m, 1])),
-        }
-        for m, size in enumerate(sizes)
-    ]
-
-
-def _building(rng: np.random.Generator, inner: int, total: int) -> Landmarks:
-    """`inner` landmarks on the square around the origin, the others around it as densely."""
-    side_m = _SIZE_M * np.sqrt(total / inner)
-    around = rng.uniform(-side_m / 2, side_m / 2, (2 * total, 2))
-    around = around[np.abs(around).max(axis=1) > _SIZE_M / 2]
-    around = around[: total - inner]
-    square = rng.uniform(-_SIZE_M / 2, _SIZE_M / 2, (inner, 2))
-    angle = rng.uniform(0, 2 * np.pi, total)
-    return Landmarks(
-        id=np.arange(total),
-        position_m=np.c_[np.concatenate([square, around]), rng.uniform(0, 3, total)],
-        covariance_m2=np.zeros((total, 3, 3), np.float32),
-        descriptor=_unit(rng.standard_normal((total, 64), np.float32)),
-        spread=np.zeros(total, np.float32),
-        view_direction=np.c_[np.cos(angle), np.sin(angle), np.zeros(total)].astype(np.float32),
-        view_cos=np.full(total, 0.5, np.float32),
-        distance_m=np.tile(np.array([1.0, 8.0], np.float32), (total, 1)),
-        observations=np.full(total, 3, np.int32),
-    )

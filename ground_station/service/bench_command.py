@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     localize.add_argument(
         "--landmarks", type=int, nargs=2, default=[10_000, 1_000_000], metavar=("A", "B"),
-        help="sizes of the growth table (10000 1000000)",
+        help="landmarks of the growth table's maps; memory is measured at B (10000 1000000)",
     )  # fmt: skip
     localize.add_argument("--seed", type=int, default=0, metavar="N", help="of what is drawn (0)")
     localize.add_argument("--json", type=Path, metavar="F", help="write the figures, too")
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `InputError` for a value out of range."""
     from ground_station.errors import InputError
     from ground_station.files import write_json
-    from ground_station.localization import bench
+    from ground_station.localization import bench, growth
     from ground_station.mapping import store
 
     for name, value, low in (
@@ -69,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
         "association": bench.association(args.seed, args.repetitions),
         "pose": bench.pose(args.seed, args.repetitions),
         "frame": bench.frames(map_, recording, args.frames),
-        "growth": bench.growth(args.seed, args.repetitions, (small, large)),
+        "growth": growth.growth(args.seed, args.repetitions, (small, large)),
+        "memory": growth.memory(args.seed, large),
     }
     print("\n".join(report(result)))
     if args.json:
@@ -82,7 +83,7 @@ def report(result: dict[str, Any]) -> list[str]:
     from ground_station.evaluation.text import columns
 
     machine, frame = result["machine"], result["frame"]
-    association, pose, growth = result["association"], result["pose"], result["growth"]
+    association, pose = result["association"], result["pose"]
     same = "the same pairs" if association["same"] else "OTHER pairs"
     apart = f"{1e3 * pose['apart_m']:.3f} mm apart"
     steps = [["step", "ours, ms", "other, ms", "ratio"]]
@@ -118,15 +119,29 @@ def report(result: dict[str, Any]) -> list[str]:
     lines += ["", f"{frame['frames']} frames of the flight, 'background' is no part of the total"]
     lines += columns(rows)
     lines += [f"thesis over default, total: {frame['ratio']:.1f}", ""]
-    table = [["landmarks", "in view", "every landmark, ms", "through the index, ms"]]
+    return [*lines, *_growth(result["growth"]), *_memory(result["memory"])]
+
+
+def _growth(growth: list[dict[str, Any]]) -> list[str]:
+    from ground_station.evaluation.text import columns
+
+    stages = ("projection", "association", "pose", "total")
+    table = [["landmarks", "density", "in view", *stages, "over the first", "by each landmark"]]
     for row in growth:
-        spans = _numbers(row["plain_ms"], row["indexed_ms"])
-        table.append([f"{row['landmarks']}", f"{row['in_view']:.0f}", *spans])
-    small, large = growth
-    ratios = (large[key] / small[key] for key in ("plain_ms", "indexed_ms"))
-    table.append(["ratio", "", *(f"{ratio:.2f}" for ratio in ratios)])
-    title = "projection and association of a frame, same density in view"
-    return [*lines, title, *columns(table)]
+        ratio = row["total_ms"] / growth[0]["total_ms"]
+        cells = [f"{row['landmarks']}", f"{row['density']}", f"{row['in_view']:.0f}"]
+        cells += _numbers(*(row[f"{stage}_ms"] for stage in stages))
+        table.append([*cells, f"{ratio:.2f}", *_numbers(row["project_all_ms"])])
+    title = "a frame after its features as the map grows, ms; the same density in view, then more"
+    return [title, *columns(table), "by each landmark: projection without the index", ""]
+
+
+def _memory(memory: dict[str, Any]) -> list[str]:
+    return [
+        f"a localizer of {memory['landmarks']} landmarks: at most {memory['peak_mb']:.0f} MB "
+        f"resident ({memory['idle_mb']:.0f} MB without a map), ready in {memory['load_s']:.1f} s, "
+        f"a search of all of it {memory['search_s']:.2f} s"
+    ]
 
 
 def _values(row: dict[str, Any], ours: str, other: str) -> tuple[float, float, float]:

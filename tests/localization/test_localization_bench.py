@@ -43,16 +43,35 @@ def test_the_direct_pose_is_four_times_the_graph_with_the_same_optimum(run):
 
 
 def test_a_frame_hardly_costs_more_in_a_larger_map(run):
-    small, large = run[1]["growth"]
+    small, large, dense = run[1]["growth"]
     assert (small["landmarks"], large["landmarks"]) == (10_000, 200_000)
-    assert small["in_view"] == large["in_view"] > 200
-    assert large["indexed_ms"] / small["indexed_ms"] <= 1.5
-    assert large["plain_ms"] > 2 * large["indexed_ms"]
+    assert large["in_view"] == pytest.approx(small["in_view"], rel=0.2) and small["in_view"] > 200
+    assert large["total_ms"] / small["total_ms"] <= 1.5
+    assert large["project_all_ms"] > 2 * large["project_indexed_ms"]
+    assert dense["landmarks"] == 200_000 and dense["density"] == 10
+    assert dense["in_view"] > 7 * large["in_view"]
+    assert small["localized"] == large["localized"] == dense["localized"] == 20
+
+
+def test_a_large_map_stays_small_in_memory(run):
+    memory = run[1]["memory"]
+    assert memory["landmarks"] == 200_000 and memory["tracked"]
+    # A fifth of 10⁶ landmarks; 1.5 GB are allowed for those.
+    assert 50 < memory["peak_mb"] - memory["idle_mb"] < 300
 
 
 def test_the_command_prints_and_writes_every_table(run):
     printed, result = run
-    for title in ("association", "pose", "decode", "features", "total", "localized", "200000"):
+    for title in (
+        "association",
+        "pose",
+        "decode",
+        "features",
+        "total",
+        "localized",
+        "200000",
+        "MB resident",
+    ):
         assert title in printed
     assert result["seed"] == 44 and result["machine"]["cores"] >= 1
     presets = result["frame"]["presets"]
