@@ -34,9 +34,11 @@ _NEAR = 20.0
 on the landmarks are moved along: costs on two of their linearisations do not compare, and so near
 no step needs the comparison."""
 
+_ROUGH = 300.0
+"""Newton's decrement of the last step of a rough descent: what is left after it is far less."""
+
 _CONVERGED = 1e-4
-"""Newton's decrement of the last step: a hundredth of a standard deviation, and what is left after
-a step of Newton's is far less."""
+"""Newton's decrement of the last step: a hundredth of a standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -209,9 +211,7 @@ class Reprojection:
         far = np.flatnonzero(variance * (y[0] * y[0] + y[1] * y[1]) > self.huber_k**2)
         start, excess = excess, np.zeros_like(variance)
         if len(far):
-            total = self._reweigh(r[:, far], spread[:, far], variance[far])
-            if start is not None:
-                total = np.where(start[far] > 0, variance[far] + start[far], total)
+            total = variance[far] if start is None else variance[far] + start[far]
             total = self._newton(total, r[:, far], spread[:, far], variance[far])
             excess[far] = total - variance[far]
             y, inverse, uu, vv = solve2(variance + excess, spread, r)
@@ -229,17 +229,11 @@ class Reprojection:
             factor[0, far], factor[1, far], factor[2, far] = -rest * b, rest * a, 0.0
         return y, excess, factor
 
-    def _reweigh(self, r: Array, spread: Array, variance: Array) -> Array:
-        """t·sigma² (N,) as if S were in all directions what it is along r: exact when it is."""
-        square = r[0] * r[0] + r[1] * r[1]
-        along = (spread[0] * r[0] + 2 * spread[1] * r[1]) * r[0] + spread[2] * r[1] * r[1]
-        total = np.sqrt(square * variance) / self.huber_k - along / square
-        return np.asarray(np.maximum(total, variance))
-
     def _newton(self, total: Array, r: Array, spread: Array, variance: Array) -> Array:
         """A t·sigma² (N,) nearer to sigma·‖y‖ = k: one step of Newton's on the inverse of both.
 
-        Moré and Sorensen's iteration for the same equation in a trust region; nearly linear in t.
+        Moré and Sorensen's iteration for the same equation in a trust region. One step is exact
+        from anywhere where S is the same in all directions.
         """
         y, inverse, uu, vv = solve2(total, spread, r)
         square = y[0] * y[0] + y[1] * y[1]
@@ -394,7 +388,7 @@ def descend(
     near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends before
     that, and its `linear` is of the step before.
     """
-    damping = 0.0
+    damping, sharp = 0.0, False
     linear = sights.linearize(wTc, twist)
     information, gradient, cost = _with(prior, linear, wTc, twist)
     for iteration in range(1, max_iterations + 1):
@@ -413,22 +407,23 @@ def descend(
         decrement = -float(step @ gradient)
         candidate = wTc @ poses.exp(step[:6])
         speed = twist + step[6:] if len(step) > 6 else twist
+        if damping == 0 and not sharp and decrement < (_ROUGH if rough else _CONVERGED):
+            # So short a step changes nothing but the gradient.
+            left = linear.gradient + linear.information @ step
+            return Descent(candidate, speed, replace(linear, gradient=left), iteration)
         near = damping == 0 and decrement < _NEAR
-        if near and rough:
-            return Descent(candidate, speed, linear, iteration)
-        done = near and decrement < _CONVERGED
-        trial = sights.linearize(candidate, speed, linear, move=near, sharp=near and not done)
+        # Every other: the last step's information is to be that of the reweighted sights.
+        sharp = near and not sharp
+        trial = sights.linearize(candidate, speed, linear, move=near, sharp=sharp)
         model = _with(prior, trial, candidate, speed)
         if not near and not model[2] <= cost * (1 + 1e-12):
             damping = max(10 * damping, 1e-4)
             if damping > 1e8:
                 return Descent(wTc, twist, linear, iteration, "diverged")
             continue
-        damping = damping / 10 if damping > 1e-6 else 0.0
+        damping = damping / 100 if damping > 1e-4 else 0.0
         wTc, twist, linear = candidate, speed, trial
         information, gradient, cost = model
-        if done:
-            return Descent(wTc, twist, linear, iteration)
     reason = f"not converged in {max_iterations} iterations"
     return Descent(wTc, twist, linear, max_iterations, reason)
 
