@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +62,7 @@ class Localizer:
         self._seen: npt.NDArray[np.intp] | None = None
         self._last_frame_ns: int | None = None
         self._last_search_ns: int | None = None
+        self._idle_since_s = 0.0
 
     @property
     def state(self) -> State:
@@ -115,9 +117,11 @@ class Localizer:
         attempt.taken = self._conditions(image, exposure_s)
         attempt.watch.lap("sharpness")
         if unhurried:
-            return self._describe(attempt, image)
-        estimate = self._follow(attempt, image)
-        self._recent.append((time_ns, image))
+            estimate = self._describe(attempt, image)
+        else:
+            estimate = self._follow(attempt, image)
+            self._recent.append((time_ns, image))
+        self._idle_since_s = perf_counter()
         return estimate
 
     def process_features(self, time_ns: int, features: Features, index: int = 0) -> PoseEstimate:
@@ -148,10 +152,16 @@ class Localizer:
         return publish(attempt, state, reason, self.settings)
 
     def _unhurried(self, time_ns: int) -> bool:
-        """Whether there is time for a frame's own features: no other frame came just before."""
+        """Whether there is time for a frame's own features.
+
+        Where nothing may wait that is idle time before the frame came: frames that are far apart
+        because others were dropped are no leisure.
+        """
         last, tracking = self._last_frame_ns, self.settings.tracking
         if not tracking.enabled or last is None:
             return True
+        if tracking.features_lag_frames == 0:
+            return perf_counter() - self._idle_since_s >= tracking.describe_gap_s
         return time_ns - last >= tracking.describe_gap_s * 1e9
 
     # Frames that are described themselves

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 
 from pi_firmware.wire import config
@@ -204,7 +204,7 @@ class TrackingSettings:
         0.6, "and one of which a smaller share of points is found again", low=0, high=1
     )
     describe_gap_s: float = config.key(
-        0.12, "a frame this long after the one before is described itself: there is time",
+        0.12, "a frame that comes this long after the one before is described itself: there is time",
         unit="s", low=0, high=1000,
     )  # fmt: skip
     features_lag_frames: int = config.key(
@@ -360,3 +360,8 @@ def load_preset(name: str) -> LocalizerSettings:
     file = resources.files("ground_station.localization") / "presets" / f"{name}.toml"
     with resources.as_file(file) as path:
         return config.load(path, LocalizerSettings)
+
+
+def for_live(settings: LocalizerSettings) -> LocalizerSettings:
+    """The same where frames come at their own pace: no frame waits for a keyframe's features."""
+    return replace(settings, tracking=replace(settings.tracking, features_lag_frames=0))

@@ -112,9 +112,7 @@ def run(
             continue
         if not result.frames:
             on_start(frame.time_ns)
-        estimate = localizer.process(
-            frame.time_ns, frame.image, frame.sequence, frame.exposure_s
-        )
+        estimate = localizer.process(frame.time_ns, frame.image, frame.sequence, frame.exposure_s)
         live = LiveFrame(frame.sequence, frame.clock_ns, frame.arrival_ns, time.time_ns(), estimate)
         result.frames.append(live)
         if keep_picture(frame):

@@ -15,7 +15,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization import results
 from ground_station.localization.localizer import Localizer
-from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.settings import LocalizerSettings, for_live
 from ground_station.mapping import store
 from ground_station.progress import Progress
 from ground_station.recording.flight import camera_of, trajectory_of
@@ -41,13 +41,24 @@ class ReplaySettings:
     start_s: float = 0.0
     duration_s: float = 0.0
     """0: to the end."""
-    gate_min_entropy_bits: float = 7.0
-    """The thesis's threshold; the payload's own default is lower."""
+    gate_min_entropy_bits: float | None = None
+    """None: the payload's own default."""
     bitrate_kbps: int = 2000
     queue_frames: int = 4
     """Frames that may wait for the localizer before the oldest is dropped and counted."""
     pictures: int = 4
     """How many frames are kept with their matches, for the report."""
+
+
+_THESIS = {"rate_hz": 5.0, "init": "truth", "gate_min_entropy_bits": 7.0}
+"""What the thesis's localizer can follow on two cores, a start that it needs, and its threshold."""
+
+
+def settings_for(preset: str, recording: Path, **options: Any) -> ReplaySettings:
+    """The settings of a replay; of `options` that are None the preset decides."""
+    usual: dict[str, Any] = _THESIS if preset == "thesis" else {"rate_hz": 30.0, "init": "none"}
+    given = {name: value for name, value in options.items() if value is not None}
+    return ReplaySettings(recording=recording, preset=preset, **(usual | given))
 
 
 @dataclass(frozen=True)
@@ -108,6 +119,7 @@ def replay(
         raise InputError(f"{settings.recording}: it carries no camera calibration")
     features = localizer_settings.features
     extract = extractors.create(features.extractor, features.max_features)
+    localizer_settings = for_live(localizer_settings)
     localizer = Localizer(map_, camera, extract, localizer_settings)
     truth = None
     if TRUTH_TOPIC in reader.topics():
@@ -181,6 +193,7 @@ def _payload_config(
     if settings.duration_s:
         options.append(f"duration_s={settings.duration_s:g}")
     path = settings.recording.resolve()
+    bits = settings.gate_min_entropy_bits
     return {
         "payload_id": PAYLOAD_ID,
         "camera": {
@@ -188,7 +201,7 @@ def _payload_config(
             "width_px": camera.width_px,
             "height_px": camera.height_px,
         },
-        "gate": {"min_entropy_bits": settings.gate_min_entropy_bits},
+        "gate": {} if bits is None else {"min_entropy_bits": bits},
         "encoder": {"bitrate_kbps": settings.bitrate_kbps},
         "link": {"port": port},
         "telemetry": {"connect": list(endpoints)},

@@ -28,22 +28,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="results.json and report.html go here (default: out/replay)",
     )  # fmt: skip
     parser.add_argument(
-        "--preset", choices=("default", "thesis"), default="thesis", help="default: thesis"
+        "--preset", choices=("default", "thesis"), default="default", help="default: default"
     )
     parser.add_argument(
-        "--init", default="truth", metavar="truth|none|TUM.txt",
-        help="the first frame's pose: the recording's true one (default), none, or of a file",
+        "--init", metavar="truth|none|TUM.txt",
+        help="the first frame's pose: found from the map alone (none, the default), the "
+        "recording's true one (truth, which the preset thesis needs and gets), or of a file",
     )  # fmt: skip
     parser.add_argument(
-        "--rate-hz", type=float, default=5.0, metavar="R", help="frames captured a second (5)"
-    )
+        "--rate-hz", type=float, metavar="R",
+        help="frames captured a second (30; with the preset thesis 5)",
+    )  # fmt: skip
     parser.add_argument("--start-s", type=float, default=0.0, metavar="S", help="skip this much")
     parser.add_argument(
         "--duration-s", type=float, default=0.0, metavar="S", help="stop after (0: at the end)"
     )
     parser.add_argument(
-        "--min-entropy-bits", type=float, default=7.0, metavar="B", help="the payload's gate (7.0)"
-    )
+        "--min-entropy-bits", type=float, metavar="B",
+        help="the payload's gate (its own default; with the preset thesis 7.0)",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write results here, too")
 
 
@@ -55,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.demo:
         if args.recording or args.map:
             raise InputError("--demo brings its own recording and map")
-        return demo.run(args.out, preset=args.preset, init=args.init)
+        return demo.run(args.out, preset=args.preset, init=args.init, rate_hz=args.rate_hz)
     if args.recording is None or args.map is None:
         raise InputError("a RECORDING and --map are needed (or --demo)")
     return _replay(args)
@@ -67,17 +70,17 @@ def _replay(args: argparse.Namespace) -> int:
     from ground_station.localization.settings import load_preset
     from ground_station.mapping import store
     from ground_station.service import flight_report
-    from ground_station.service.replay import ReplaySettings, replay
+    from ground_station.service.replay import replay, settings_for
     from pi_firmware.wire.recording import RecordingReader
 
-    settings = ReplaySettings(
-        recording=args.recording,
+    settings = settings_for(
+        args.preset,
+        args.recording,
         rate_hz=args.rate_hz,
-        preset=args.preset,
         init=args.init,
+        gate_min_entropy_bits=args.min_entropy_bits,
         start_s=args.start_s,
         duration_s=args.duration_s,
-        gate_min_entropy_bits=args.min_entropy_bits,
     )
     simulation = RecordingReader(args.recording).metadata_table("simulation")
     map_ = store.load(args.map)

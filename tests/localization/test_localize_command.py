@@ -108,6 +108,26 @@ def test_a_folder_becomes_a_trajectory_and_figures(flight, tmp_path, preset):
     assert figures["preset"] == preset and figures["frame"] == "world"
 
 
+def test_what_was_seen_is_written_for_the_maps_refinement(flight, tmp_path):
+    from ground_station.mapping import store
+    from ground_station.mapping.observations import landmarks_sha256, load_observations
+
+    out = tmp_path / "seen.safetensors"
+    more = ["--init", str(flight / "truth.txt"), "--observations", str(out)]
+    assert command.run(_args(flight, tmp_path, *more)) == 0
+    seen, map_ = load_observations(out), store.load(flight / "map")
+    assert seen.name == "frames" and seen.map == "wall" and seen.camera == map_.info.camera
+    assert seen.landmarks_sha256 == landmarks_sha256(map_.landmarks)
+    estimate = read_tum(tmp_path / "est.txt")
+    assert np.isin(seen.time_ns, estimate.time_ns).all() and len(seen) >= 4
+    for k in range(len(seen)):
+        rows = slice(seen.offset[k], seen.offset[k + 1])
+        points = map_.landmarks.position_m[np.searchsorted(map_.landmarks.id, seen.landmark[rows])]
+        pixel = seen.camera.project(poses.transform(poses.inverse(seen.wTc[k]), points))
+        assert len(points) > 20
+        assert np.median(np.linalg.norm(pixel - seen.pixel_px[rows], axis=1)) < 1.0
+
+
 def test_without_a_first_pose_the_default_finds_it_in_the_map(flight, tmp_path):
     assert command.run(_args(flight, tmp_path, "--range", "1:4")) == 0
     estimate = read_tum(tmp_path / "est.txt")
@@ -134,7 +154,7 @@ def test_an_interrupted_run_writes_what_was_finished(flight, tmp_path, monkeypat
 
     process = Localizer.process
 
-    def interrupted(self, time_ns, image, index=0):
+    def interrupted(self, time_ns, image, index=0, exposure_s=None):
         if index == 3:
             raise KeyboardInterrupt
         return process(self, time_ns, image, index)
