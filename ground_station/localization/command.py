@@ -160,7 +160,9 @@ def _process(
                 if apart_s > _FAR_INIT_S:
                     _say(f"the first pose was taken {apart_s:.2f} s apart from the first frame")
                 localizer.set_initial_pose(initial.wTc[nearest], frame.time_ns)
-            estimates.append(localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s))
+            estimates.append(
+                localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
+            )
             progress.step()
 
 

@@ -204,7 +204,8 @@ class TrackingSettings:
         0.6, "and one of which a smaller share of points is found again", low=0, high=1
     )
     describe_gap_s: float = config.key(
-        0.12, "a frame that comes this long after the one before is described itself: there is time",
+        0.12,
+        "a frame that comes this long after the one before is described itself: there is time",
         unit="s", low=0, high=1000,
     )  # fmt: skip
     features_lag_frames: int = config.key(
