@@ -18,8 +18,8 @@ from ground_station.localization.settings import MotionSettings
 
 Array = npt.NDArray[np.float64]
 
-_SHORTEST_S = 1e-4
-"""No two frames are nearer: a shorter step would give a noise that can't be inverted."""
+_SHORTEST_S = 2e-3
+"""Frames that are nearer count as this far apart: no noise becomes too small for a graph."""
 
 _ZERO, _ONE = np.zeros((6, 6)), np.eye(6)
 _POSE, _TWIST = np.arange(6), np.arange(6, 12)

@@ -115,7 +115,8 @@ class FixedLagSmoother:
         except (_Refused, RuntimeError, np.linalg.LinAlgError, ValueError) as error:
             # GTSAM raises RuntimeError for a singular system, and its graph is then unusable.
             self.failures += 1
-            self.failure = str(error).splitlines()[0] if str(error) else type(error).__name__
+            lines = (line.strip() for line in str(error).splitlines())
+            self.failure = next(filter(None, lines), type(error).__name__)
             if not _finite(state):
                 state = self._advance(latest, time_ns, self.density).state
             self._drain()
@@ -221,9 +222,10 @@ class FixedLagSmoother:
     def _estimate(self, node: _Node) -> Kinematics:
         step = self._graph.calculateEstimateVector(node.key)
         covariance = self._graph.marginalCovariance(node.key)
-        if not (np.isfinite(step).all() and (np.diag(covariance) > 0).all()):
+        state = process.moved(node.anchor, step, (covariance + covariance.T) / 2)
+        if not (_finite(state) and (np.diag(covariance) > 0).all()):
             raise _Refused("the graph's estimate is not finite")
-        return process.moved(node.anchor, step, (covariance + covariance.T) / 2)
+        return state
 
     def _leave(self, time_ns: int) -> None:
         """Reads the states that the coming frame pushes out: their lag is over."""
