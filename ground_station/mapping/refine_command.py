@@ -63,7 +63,7 @@ def run(args: argparse.Namespace, print_table: Callable[[dict[str, Any]], None])
     if not report["rolling_shutter"]["undone"]:
         print(
             "note: the keyframes' rolling shutter is still in the map: "
-            "they are too far apart in time, or fit no better without it",
+            "they are too far apart in time, or fit worse without it",
             file=sys.stderr,
         )
     if args.json:
