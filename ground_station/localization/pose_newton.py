@@ -86,7 +86,8 @@ class Linear:
     `information` (D, D), `gradient` (D,) for steps of pose and twist (D = 12) or of the pose alone
     (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
     image (uu, uv, vv), and `reach` (2, 3, N) what moves them: their covariance by each coordinate.
-    `excess` (N,) is the variance, px², that reweighting adds beyond Huber's reach.
+    `rows` (2, 3, N) are ∂pixel/∂landmark once these are moved along. `excess` (N,) is the variance,
+    px², that reweighting adds beyond Huber's reach.
     """
 
     information: Array
@@ -95,6 +96,7 @@ class Linear:
     moved_m: Array
     spread_px2: Array
     reach: Array
+    rows: Array | None
     excess: Array
 
 
@@ -169,19 +171,20 @@ class Reprojection:
         """The cost at a pose (4, 4) and twist (6,).
 
         After the `last` one, landmarks' covariances in the image stay what they were there, so that
-        both costs compare; with `move` they are linearised anew, where `last` moved the landmarks.
+        both costs compare; with `move` they are linearised anew where `last` moved the landmarks.
         With `sharp` the information is the cost's second derivative, which is less than that of the
         reweighted sights beyond Huber's reach and makes for longer steps.
         """
         moved = last.moved_m if move and last is not None else None
         view = self.view(wTc, twist, moved)
         r = view.residual_px
-        if last is None or move:
+        rows = None
+        if last is None or (move and last.rows is None):
             rows, reach, spread = self.reach(view)
-            if moved is not None:
-                r = r - np.einsum("ain,in->an", rows, moved)
-        else:
-            reach, spread = last.reach, last.spread_px2
+        else:  # so near another step hardly turns them
+            rows, reach, spread = last.rows, last.reach, last.spread_px2
+        if moved is not None and rows is not None:
+            r = r - np.einsum("ain,in->an", rows, moved)
         y, excess, factor = self._whiten(r, spread, None if last is None else last.excess, sharp)
         if not view.all_front:
             y, factor = y * view.front, factor * view.front
@@ -194,9 +197,11 @@ class Reprojection:
         J[:, 0] += factor[1] * J[:, 1]
         J[:, 1] *= factor[2]
         flat = J.reshape(len(J), -1)
-        moved = reach[0] * y[0]
-        moved += reach[1] * y[1]
-        return Linear(flat @ flat.T, gradient, cost, -moved, spread, reach, excess)
+        best = reach[0] * y[0]
+        best += reach[1] * y[1]
+        return Linear(
+            flat @ flat.T, gradient, cost, -best, spread, reach, rows if move else None, excess
+        )
 
     def _whiten(
         self, r: Array, spread: Array, excess: Array | None, sharp: bool
@@ -397,7 +402,8 @@ def descend(
             return Descent(wTc, twist, linear, iteration, "singular")
         scale = 1.0 / np.sqrt(scale)
         scaled = information * scale * scale[:, None]
-        scaled.flat[:: len(scaled) + 1] += damping
+        if damping:
+            scaled.flat[:: len(scaled) + 1] += damping
         try:
             step = -scale * np.linalg.solve(scaled, scale * gradient)
         except np.linalg.LinAlgError:
