@@ -393,7 +393,8 @@ def descend(
     near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends before
     that, and its `linear` is of the step before.
     """
-    damping, sharp = 0.0, False
+    damping, before = 0.0, math.inf
+    sharp, sharpen = False, True
     linear = sights.linearize(wTc, twist)
     information, gradient, cost = _with(prior, linear, wTc, twist)
     for iteration in range(1, max_iterations + 1):
@@ -418,8 +419,11 @@ def descend(
             left = linear.gradient + linear.information @ step
             return Descent(candidate, speed, replace(linear, gradient=left), iteration)
         near = damping == 0 and decrement < _NEAR
-        # Every other: the last step's information is to be that of the reweighted sights.
-        sharp = near and not sharp
+        # Every other one, as the last's information is to be that of the reweighted sights; and no
+        # more once it has led astray, as it can where few sights are within Huber's reach.
+        sharpen &= not sharp or decrement <= before
+        before = decrement
+        sharp = near and sharpen and not sharp
         trial = sights.linearize(candidate, speed, linear, move=near, sharp=sharp)
         model = _with(prior, trial, candidate, speed)
         if not near and not model[2] <= cost * (1 + 1e-12):
