@@ -61,7 +61,7 @@ def load_flight(spec: str, limit: int | None = None, frame_range: str = "") -> F
             break
     is_recording = path.endswith(".mcap")
     truth = trajectory_of(path) if is_recording else None
-    about = Path(path).name
+    about = "/".join(Path(path).parts[-2:])
     if is_recording:
         made = RecordingReader(path).metadata_table("simulation")
         if made:
