@@ -331,3 +331,13 @@ def test_a_prediction_that_cannot_be_used_is_named():
     assert np.allclose(state.state.wTc, predicted.wTc, atol=1e-6)
     stopped = dataclasses.replace(SETTINGS, max_iterations=1)
     assert "not converged" in solve_rolling(predicted, sights, CAMERA, stopped).reason
+
+
+def test_no_cycle_where_half_of_few_sights_are_wrong():
+    """Newton's steps on Huber's loss can go round in circles there."""
+    sigma = np.repeat([0.1, 0.25, 0.3, 0.8], 3)
+    for seed in range(670, 690):  # 678 did
+        rng = np.random.default_rng(seed)
+        predicted, sights, _ = _scene(rng, count=30, landmark_m=0.005, outliers=0.5, sigma=sigma)
+        solution = solve_rolling(predicted, sights, CAMERA, SETTINGS)
+        assert "converged" not in solution.reason, seed
