@@ -28,7 +28,10 @@ def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fracti
 
 
 class MotionModel:
-    """The last two solved poses and what they predict."""
+    """The last two solved poses and what they predict, without covariance, as in the thesis.
+
+    The setting `blimp` needs velocities and goes on at constant velocity here: see `process`.
+    """
 
     def __init__(self, settings: MotionSettings) -> None:
         self.settings = settings

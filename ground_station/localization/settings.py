@@ -49,11 +49,11 @@ class MotionSettings:
     )
     rotation_density_rad2_s3: float = config.key(
         1e-4, "spectral density of a quiet flight's angular acceleration, each axis",
-        unit="rad2/s3", low=1e-9, high=1e3,
+        unit="rad2/s3", low=1e-5, high=1e3,
     )  # fmt: skip
     translation_density_m2_s3: float = config.key(
         1e-3, "spectral density of a quiet flight's acceleration, each axis",
-        unit="m2/s3", low=1e-9, high=1e3,
+        unit="m2/s3", low=1e-5, high=1e3,
     )  # fmt: skip
     density_limit: float = config.key(
         1e5, "innovations raise the densities up to this often; 1: they stay", low=1, high=1e9

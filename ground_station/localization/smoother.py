@@ -145,7 +145,9 @@ class FixedLagSmoother:
     def _clear(self) -> None:
         parameters = gtsam.ISAM2Params()
         # All factors are linear where they stay: nothing is to be made linear again, and all of
-        # the lag is to hear of each frame.
+        # the lag is to hear of each frame. Cholesky takes two thirds of QR's time; it bears a start
+        # that is 10⁷ times as uncertain as the process makes a step (a reason for the settings'
+        # limits), QR would bear more.
         parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         parameters.setRelinearizeThreshold(1e12)
         parameters.relinearizeSkip = 1_000_000
@@ -260,6 +262,11 @@ class _Adaptation:
     deviation e of a solution from its prediction has the covariance P − P⁺ when the filter is right
     (P predicted, P⁺ with the sights), so y = P⁻¹e has S = P⁻¹ − P⁻¹P⁺P⁻¹. Each density's noise Qᵢ
     weighs the directions in which it tells: yᵀQᵢy is expected to be tr(Qᵢ S).
+
+    No one value serves: simulated blimps (plans loop, small-circle and mapping, seeds 1 to 10) have
+    at most 4e-5 rad²/s³ and 5e-4 m²/s³ over a frame, 1e-3 and 8e-3 over 0.5 s; a runner has 3.5 and
+    3 over a frame, 0.7 and 1.2 over 0.5 s. The settings' densities are the floor, set between the
+    blimps' two.
     """
 
     _MOST = 30.0  # one frame's ratio: an outlier shall not open the filter at once

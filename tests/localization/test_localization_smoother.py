@@ -327,6 +327,18 @@ def test_frames_a_nanosecond_apart_do_no_harm():
     assert np.abs(poses.log(poses.inverse(truth) @ state.wTc)).max() < 0.03
 
 
+@pytest.mark.parametrize("density", [1e-5, 1e3])
+@pytest.mark.parametrize("model", ["static", "constant_velocity", "blimp"])
+def test_the_settings_limits_and_all_models_keep_the_graph_whole(model, density):
+    settings = replace(
+        STEADY, model=model, rotation_density_rad2_s3=density, translation_density_m2_s3=density
+    )
+    smoother = FixedLagSmoother(settings)
+    states = [state for state, _ in through(smoother, drawn(12, 50))]
+    assert smoother.failures == 0
+    assert all(np.isfinite(state.covariance).all() for state in states)
+
+
 def flown(plan: str, seed: int, settings: MotionSettings) -> tuple[list[float], FixedLagSmoother]:
     """Predictions' squared Mahalanobis distances from a simulated motion, 1/30 s to 0.5 s ahead."""
     flight = prepare_flight(
