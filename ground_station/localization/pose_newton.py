@@ -421,7 +421,7 @@ def descend(
         near = damping == 0 and decrement < _NEAR
         # Every other one, as the last's information is to be that of the reweighted sights; and no
         # more once it has led astray, as it can where few sights are within Huber's reach.
-        sharpen &= not sharp or decrement <= before
+        sharpen &= decrement <= before
         before = decrement
         sharp = near and sharpen and not sharp
         trial = sights.linearize(candidate, speed, linear, move=near, sharp=sharp)
