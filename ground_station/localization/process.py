@@ -51,11 +51,6 @@ class Density:
         return np.array([self.rotation] * 3 + [self.translation] * 3)
 
 
-def exp(xi: Array) -> Array:
-    """`poses.exp` of one tangent vector (6,), as GTSAM computes it: faster."""
-    return np.asarray(gtsam.Pose3.Expmap(xi).matrix())
-
-
 def adjoint(aTb: Array) -> Array:
     """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
     return np.asarray(gtsam.Pose3(aTb).AdjointMap())
@@ -73,13 +68,12 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 def difference(a: Kinematics, b: Kinematics) -> Array:
     """The tangent step (12,) from state a to state b."""
-    aTb = gtsam.Pose3(poses.inverse(a.wTc) @ b.wTc)
-    return np.concatenate([gtsam.Pose3.Logmap(aTb), b.twist - a.twist])
+    return np.concatenate([poses.log(poses.inverse(a.wTc) @ b.wTc), b.twist - a.twist])
 
 
 def moved(state: Kinematics, step: Array, covariance: Array) -> Kinematics:
     """The state a tangent step (12,) away, with this covariance (12, 12)."""
-    wTc = _rotation_again(state.wTc @ exp(step[:6]))
+    wTc = _rotation_again(state.wTc @ poses.exp(step[:6]))
     return Kinematics(state.time_ns, wTc, state.twist + step[6:], covariance)
 
 
@@ -139,13 +133,13 @@ def _constant_velocity(
     """White noise on acceleration: Anderson and Barfoot, IROS 2015, in right tangents."""
     step = state.twist * dt_s
     transition = _transition(step, dt_s * _ONE)
-    return state.wTc @ exp(step), state.twist, transition, _integrated(density, dt_s)
+    return state.wTc @ poses.exp(step), state.twist, transition, _integrated(density, dt_s)
 
 
 def _transition(step: Array, by_twist: Array) -> Array:
     """(12, 12) of wTc·exp(step) when a twist's step δ changes the tangent `step` by by_twist·δ."""
     result = np.eye(12)
-    result[:6, :6] = adjoint(exp(-step))
+    result[:6, :6] = adjoint(poses.exp(-step))
     result[:6, 6:] = right_jacobian(step) @ by_twist
     return result
 
@@ -203,7 +197,7 @@ def _blimp(
     noise = _swing_noise(settings, density, dt_s, basis)
     there, back = np.kron(np.eye(2), to_point), np.kron(np.eye(2), to_camera)
     point = poses.inverse(arm)
-    wTc = state.wTc @ point @ exp(step) @ arm
+    wTc = state.wTc @ point @ poses.exp(step) @ arm
     return wTc, to_camera @ moved_twist, back @ transition @ there, back @ noise @ back.T
 
 
