@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.localization.row_motion import RowMotion, adjoint
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -62,21 +63,6 @@ class Prior:
         J[:6, :6] += 0.5 * ad + ad @ ad / 12
         weighted = J.T @ self.information
         return weighted @ J, weighted @ step, 0.5 * float(step @ self.information @ step)
-
-
-def adjoint(xi: Array) -> Array:
-    """The 6×6 matrix of the Lie bracket [xi, ·] of se(3), rotation first; Barfoot, eq. 7.32."""
-    a, b, c, x, y, z = xi.tolist()
-    return np.array(
-        [
-            [0, -c, b, 0, 0, 0],
-            [c, 0, -a, 0, 0, 0],
-            [-b, a, 0, 0, 0, 0],
-            [0, -z, y, 0, -c, b],
-            [z, 0, -x, c, 0, -a],
-            [-y, x, 0, -b, a, 0],
-        ]
-    )
 
 
 @dataclass(frozen=True)
@@ -136,7 +122,7 @@ class Reprojection:
         """What a pose (4, 4) and twist (6,) have the camera see, landmarks moved by `moved_m`."""
         world = self.points_m if moved_m is None else self.points_m + moved_m
         points = wTc[:3, :3].T @ (world - wTc[:3, 3:])
-        motion = None if self.row_s is None else _Motion(self.row_s, twist)
+        motion = None if self.row_s is None else RowMotion(self.row_s, twist)
         if motion is not None:
             points = motion.forward(points)
         z = points[2]
@@ -264,7 +250,7 @@ class View:
 
     camera: Camera
     wRc: Array
-    motion: _Motion | None
+    motion: RowMotion | None
     uv: Array
     inverse_z: Array
     residual_px: Array
@@ -302,70 +288,6 @@ class View:
         np.multiply(-fy, self.inverse_z, out=J[4, 1])
         np.multiply(-J[4, 1], v, out=J[5, 1])
         return J if self.motion is None else self.motion.jacobian(J)
-
-
-class _Motion:
-    """From the camera at the frame's time to the camera at each of N rows' times."""
-
-    def __init__(self, row_s: Array, twist: Array) -> None:
-        self.row_s, self.ad = row_s, adjoint(twist)
-        self.hat = self.ad[:3, :3]
-        self.square = self.hat @ self.hat
-        rate = math.sqrt(float(twist[:3] @ twist[:3]))
-        # Rodrigues' formula of exp(−twist·row_s), with the row's time in its coefficients.
-        coefficients = np.empty((3, len(row_s)))
-        if rate > 1e-6:
-            angle = rate * row_s
-            np.divide(np.sin(angle), -rate, out=coefficients[0])
-            half = np.sin(0.5 * angle)
-            np.multiply(2 / rate**2, half * half, out=coefficients[1])
-            np.add(row_s, coefficients[0], out=coefficients[2])
-            coefficients[2] *= -1 / rate**2
-        else:
-            np.negative(row_s, out=coefficients[0])
-            np.multiply(0.5 * row_s, row_s, out=coefficients[1])
-            np.multiply(-row_s / 3, coefficients[1], out=coefficients[2])
-        self.first, self.second = coefficients[0], coefficients[1]
-        drift = np.empty((3, 3))
-        drift[:, 0] = twist[3:]
-        np.matmul(self.hat, drift[:, 0], out=drift[:, 1])
-        np.matmul(self.square, drift[:, 0], out=drift[:, 2])
-        self.drift = drift @ coefficients
-
-    def forward(self, points: Array) -> Array:
-        """Points (3, N) of the frame's camera in those of the rows: exp(−twist·row_s)·p."""
-        result = self.hat @ points
-        result *= self.first
-        turned = self.square @ points
-        turned *= self.second
-        result += turned
-        result += points
-        result += self.drift
-        return result
-
-    def turned_back(self, directions: Array) -> Array:
-        """Directions (A, 3, N) of the rows' cameras in the frame's."""
-        result = self.square @ directions
-        result *= self.second
-        turned = self.hat @ directions
-        turned *= self.first
-        result -= turned
-        result += directions
-        return result
-
-    def jacobian(self, J: Array) -> Array:
-        """Columns (6, 2, N) for steps of the rows' poses to (12, 2, N) for pose and twist.
-
-        Right tangents, to first order in the motion between the frame's time and the row's.
-        """
-        bracket = (self.ad.T @ J.reshape(6, -1)).reshape(J.shape)
-        bracket *= self.row_s
-        result = np.empty((12, *J.shape[1:]))
-        np.subtract(J, bracket, out=result[:6])
-        bracket *= -0.5
-        bracket += J
-        np.multiply(bracket, self.row_s, out=result[6:])
-        return result
 
 
 @dataclass(frozen=True)
