@@ -38,6 +38,9 @@ _DATUM_ROUNDS = 20
 _MOST_LOST = 0.5
 """A frame that loses a larger share of its sights to the gate was not where it said."""
 
+_FLIGHT_GATE = 3.5
+"""Deviations of a pixel coordinate above which a flight's sight goes: no geometry verified it."""
+
 _LEAST_ANGLE_DEG = 0.05
 """Sights nearer to parallel than this give no depth, and no covariance that could be inverted."""
 
@@ -67,7 +70,7 @@ def adjust(
         )
 
     graph = solve(_without_hopeless(graph))
-    graph = graphs.drop(graph, graph.error_px() > sfm.max_error_px)
+    graph = graphs.drop(graph, graph.error_px() > _gate_px(graph, sfm.max_error_px))
     least = np.maximum((1 - _MOST_LOST) * sights_before, settings.refine.min_sights)
     graph = graphs.drop_images(graph, (graph.group > 0) & (_sights(graph) < least))
     graph = _without_hopeless(graph)
@@ -76,6 +79,13 @@ def adjust(
     weak_before = weak_before[np.isin(map_.landmarks.id, graph.model.point_id)]
     graph = _without_hopeless(graphs.drop_points(graph, weak & ~weak_before))
     return in_datum(graph, map_)
+
+
+def _gate_px(graph: Graph, max_error_px: float) -> F64:
+    """The largest error of each sight (O,): the build's or, of a flight, a few deviations."""
+    gate = np.minimum(_FLIGHT_GATE * graphs.spread_px(graph), max_error_px)
+    gate[0] = max_error_px
+    return np.asarray(gate[graph.group_of_sights()])
 
 
 def _sights(graph: Graph) -> npt.NDArray[np.int64]:
