@@ -25,8 +25,10 @@ _PER_LOG_ODDS = 0.06
 """How much the limit grows with the logarithm of its odds: right matches over wrong ones."""
 _MARGIN = 0.05
 """Pairs this near to their limit tell whether all limits should move."""
-_RIGHT_SHARE = 0.35
-"""Of the pairs near their limits: with a larger share of inliers the limits grow."""
+_RIGHT_SHARE = 0.4
+"""Of the pairs near their limits: with a larger share of right ones the limits grow."""
+RIGHT_PX = 3.0
+"""A pair of a smaller residual is right: a solver's inliers are many by chance among the near."""
 _STEP, _MOST = 0.002, 0.02
 """A pair's and a frame's weight in moving all limits."""
 _LOWEST = 0.3
@@ -37,9 +39,9 @@ class DescriptorThresholds:
     """One limit of L2 descriptor distance for each of M landmarks.
 
     limit = common + 0.25·RMS + 0.06·log odds, within 0.3 and `max_descriptor_distance`. The RMS of
-    a landmark's distances begins with its `spread` in the map and goes on with its inliers; its
-    odds are those of being matched rightly. The common part follows light: it grows while enough
-    of the pairs at the limits are inliers and falls when they are not.
+    a landmark's distances begins with its `spread` in the map and goes on with its right pairs; its
+    odds are right pairs over wrong ones. The common part follows light: it grows while enough of
+    the pairs at the limits are right and falls when they are not.
     """
 
     def __init__(self, landmarks: Landmarks, settings: AssociationSettings) -> None:
@@ -61,22 +63,22 @@ class DescriptorThresholds:
         lowest = min(_LOWEST, self._highest)
         return np.asarray(np.clip(limit, lowest, self._highest), np.float32)
 
-    def learn(self, index: Indices, distance: F32, inlier: Flags) -> None:
-        """Takes a solved frame's pairs: landmarks (N,), each once, distances (N,), inliers (N,).
+    def learn(self, index: Indices, distance: F32, right: Flags) -> None:
+        """Takes a solved frame's pairs: landmarks (N,), each once, distances (N,), right ones (N,).
 
         What is not a number is left out.
         """
         known = np.isfinite(distance)
-        index, distance, inlier = index[known], distance[known], inlier[known]
-        marginal = inlier[distance > self.limits(index) - _MARGIN]
+        index, distance, right = index[known], distance[known], right[known]
+        marginal = right[distance > self.limits(index) - _MARGIN]
         step = _STEP * float(marginal.sum() - _RIGHT_SHARE * len(marginal))
         lowest = _LOWEST - self._highest
         self.common += float(np.clip(step, -_MOST, _MOST))
         self.common = float(np.clip(self.common, lowest, self._highest))
         kept = np.float32(1 - 1 / _MEMORY)
         for total, new in (
-            (self._square, np.where(inlier, distance**2, 0)),
-            (self._right, inlier),
-            (self._wrong, ~inlier),
+            (self._square, np.where(right, distance**2, 0)),
+            (self._right, right),
+            (self._wrong, ~right),
         ):
             total[index] = kept * total[index] + new
