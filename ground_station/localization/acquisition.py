@@ -21,7 +21,7 @@ from ground_station.localization.matching import (
 )
 from ground_station.localization.relocalization import Relocalizer
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.thresholds import DescriptorThresholds
+from ground_station.localization.thresholds import RIGHT_PX, DescriptorThresholds
 from ground_station.localization.tracking import Keyframe, spread_out
 from ground_station.mapping.store import Map
 
@@ -47,7 +47,8 @@ class Located:
         """What a solved frame says about its landmarks' descriptors."""
         if thresholds is not None and self.solution.state is not None:
             matches = self.matches
-            thresholds.learn(matches.landmark, matches.distance, self.observations.inlier)
+            right = self.observations.residual_px < RIGHT_PX
+            thresholds.learn(matches.landmark, matches.distance, right)
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,7 @@ class Acquirer:
             closer_px = self._settings.association.refine_radius_px
             radius_px = closer_px or self._settings.association.radius_px
             found = self._locate_once(seen, state, state, estimator, radius_px, watch)
+            found = self._verified(seen, found, watch)
             return self._acquired(time_ns, image, found, watch, searched=False)
 
         return job
@@ -163,12 +165,24 @@ class Acquirer:
             seen = self.describe(image, taken)
             found = _nothing(seen, "no prediction")
             if expected is not None:
-                found = self.locate(seen, expected, make(), watch)
+                found = self._verified(seen, self.locate(seen, expected, make(), watch), watch)
             if found.solution.state is None and self._relocalizer is not None:
                 found = self.relocalize(seen, time_ns, make, watch)
             return self._acquired(time_ns, image, found, watch, searched=True)
 
         return job
+
+    def _verified(self, seen: Described, found: Located, watch: Stopwatch) -> Located:
+        """What was found, or nothing when the frame shows too little of what it should."""
+        state, least = found.solution.state, self._settings.tracking.min_significance
+        if state is None:
+            return found
+        sure = self.matcher.significance(seen, state.wTc)
+        watch.lap("verification")
+        if sure >= least:
+            return found
+        reason = f"only {sure:.1f} sigma more landmarks than by chance"
+        return _nothing(seen, reason)
 
     def _acquired(
         self, time_ns: int, image: Image, found: Located, watch: Stopwatch, *, searched: bool

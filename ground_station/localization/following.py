@@ -54,14 +54,15 @@ def follow(
     attempt.watch.lap("track")
     found = len(tracks.point)
     landmark = keyframe.landmark[tracks.point]
-    if found < settings.tracking.min_inliers:
+    least = max(settings.tracking.min_inliers, settings.tracking.min_found_share * tracks.sought)
+    if found < least:
         solution = no_solution(found, f"{found} points found again")
     else:
         sights = matcher.sights(
             tracks.pixel_px, landmark, settings.tracking.sigma_px, predicted, attempt.taken
         )
         solution = estimator.solve(predicted, sights, _tracked(settings))
-        solution = believed(solution, settings, settings.tracking.min_inliers)
+        solution = believed(solution, settings, int(np.ceil(least)))
     attempt.watch.lap("pose")
     way = np.linalg.norm(tracks.pixel_px - keyframe.pixel_px[tracks.point], axis=1)
     return Followed(

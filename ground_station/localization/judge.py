@@ -56,9 +56,9 @@ class Judge:
         """Whether the pose rests on a relocalization that no other features confirmed."""
         return self._doubtful_ns is not None
 
-    def relocalized(self, time_ns: int) -> None:
-        """A frame was found in the whole map: others with features of their own must agree."""
-        self._owe(self.settings.confirm_frames, "relocalized, to be confirmed")
+    def found_again(self, time_ns: int) -> None:
+        """A frame was searched and found: others with features of their own must agree."""
+        self._owe(self.settings.confirm_frames, "found again, to be confirmed")
         self._doubtful_ns = time_ns
 
     def _owe(self, frames: int, why: str) -> None:

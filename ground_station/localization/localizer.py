@@ -287,8 +287,7 @@ class Localizer:
         if not caught_up:
             return False
         self._estimator, self._keyframe = estimator, landed.keyframe
-        if landed.relocalized:
-            self._judge.relocalized(landed.time_ns)
+        self._judge.found_again(landed.time_ns)
         return landed.relocalized
 
     # What becomes of a frame
@@ -296,7 +295,7 @@ class Localizer:
     def _begin_again(self, estimator: Estimator, state: Kinematics) -> None:
         estimator.restart(state.time_ns, state.wTc, state.covariance[:6, :6])
         self._estimator, self._keyframe = estimator, None
-        self._judge.relocalized(state.time_ns)
+        self._judge.found_again(state.time_ns)
 
     def _solved(
         self,

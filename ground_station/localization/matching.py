@@ -17,6 +17,7 @@ from ground_station.localization.kinematics import Kinematics, Sights
 from ground_station.localization.projection import Lens, project
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import DescriptorThresholds
+from ground_station.localization.verification import Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.mapping.store import Map
 
@@ -129,6 +130,21 @@ class Matcher:
             pairs.distance[best],
             len(projected.landmark),
             len(pairs),
+        )
+
+    def significance(self, seen: Described, wTc: Array) -> float:
+        """By how many standard deviations a pose (4, 4) explains more landmarks than chance does.
+
+        Near a wrong pose features pair up as well, and agree with each other as far as they were
+        looked for. Landmarks shifted aside tell how many do so by chance.
+        """
+        among = self._index.near(wTc, self._lens, self.settings.projection)
+        witness = Witness(seen.features, seen.pinhole_px, self._lens)
+        support = witness.support(wTc, self.landmarks, among)
+        by_chance = support.expected * support.chance
+        return float(
+            (support.expected * support.share - by_chance)
+            / np.sqrt(by_chance * (1 - support.chance) + 1)
         )
 
     def sights(

@@ -192,6 +192,14 @@ class TrackingSettings:
     min_inliers: int = config.key(
         10, "a followed frame with fewer is not believed", low=6, high=1000
     )
+    min_significance: float = config.key(
+        7.0, "of a keyframe: standard deviations by which more landmarks are seen than by chance",
+        low=0, high=1000,
+    )  # fmt: skip
+    min_found_share: float = config.key(
+        0.1, "of a keyframe's points in view; a frame that shows fewer is not believed",
+        low=0, high=1,
+    )  # fmt: skip
     keyframe_min_points: int = config.key(20, "a keyframe with fewer is none", low=6, high=1000)
     keyframe_parallax_px: float = config.key(
         100.0, "a keyframe whose points moved by this in the median is replaced", unit="px",

@@ -216,7 +216,7 @@ def test_a_blackout_is_lost_and_found_beside_the_frames(wall):
     assert State.LOST not in states[:15] and set(states[22:35]) == {State.LOST}
     found = next(k for k in range(35, 70) if frames[k].localized)
     assert frames[found].relocalized and found < 50
-    assert frames[found].reason.startswith("relocalized, to be confirmed")
+    assert frames[found].reason.startswith("found again, to be confirmed")
     sure = states.index(State.TRACKING, 35)
     assert found < sure < 62 and all(state is State.TRACKING for state in states[sure:])
     for k in range(found, 70):
