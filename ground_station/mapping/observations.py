@@ -36,6 +36,9 @@ _ROWS = 1 << 14
 
 _LONGEST_NAME = 200
 
+_LATEST_NS = 2**62
+"""Times whose differences still fit 64 bits."""
+
 
 @dataclass(frozen=True)
 class FlightObservations:
@@ -173,6 +176,8 @@ def _fault(seen: FlightObservations) -> str | None:
         return "its arrays do not fit each other"
     if (seen.time_ns[1:] <= seen.time_ns[:-1]).any():
         return "its frames are not in order of time"
+    if ((seen.time_ns < -_LATEST_NS) | (seen.time_ns > _LATEST_NS)).any():
+        return "a time in it is out of range"
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(initial=0)
     if off > _RIGID or (np.linalg.det(R) < 0).any() or (seen.wTc[:, 3] != [0, 0, 0, 1]).any():
         return "a pose in it is no rigid motion"

@@ -67,6 +67,7 @@ def refine_map(
             groups = past.groups(len(map_.keyframes))
             start = graphs.build_graph(map_, pixel_px, groups, chosen)
             graph = adjust(start, map_, settings, progress.step)
+        _check_added(graph, past, chosen)
         refined = _assemble(map_, graph)
         report = {
             "images": len(refined.keyframes),
@@ -82,7 +83,7 @@ def refine_map(
                 for k, flight in enumerate(chosen)
             ],
         }
-        refined.info.refined = _table(map_, past, report)
+        refined.info.refined = _table(map_, past, graph, report)
         if out is not None:
             refined.info.name = target.absolute().name
             _carry_floorplan(folder, part)
@@ -126,6 +127,15 @@ def _check_new(chosen: Sequence[Chosen], map_: store.Map) -> None:
         if names & mine:
             raise MapError(f"the flight '{flight.name}' is in the map already, or given twice")
         names |= mine
+
+
+def _check_added(graph: Graph, past: Refined, chosen: Sequence[Chosen]) -> None:
+    for group, flight in enumerate(chosen, start=len(past.flights) + 1):
+        if not (graph.group == group).any():
+            raise MapError(
+                f"the flight '{flight.name}' does not fit: each of its {len(flight)} frames lost "
+                "most of its sights when all were adjusted together"
+            )
 
 
 def _keyframe_sights(
@@ -243,15 +253,20 @@ def _median(values: F64) -> float:
     return round(float(np.median(values)), 5) if len(values) else 0.0
 
 
-def _table(map_: store.Map, past: Refined, report: dict[str, Any]) -> dict[str, Any]:
+def _table(map_: store.Map, past: Refined, graph: Graph, report: dict[str, Any]) -> dict[str, Any]:
     """`refined` of map.toml: the flights that are in the map, and the last run's report."""
     hashes = [*past.landmarks_sha256, landmarks_sha256(map_.landmarks)]
     undone = report["rolling_shutter"]["undone"]
     last = {name: value for name, value in report.items() if name != "flights"}
+    frames = np.bincount(graph.group, minlength=len(graph.sigma_px))
+    earlier = [  # they may have lost frames, too
+        flight | {"frames": int(count)}
+        for flight, count in zip(past.flights, frames[1:], strict=False)
+    ]
     return Refined(
         runs=past.runs + 1,
         pixels_at=FRAME_TIME if undone else "",
-        flights=[*past.flights, *report["flights"]],
+        flights=[*earlier, *report["flights"]],
         landmarks_sha256=list(dict.fromkeys(hashes)),
         last=last,
     ).as_dict()

@@ -319,6 +319,38 @@ def test_a_second_flight_joins_the_first_and_the_same_one_is_refused(world):
     assert kept == ["room", "room.before", "room.before-2"]
 
 
+def test_frames_of_an_earlier_flight_that_go_are_no_longer_counted(world):
+    first, _ = refine_map(world.folder, [world.flight()], SETTINGS)
+    sights = np.diff(first.keyframes.offset)[8:]
+    strict = dataclasses.replace(
+        SETTINGS, refine=RefineSettings(min_sights=int(np.median(sights)) + 1)
+    )
+    second, result = refine_map(world.folder, [], strict)
+    table = Refined.of(store.load(world.folder))
+    assert 0 < result.report["frames_dropped"] == len(first.keyframes) - len(second.keyframes)
+    assert table.flights[0]["frames"] == len(second.keyframes) - 8
+    third, _ = refine_map(world.folder, [world.flight(seed=5, name="third")], SETTINGS)
+    groups = Refined.of(store.load(world.folder)).groups(len(third.keyframes))
+    third_names = [name.startswith("third/") for name in third.keyframes.names]
+    assert third_names == (groups == 2).tolist()
+
+
+def test_a_keyframe_and_landmarks_without_sights_are_no_hindrance(world):
+    kf = world.map.keyframes
+    offset = np.append(kf.offset, kf.offset[-1])
+    more = dataclasses.replace(
+        kf,
+        names=[*kf.names, "blank"],
+        time_ns=np.append(kf.time_ns, 10**10),
+        wTc=np.concatenate([kf.wTc, kf.wTc[:1]]),
+        offset=offset,
+    )
+    store.save_tables(world.folder, dataclasses.replace(world.map, keyframes=more))
+    refined, _ = refine_map(world.folder, [world.flight()], SETTINGS)
+    assert refined.keyframes.names[8] == "blank" and np.diff(refined.keyframes.offset)[8] == 0
+    assert len(colmap.to_arrays(colmap.read(world.folder / "sparse")).names) > 9
+
+
 def test_the_old_map_is_kept_whole_and_other_files_stay(world):
     old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
     _, result = refine_map(world.folder, [world.flight()], SETTINGS)
@@ -436,6 +468,8 @@ def test_an_empty_flight_and_a_map_without_sights_are_refused(world):
         landmark=np.empty(0, np.int64),
         pixel_px=np.empty((0, 2), np.float32),
     )
+    save_observations(world.folder.with_name("empty"), empty)
+    empty = load_observations(world.folder.with_name("empty"))
     with pytest.raises(MapError, match="no frame that could be added"):
         refine_map(world.folder, [empty], SETTINGS)
     none = store.Keyframes(
@@ -593,6 +627,7 @@ def test_a_file_cut_anywhere_is_refused(world, tmp_path):
     [
         (lambda f: {"time_ns": f.time_ns[::-1].copy()}, "not in order of time"),
         (lambda f: {"time_ns": f.time_ns[:-1]}, "do not fit each other"),
+        (lambda f: {"time_ns": f.time_ns + 2**62}, "out of range"),
         (lambda f: {"time_ns": f.time_ns.astype(np.float64)}, "'time_ns' must be int64"),
         (lambda f: {"wTc": f.wTc * np.nan}, "not finite"),
         (lambda f: {"wTc": f.wTc * 1.1}, "no rigid motion"),
