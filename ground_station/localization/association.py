@@ -95,7 +95,7 @@ def associate(
     feature, candidate = feature[near], candidate[near]
     apart = feature_descriptors.take(feature, axis=0)
     apart -= candidate_descriptors.take(candidate, axis=0)
-    distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+    distance = np.sqrt(np.vecdot(apart, apart))
     if limit.ndim:
         plausible = distance <= farthest[candidate]
         feature, candidate, distance = feature[plausible], candidate[plausible], distance[plausible]
@@ -145,7 +145,7 @@ def _bounding(descriptors: F32) -> F32:
     rest = descriptors[:, _PREFIX:]
     rows = np.empty((len(descriptors), _PREFIX + 1), np.float32)
     rows[:, :_PREFIX] = descriptors[:, :_PREFIX]
-    np.sqrt(np.einsum("ij,ij->i", rest, rest), out=rows[:, _PREFIX])
+    np.sqrt(np.vecdot(rest, rest), out=rows[:, _PREFIX])
     return rows
 
 

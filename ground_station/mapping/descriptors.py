@@ -40,6 +40,7 @@ class Descriptors:
 
     def __init__(self, values: npt.NDArray[Any]) -> None:
         self.values = values
+        self._plain = np.asarray(values)  # a mapped array's own indexing is slower
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -50,9 +51,9 @@ class Descriptors:
 
     def __getitem__(self, index: Any) -> F32:
         """Unit rows (N, D) of an index, a slice or a mask on the first axis; (D,) of a number."""
-        rows = np.asarray(self.values[index], np.float32)
-        square = np.einsum("...i,...i->...", rows, rows)
-        return np.asarray(rows / np.maximum(np.sqrt(square), 1e-12)[..., None], np.float32)
+        rows = np.array(self._plain[index], np.float32)
+        rows /= np.maximum(np.sqrt(np.vecdot(rows, rows)), 1e-12)[..., None]
+        return rows
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         if copy is False:
