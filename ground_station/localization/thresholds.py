@@ -25,8 +25,9 @@ _PER_LOG_ODDS = 0.06
 """How much the limit grows with the logarithm of its odds: right matches over wrong ones."""
 _MARGIN = 0.05
 """Pairs this near to their limit tell whether all limits should move."""
-_RIGHT_SHARE = 0.4
-"""Of the pairs near their limits: with a larger share of right ones the limits grow."""
+_RIGHT_SHARE = 0.2
+"""Of the pairs near their limits: with a larger share of right ones the limits grow. A larger value
+costs fast flights, which have few pairs, more than it gains."""
 RIGHT_PX = 3.0
 """A pair of a smaller residual is right: a solver's inliers are many by chance among the near."""
 _STEP, _MOST = 0.002, 0.02

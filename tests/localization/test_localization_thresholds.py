@@ -48,7 +48,7 @@ def test_what_varied_more_in_the_map_may_be_farther(landmarks):
 
 def test_learning_drops_wrong_pairs_and_keeps_right_ones(landmarks):
     rng = np.random.default_rng(2)
-    rms, share = np.full(4000, 0.25), np.where(np.arange(4000) < 2000, 0.95, 0.2)
+    rms, share = np.full(4000, 0.25), np.where(np.arange(4000) < 2000, 0.9, 0.03)
     thresholds = DescriptorThresholds(landmarks, SETTINGS)
     _fly(thresholds, rng, 100, rms, share)
     good, poor = thresholds.limits(np.arange(2000)), thresholds.limits(np.arange(2000, 4000))
@@ -60,7 +60,7 @@ def test_learning_drops_wrong_pairs_and_keeps_right_ones(landmarks):
 
 def test_in_other_light_all_limits_move(landmarks):
     rng = np.random.default_rng(3)
-    share = np.full(4000, 0.6)
+    share = np.full(4000, 0.4)
     thresholds = DescriptorThresholds(landmarks, SETTINGS)
     _fly(thresholds, rng, 60, np.full(4000, 0.15), share)
     before = thresholds.common
