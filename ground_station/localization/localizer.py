@@ -245,10 +245,13 @@ class Localizer:
             or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
+            hurried = followed.moved_px > settings.hurry_px_s * age_s
+            lag = settings.hurried_lag_frames if hurried else None
             self._worker.submit(
                 self._acquirer.promote(
                     attempt.time_ns, image, state, self._estimator, attempt.taken
-                )
+                ),
+                lag,
             )
 
     def _search(self, attempt: Attempt, image: Image) -> None:

@@ -220,6 +220,13 @@ class TrackingSettings:
         6, "frames after which a keyframe's features land, waited for; 0: when ready",
         low=0, high=30,
     )  # fmt: skip
+    hurry_px_s: float = config.key(
+        150.0, "points faster than this need their next keyframe sooner", unit="px/s",
+        low=0, high=1e5,
+    )  # fmt: skip
+    hurried_lag_frames: int = config.key(
+        4, "and that keyframe's features land after so many frames at most", low=0, high=30
+    )
 
 
 @dataclass(frozen=True)

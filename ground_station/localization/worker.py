@@ -21,17 +21,22 @@ class Worker(Generic[Result]):
         self._executor: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
         self._age = 0
+        self._due = lag
 
     @property
     def busy(self) -> bool:
         """Whether a job was given whose result has not landed."""
         return self._job is not None
 
-    def submit(self, job: Callable[[], Result]) -> None:
-        """Starts a job; one that has not landed is forgotten."""
+    def submit(self, job: Callable[[], Result], lag: int | None = None) -> None:
+        """Starts a job; one that has not landed is forgotten. It may have a lag of its own.
+
+        A lag of its own is no more than the worker's, so that with 0 nothing is ever waited for.
+        """
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self.drop()
+        self._due = self.lag if lag is None else min(lag, self.lag)
         self._job, self._age = self._executor.submit(job), 0
 
     def collect(self) -> Result | None:
@@ -40,7 +45,7 @@ class Worker(Generic[Result]):
         if job is None:
             return None
         self._age += 1
-        if self._age < self.lag or (self.lag == 0 and not job.done()):
+        if self._age < self._due or (self._due == 0 and not job.done()):
             return None
         self._job = None
         return job.result()
