@@ -85,6 +85,7 @@ def _build(args: argparse.Namespace) -> int:
     from ground_station.geometry.camera import load_camera
     from ground_station.mapping.build import build_map
     from ground_station.mapping.folder import check_target
+    from ground_station.mapping.refine import straighten
     from ground_station.mapping.settings import MappingSettings, load_settings
     from ground_station.recording.open import parse_range
     from pi_firmware.wire import config
@@ -105,9 +106,8 @@ def _build(args: argparse.Namespace) -> int:
         "range": args.range or f"::{step}",
         "rate_hz": args.rate_hz,
     }
-    map_ = build_map(
-        _named(args.inputs, sources), camera, settings, args.out, total=total, built=built
-    )
+    build_map(_named(args.inputs, sources), camera, settings, args.out, total=total, built=built)
+    map_ = straighten(args.out, settings)
     for source in sources:
         for note in source.notes:
             print(f"note: {note}", file=sys.stderr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +93,22 @@ def refine_map(
         store.save_tables(part, refined, quantise=quantise)
     refined.folder = target
     return refined, Refinement(report, kept)
+
+
+def straighten(folder: str | Path, settings: MappingSettings) -> store.Map:
+    """Takes the rolling shutter out of a map that was just built, in its place.
+
+    Structure from motion takes each picture for a moment's. Nothing is done where the camera has no
+    readout time or the settings say so; a map that cannot be adjusted stays as it was.
+    """
+    map_ = store.load(folder)
+    if map_.info.camera.readout_s <= 0 or not settings.sfm.rolling_shutter:
+        return map_
+    try:
+        return refine_map(folder, (), settings, out=folder)[0]
+    except MapError as error:
+        print(f"note: the rolling shutter stays in the map: {error}", file=sys.stderr)
+        return map_
 
 
 def _check_map(map_: store.Map) -> None:

@@ -73,6 +73,9 @@ class SfmSettings:
     max_jump: float = config.key(
         4.0, "a frame is dropped when its step is so many times a fast one", low=1.5, high=1000.0
     )
+    rolling_shutter: bool = config.key(
+        True, "take it out of the finished map, by the camera's readout time"
+    )
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from ground_station.evaluation.report import summary_table, write_report
 from ground_station.files import write_json
 from ground_station.localization.settings import load_preset
 from ground_station.mapping.build import build_map
+from ground_station.mapping.refine import straighten
 from ground_station.mapping.register import register_map
 from ground_station.mapping.settings import load_settings
 from ground_station.mapping.sights import read_pairs
@@ -101,6 +102,7 @@ def build(mapping: Path, sample: Path, folder: Path) -> Map:
         total=total,
         built={"inputs": [mapping.name], "range": f"::{step}", "rate_hz": 0.0},
     )
+    straighten(folder, settings)
     registered, found = register_map(
         folder, sights=read_pairs(sample / "PAIRS.csv"), source="PAIRS.csv"
     )

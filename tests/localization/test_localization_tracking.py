@@ -227,8 +227,8 @@ def test_a_blackout_is_lost_and_found_beside_the_frames(wall):
 
 def test_a_relocalization_is_not_confirmed_by_its_own_points(wall):
     localizer, _ = make(wall)
-    times, truth = path(10)
-    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(10)]
+    times, truth = path(14)
+    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(14)]
     assert frames[0].relocalized and all(frame.tracked for frame in frames[1:])
     landed = next(k for k, frame in enumerate(frames) if "background" in frame.stage_ms)
     assert landed >= 6
