@@ -10,12 +10,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.errors import MapError
+from ground_station.errors import GeometryError, MapError
+from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.mapping import colmap, store
 from ground_station.mapping.folder import replacing
+from ground_station.mapping.pose_similarity import (
+    Positions,
+    joint_similarity,
+    orientation_offset,
+    position_scatter,
+    robust_rotation,
+    similarity_on_a_line,
+)
 from ground_station.mapping.sights import Sights, Triangulated, triangulate_sights
 from ground_station.mapping.similarity import (
     MIN_POINTS,
@@ -125,32 +134,106 @@ def by_sights(map_: store.Map, sights: Sights, seed: int) -> Registration:
 
 
 def by_trajectory(map_: store.Map, trajectory: Trajectory, seed: int) -> Registration:
-    """The similarity from the keyframes' centres to a trajectory's positions at the same times."""
-    kf = map_.keyframes
-    nearest = np.array([trajectory.nearest(int(time)) for time in kf.time_ns])
-    close = np.abs(trajectory.time_ns[nearest] - kf.time_ns) <= _MAX_DIFF_NS
+    """The similarity from the keyframes' poses to a trajectory's at the same times.
+
+    Positions and orientations count each by its own scatter. Orientations that are a constant
+    rotation off the camera's (a vehicle's own axes) are left out, with a note. Positions on one
+    line leave the roll about it to the orientations. Raises `MapError` for fewer than three poses,
+    numbers that are not finite, positions in one place, and positions on one line where the
+    orientations cannot be used.
+    """
+    model, truth = _matched(map_.keyframes, trajectory)
+    n, total = len(model), len(map_.keyframes)
+    notes = [f"{n} of {total} keyframes have a pose in the trajectory"]
+    positions = Positions(model[:, :3, 3], truth[:, :3, 3])
+    turned = truth[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)
+    mean, turned_alike = robust_rotation(turned, seed)
+    try:
+        check_spread(positions.target, "positions")
+        noise = np.zeros(n)
+        fit, alike = robust_similarity(positions.source, positions.target, noise, seed, "positions")
+        on_line = False
+    except (MapError, GeometryError):
+        fit, alike = similarity_on_a_line(positions, mean, seed)
+        on_line = True
+        notes.append("the positions lie on one line: the orientations give the roll about it")
+    used = positions.of(alike)
+    scatter_m = max(position_scatter(used, fit), used.floor_m())
+    offset = orientation_offset(
+        fit, used.information(fit, scatter_m), model[:, :3, :3], truth[:, :3, :3], seed
+    )
+    report: dict[str, Any] = {"method": "trajectory", "points": len(used.source), "points_given": n}
+    if offset.another_frame:
+        if on_line:
+            raise MapError(
+                f"registration: the {n} positions lie on one line, and the trajectory's "
+                f"orientations, {offset.angle_deg:.1f} deg off the camera's, do not give the roll"
+            )
+        notes.append(
+            f"the trajectory's orientations are {offset.angle_deg:.1f} deg off the camera's "
+            f"(scatter {offset.scatter_deg:.1f} deg): only its positions are used"
+        )
+        scales = _jackknife_scales(used.source, used.target)
+        report |= {"orientations": 0, "sigma_m": scatter_m}
+    else:
+        joint = joint_similarity(used, turned[turned_alike], fit)
+        fit, scales = joint.fit, used.jackknife_scales(joint.fit.rotation)
+        report |= {
+            "orientations": int(turned_alike.sum()),
+            "sigma_m": joint.sigma_m,
+            "sigma_deg": float(np.degrees(joint.sigma_rad)),
+        }
+    if not alike.all():
+        notes.append(f"{int((~alike).sum())} positions left out: far off where the others agree")
+    if not (turned_alike.all() or offset.another_frame):
+        notes.append(f"{int((~turned_alike).sum())} orientations left out: far off the others'")
+    error = np.linalg.norm(fit.apply(used.source) - used.target, axis=1)
+    angle = np.degrees(poses.rotation_angle(turned[turned_alike] @ fit.rotation.T))
+    report |= {
+        "residual_rms_m": _rms(error),
+        "residual_max_m": float(error.max()),
+        "residual_rms_deg": _rms(angle),
+        "residual_max_deg": float(angle.max()),
+        "orientation_offset_deg": offset.angle_deg,
+        **_similarity_report(fit, scales),
+    }
+    return Registration(fit, report, notes)
+
+
+def _matched(kf: store.Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
+    """Poses (N, 4, 4) of keyframes and the trajectory's at their times."""
+    if not len(trajectory):
+        raise MapError("registration: the trajectory has no poses")
+    order = np.argsort(trajectory.time_ns, kind="stable")
+    sorted_ns = trajectory.time_ns[order]
+    right = np.clip(np.searchsorted(sorted_ns, kf.time_ns), 0, len(order) - 1)
+    left = np.maximum(right - 1, 0)
+    # In floats: the difference of two times out of a hostile file need not be an integer of 64 bit.
+    ahead, behind = (
+        np.abs(sorted_ns[i].astype(np.float64) - kf.time_ns.astype(np.float64))
+        for i in (right, left)
+    )
+    nearest = order[np.where(behind <= ahead, left, right)]
+    close = np.minimum(ahead, behind) <= _MAX_DIFF_NS
     if close.sum() < MIN_POINTS:
         raise MapError(
             f"registration: {int(close.sum())} of {len(kf)} keyframes have a pose within "
             f"{_MAX_DIFF_NS / 1e9} s in the trajectory; at least {MIN_POINTS} are needed"
         )
-    centres = kf.wTc[close, :3, 3]
-    truth = trajectory.position_m[nearest[close]]
-    fit, inliers = robust_similarity(centres, truth, np.zeros(len(truth)), seed, "positions")
-    error = np.linalg.norm(fit.apply(centres[inliers]) - truth[inliers], axis=1)
-    notes = [f"{int(close.sum())} of {len(kf)} keyframes have a pose in the trajectory"]
-    if not inliers.all():
-        notes.append(f"{int((~inliers).sum())} of them left out: far off where the others agree")
-    scales = _jackknife_scales(centres[inliers], truth[inliers])
-    report = {
-        "method": "trajectory",
-        "points": int(inliers.sum()),
-        "points_given": int(close.sum()),
-        "residual_rms_m": _rms(error),
-        "residual_max_m": float(error.max()),
-        **_similarity_report(fit, scales),
-    }
-    return Registration(fit, report, notes)
+    position = trajectory.position_m[nearest[close]]
+    quaternion = trajectory.quaternion_xyzw[nearest[close]]
+    length = np.linalg.norm(quaternion, axis=1)
+    good = np.isfinite(position).all(axis=1) & np.isfinite(length) & (length > 1e-6)
+    if not good.all():
+        time_s = trajectory.time_ns[nearest[close]][~good][0] / 1e9
+        raise MapError(
+            f"registration: the trajectory's pose at {time_s:.6f} s is not finite or has a zero "
+            "quaternion"
+        )
+    if not np.isfinite(kf.wTc[close]).all():
+        name = next(np.array(kf.names)[close][~np.isfinite(kf.wTc[close]).all(axis=(1, 2))].flat)
+        raise MapError(f"registration: the map's pose of '{name}' is not finite")
+    return kf.wTc[close], poses.from_quaternion(position, quaternion)
 
 
 def transform_map(map_: store.Map, fit: Alignment) -> store.Map:

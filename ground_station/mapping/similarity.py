@@ -22,9 +22,12 @@ MIN_POINTS = 3
 _MIN_WIDTH = 0.01
 """Second over first extent of the points; below, a rotation about their line is free."""
 _TRIPLES = 2000
-_GATE_DEVIATION = 2.5
+GATE_DEVIATION = 2.5
+"""Robust deviations from the consensus up to which a measurement belongs to it."""
 _GATE_NOISE = 3.0
 _LOSS_PX = 2.0
+_ROUNDING = 1e-9
+"""Of the points' extent: arithmetic alone leaves less."""
 
 
 def check_spread(points: F64, what: str) -> None:
@@ -68,10 +71,12 @@ def robust_similarity(
     if best is None:
         raise MapError(f"registration: no three of the {n} {what} form a triangle")
     deviation = 1.4826 * (1 + 5 / max(n - MIN_POINTS, 1)) * best_score
+    rounding = _ROUNDING * float(np.linalg.norm(np.ptp(target, axis=0)))
     result, inliers = best, np.zeros(n, dtype=bool)
     for _ in range(10):
         error = np.linalg.norm(result.apply(source) - target, axis=1)
-        now = error <= np.maximum(_GATE_DEVIATION * deviation, _GATE_NOISE * result.scale * noise)
+        gate = np.maximum(GATE_DEVIATION * deviation, _GATE_NOISE * result.scale * noise)
+        now = error <= gate + rounding
         if (now == inliers).all():
             break
         inliers = now

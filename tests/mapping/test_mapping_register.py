@@ -122,9 +122,27 @@ def test_a_trajectory_puts_the_map_into_the_world(built, target):
     moved, found = register.register_map(target, trajectory=truth, source="truth.txt")
     assert _camera_errors(moved, scene).max() < 0.02
     assert found.report["method"] == "trajectory" and found.report["points"] == len(kf)
+    report = store.load(target).info.registration
+    assert report["orientations"] == len(kf) and report["orientation_offset_deg"] < 1
+    assert 0 < report["residual_rms_deg"] <= report["residual_max_deg"] < 0.3
+    assert report["residual_rms_m"] <= report["residual_max_m"] < 0.03
     late = Trajectory.from_poses(kf.time_ns + 30_000_000, scene.wTc)
     with pytest.raises(MapError, match=r"0 of 16 keyframes have a pose within 0.01 s"):
         register.register_map(target, trajectory=late)
+
+
+def test_a_registered_map_is_taken_by_a_trajectory_from_any_frame_to_the_same_world(built, target):
+    scene, kf = built.scene, built.map.keyframes
+    truth = Trajectory.from_poses(kf.time_ns, scene.wTc)
+    first, _ = register.register_map(target, trajectory=truth)
+    turn = poses.exp(np.array([0.9, -1.4, 2.0, 30.0, -20.0, 5.0]))
+    elsewhere = Trajectory.from_poses(kf.time_ns, turn @ scene.wTc)
+    moved, _ = register.register_map(target, trajectory=elsewhere)
+    assert np.allclose(moved.keyframes.wTc, turn @ first.keyframes.wTc, atol=1e-6)
+    back, found = register.register_map(target, trajectory=truth)
+    assert np.allclose(back.keyframes.wTc, first.keyframes.wTc, atol=1e-6)
+    assert found.report["scale"] == pytest.approx(1, abs=1e-6)
+    assert np.allclose(store.load(target).landmarks.position_m, first.landmarks.position_m)
 
 
 @pytest.mark.parametrize(
