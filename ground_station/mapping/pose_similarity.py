@@ -86,7 +86,7 @@ class Positions:
     def floor_m(self) -> float:
         """The least scatter, metres, that is told from none."""
         dy = self.centred()[1]
-        return _FLOOR * float(np.sqrt(np.mean(np.sum(dy * dy, axis=1)))) + 1e-300
+        return _FLOOR * float(np.sqrt(np.mean(np.sum(dy * dy, axis=1))))
 
 
 @dataclass(frozen=True)
@@ -139,10 +139,11 @@ def similarity_on_a_line(positions: Positions, rotation: F64, seed: int) -> tupl
     """
     x, y = positions.source, positions.target
     n = len(x)
-    pairs = np.stack(np.triu_indices(n, 1), axis=1)
-    if len(pairs) > _CANDIDATES:
+    if n * (n - 1) // 2 <= _CANDIDATES:
+        pairs = np.stack(np.triu_indices(n, 1), axis=1)
+    else:
         rng = np.random.default_rng(seed)
-        pairs = pairs[rng.choice(len(pairs), _CANDIDATES, replace=False)]
+        pairs = np.array([rng.choice(n, 2, replace=False) for _ in range(_CANDIDATES)])
     rank = min(n - 1, max(n // 2, 2))  # more than the pair, which fits itself
     best, best_score = None, np.inf
     for i, j in pairs:

@@ -38,6 +38,9 @@ F64 = npt.NDArray[np.float64]
 _MAX_DIFF_NS = 10_000_000
 """A trajectory's pose counts for a keyframe within 10 ms, as in the evaluation."""
 
+_MIN_EXTENT, _MAX_EXTENT = 1e-9, 1e9
+"""Of a path, in a model's units or metres: beyond, squares leave the numbers' range."""
+
 
 @dataclass(frozen=True)
 class Registration:
@@ -222,18 +225,29 @@ def _matched(kf: store.Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
         )
     position = trajectory.position_m[nearest[close]]
     quaternion = trajectory.quaternion_xyzw[nearest[close]]
-    length = np.linalg.norm(quaternion, axis=1)
-    good = np.isfinite(position).all(axis=1) & np.isfinite(length) & (length > 1e-6)
+    # Compared this way round, what is not a number fails, too.
+    good = (np.abs(position) < _MAX_EXTENT).all(axis=1)
+    good &= (np.abs(quaternion) < 2).all(axis=1) & (np.abs(quaternion).max(axis=1) > 1e-6)
     if not good.all():
         time_s = trajectory.time_ns[nearest[close]][~good][0] / 1e9
         raise MapError(
-            f"registration: the trajectory's pose at {time_s:.6f} s is not finite or has a zero "
-            "quaternion"
+            f"registration: the trajectory's pose at {time_s:.6f} s is not finite, is further than "
+            f"{_MAX_EXTENT:.0e} m or has a quaternion that is not of length 1"
         )
-    if not np.isfinite(kf.wTc[close]).all():
-        name = next(np.array(kf.names)[close][~np.isfinite(kf.wTc[close]).all(axis=(1, 2))].flat)
-        raise MapError(f"registration: the map's pose of '{name}' is not finite")
-    return kf.wTc[close], poses.from_quaternion(position, quaternion)
+    model = kf.wTc[close]
+    good = (np.abs(model) < _MAX_EXTENT).all(axis=(1, 2))
+    R = np.where(good[:, None, None], model[:, :3, :3], 0.0)
+    good &= np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) < 1e-3
+    good &= np.linalg.det(R) > 0
+    if not good.all():
+        name = np.array(kf.names)[close][~good][0]
+        raise MapError(f"registration: the map's pose of '{name}' is not finite or no rigid motion")
+    for which, centre in (("map", model[:, :3, 3]), ("trajectory", position)):
+        if np.ptp(centre, axis=0).max() < _MIN_EXTENT:
+            raise MapError(
+                f"registration: the {len(centre)} positions of the {which} lie in one place"
+            )
+    return model, poses.from_quaternion(position, quaternion)
 
 
 def transform_map(map_: store.Map, fit: Alignment) -> store.Map:

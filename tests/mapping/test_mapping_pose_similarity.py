@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,11 +12,14 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import BlimpError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
-from ground_station.geometry.trajectory import Trajectory
+from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.mapping import pose_similarity, store
 from ground_station.mapping.register import by_trajectory
 
 STEP_NS = 500_000_000
+DATA = Path(__file__).parents[2] / "../shared/data/redkitchen"
+
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/redkitchen is not there")
 
 
 def walk(count: int = 30, sideways_m: float = 0.3, seed: int = 0) -> np.ndarray:
@@ -265,7 +269,7 @@ def test_three_poses_are_enough_and_two_are_not():
         by_trajectory(model_of(wTc[:2], truth), trajectory_of(wTc), 0)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
 @pytest.mark.parametrize("part", ["position_m", "quaternion_xyzw", "map"])
 def test_numbers_that_are_not_finite_are_refused_in_one_line(part, value):
     wTc, truth = walk(), random_similarity(1)
@@ -277,11 +281,33 @@ def test_numbers_that_are_not_finite_are_refused_in_one_line(part, value):
     assert "\n" not in str(e.value)
 
 
+@pytest.mark.parametrize("rotation", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), 2 * np.eye(3)])
+def test_a_maps_pose_that_is_no_rigid_motion_is_refused_by_name(rotation):
+    map_ = model_of(walk(), random_similarity(1))
+    map_.keyframes.wTc[4, :3, :3] = rotation
+    with pytest.raises(MapError, match=r"'frame-000004' is not finite or no rigid motion"):
+        by_trajectory(map_, trajectory_of(walk()), 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_by_chance_give_a_fit_that_admits_it_or_one_line(seed):
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(30, random_state=seed).as_matrix()
+    chance = poses.pose(rotation, rng.normal(size=(30, 3)))
+    trajectory = Trajectory.from_poses(np.arange(30) * STEP_NS, chance)
+    try:
+        found = by_trajectory(model_of(walk(), random_similarity(1)), trajectory, 0)
+    except BlimpError as error:
+        assert "\n" not in str(error)
+    else:
+        assert found.report["residual_rms_m"] > 0.3 and found.report["residual_rms_deg"] > 20
+
+
 def test_a_zero_quaternion_and_an_empty_trajectory_are_refused():
     wTc, truth = walk(), random_similarity(1)
     trajectory = trajectory_of(wTc)
     trajectory.quaternion_xyzw[7] = 0.0
-    with pytest.raises(MapError, match=r"at 3\.500000 s .* zero quaternion"):
+    with pytest.raises(MapError, match=r"at 3\.500000 s .* quaternion that is not of length 1"):
         by_trajectory(model_of(wTc, truth), trajectory, 0)
     none = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
     with pytest.raises(MapError, match="no poses"):
@@ -301,3 +327,16 @@ def test_times_at_the_ends_of_the_number_range_and_out_of_order_are_matched_righ
     )
     found = by_trajectory(model_of(wTc, truth), shuffled, 0)
     assert found.report["points_given"] == 30 and off_deg(found.fit, truth) < 1e-6
+
+
+@needs_data
+def test_depth_camera_poses_of_a_kitchen_do_not_turn_a_map_of_the_colour_camera():
+    """KinectFusion's orientations are the depth camera's, some degrees off the colour camera's."""
+    colour, depth = (read_tum(DATA / f"{name}groundtruth.txt") for name in ("pseudo_", ""))
+    half = colour.time_ns < 500 / 30 * 1e9
+    map_ = with_poses(colour.wTc[half])
+    map_.keyframes.time_ns[:] = colour.time_ns[half]
+    found = by_trajectory(map_, depth, 0)
+    assert found.report["orientations"] == 0
+    assert 2 < found.report["orientation_offset_deg"] < 8
+    assert any("only its positions are used" in note for note in found.notes)
