@@ -191,7 +191,8 @@ def by_trajectory(map_: store.Map, trajectory: Trajectory, seed: int) -> Registr
     if not (turned_alike.all() or offset.another_frame):
         notes.append(f"{int((~turned_alike).sum())} orientations left out: far off the others'")
     error = np.linalg.norm(fit.apply(used.source) - used.target, axis=1)
-    angle = np.degrees(poses.rotation_angle(turned[turned_alike] @ fit.rotation.T))
+    seen = turned if offset.another_frame else turned[turned_alike]
+    angle = np.degrees(poses.rotation_angle(seen @ fit.rotation.T))
     report |= {
         "residual_rms_m": _rms(error),
         "residual_max_m": float(error.max()),
@@ -235,7 +236,7 @@ def _matched(kf: store.Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
             f"{_MAX_EXTENT:.0e} m or has a quaternion that is not of length 1"
         )
     model = kf.wTc[close]
-    good = (np.abs(model) < _MAX_EXTENT).all(axis=(1, 2))
+    good = np.asarray((np.abs(model) < _MAX_EXTENT).all(axis=(1, 2)))
     R = np.where(good[:, None, None], model[:, :3, :3], 0.0)
     good &= np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) < 1e-3
     good &= np.linalg.det(R) > 0

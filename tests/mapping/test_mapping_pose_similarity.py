@@ -184,6 +184,7 @@ def test_a_vehicles_own_axes_are_recognised_and_positions_alone_decide(degrees, 
     assert off_deg(found.fit, expected) < 1e-6
     assert found.report["orientations"] == 0
     assert found.report["orientation_offset_deg"] == pytest.approx(degrees, abs=0.5)
+    assert found.report["residual_rms_deg"] == pytest.approx(degrees, abs=2.0)
     said = [note for note in found.notes if "only its positions are used" in note]
     assert len(said) == 1 and f"{found.report['orientation_offset_deg']:.1f} deg" in said[0]
 
