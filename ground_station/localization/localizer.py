@@ -21,7 +21,7 @@ from ground_station.localization.following import Followed
 from ground_station.localization.judge import Judge
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.matching import Described, Matcher, describe
-from ground_station.localization.publishing import evidence_of, publish
+from ground_station.localization.publishing import evidence_of, publish, published_covariance
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
@@ -149,7 +149,7 @@ class Localizer:
             return None
         state = State.DEGRADED if self.state is State.TRACKING else self.state
         reason = f"refused: {(last - attempt.time_ns) / 1e9:.3f} s before the last frame"
-        return publish(attempt, state, reason, self.settings)
+        return publish(attempt, state, reason)
 
     def _unhurried(self, time_ns: int) -> bool:
         """Whether there is time for a frame's own features.
@@ -245,7 +245,7 @@ class Localizer:
             or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
-            hurried = followed.moved_px > settings.hurry_px_s * age_s
+            hurried = self._judge.doubtful or followed.moved_px > settings.hurry_px_s * age_s
             lag = settings.hurried_lag_frames if hurried else None
             self._worker.submit(
                 self._acquirer.promote(
@@ -312,13 +312,14 @@ class Localizer:
         state = believed or solution.state
         assert state is not None
         self._seen = attempt.observations.landmark[solution.inlier]
-        evidence = evidence_of(
-            attempt, solution, state, self.camera, self.settings.covariance,
-            followed.support_ns if followed else attempt.time_ns,
-        )  # fmt: skip
+        covariance = published_covariance(
+            state.covariance, solution.information, self.settings.covariance
+        )
+        support_ns = followed.support_ns if followed else attempt.time_ns
+        evidence = evidence_of(attempt, solution, covariance, self.camera, support_ns)
         verdict, reason = self._judge.solved(attempt.time_ns, evidence)
         return publish(
-            attempt, verdict, reason, self.settings, found=state,
+            attempt, verdict, reason, found=state, covariance=covariance,
             relocalized=relocalized, tracked=followed is not None,
         )  # fmt: skip
 
@@ -329,11 +330,11 @@ class Localizer:
             self._keyframe, self._followed, self._estimator = None, None, self._fresh()
             self._seen = None
         attempt.observations = no_observations()
-        return publish(attempt, verdict, reason, self.settings)
+        return publish(attempt, verdict, reason)
 
     def _gated(self, attempt: Attempt, reason: str) -> PoseEstimate:
         # Skipped is not failed: until the prediction is no more than a held pose.
         patience_s = max(self.settings.state.lost_after_s, self.settings.motion.coast_s)
         verdict = self._judge.unsolved(attempt.time_ns, patience_s)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
-        return publish(attempt, verdict, reason, self.settings, gated=True)
+        return publish(attempt, verdict, reason, gated=True)

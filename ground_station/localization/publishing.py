@@ -11,29 +11,40 @@ from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.judge import Evidence
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.relocalization import spread
-from ground_station.localization.settings import CovarianceSettings, LocalizerSettings
+from ground_station.localization.settings import CovarianceSettings
 
 Array = npt.NDArray[np.float64]
 
 
-def published_covariance(covariance: Array, settings: CovarianceSettings) -> Array:
+def published_covariance(
+    covariance: Array, information: Array, settings: CovarianceSettings
+) -> Array:
     """The pose's covariance (6, 6) as it goes out: scaled, and with what frames share added.
 
-    A filter takes the errors of two frames for independent; those of the map are the same again.
+    A filter takes the errors of two frames for independent; the errors of the landmarks they both
+    see are not. Those move the pose as the sights of one frame alone would: by the inverse of their
+    `information` (12, 12) about the pose, with a share that was calibrated against truth.
     """
-    floor = np.r_[np.full(3, np.deg2rad(settings.floor_deg)), np.full(3, settings.floor_m)]
-    return np.asarray(settings.scale**2 * covariance[:6, :6] + np.diag(floor**2))
+    published = settings.scale**2 * covariance[:6, :6]
+    if settings.shared > 0:
+        try:
+            published = published + settings.shared**2 * np.linalg.inv(information[:6, :6])
+        except np.linalg.LinAlgError:
+            return np.full((6, 6), np.inf)
+    return np.asarray(published)
 
 
 def evidence_of(
     attempt: Attempt,
     solution: Solution,
-    state: Kinematics,
+    covariance: Array,
     camera: Camera,
-    settings: CovarianceSettings,
     support_ns: int,
 ) -> Evidence:
-    """What speaks for a solved frame, whose observations the attempt holds."""
+    """What speaks for a solved frame, whose observations the attempt holds.
+
+    `covariance` (6, 6) is the published one.
+    """
     seen = attempt.observations
     residual = solution.residual_px[solution.inlier]
     return Evidence(
@@ -41,7 +52,7 @@ def evidence_of(
         observations=len(seen),
         spread=spread(seen.pixel_px[solution.inlier], camera),
         residual_px=float(np.sqrt(np.mean(residual**2))) if len(residual) else np.inf,
-        covariance=published_covariance(state.covariance, settings),
+        covariance=covariance,
         innovation=solution.innovation,
         support_ns=support_ns,
         sharpness=attempt.taken.sharpness,
@@ -52,9 +63,9 @@ def publish(
     attempt: Attempt,
     state: State,
     reason: str,
-    settings: LocalizerSettings,
     *,
     found: Kinematics | None = None,
+    covariance: Array | None = None,
     relocalized: bool = False,
     gated: bool = False,
     tracked: bool = False,
@@ -68,7 +79,7 @@ def publish(
         reason=reason,
         wTc=found.wTc if found else None,
         twist=found.twist if found else None,
-        covariance=published_covariance(found.covariance, settings.covariance) if found else None,
+        covariance=covariance,
         predicted_wTc=predicted.wTc if predicted else None,
         counts=attempt.counts,
         observations=attempt.observations,

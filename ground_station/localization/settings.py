@@ -317,13 +317,10 @@ class CovarianceSettings:
     """From what the filter believes to what is published: calibrated against truth."""
 
     scale: float = config.key(1.0, "standard deviations are multiplied by it", low=0.01, high=100)
-    floor_m: float = config.key(
-        0.0, "added to the position's variance, an axis: errors that frames share", unit="m",
+    shared: float = config.key(
+        0.0, "share of the deviations by the frame's own sights that all frames have in common",
         low=0, high=10,
     )  # fmt: skip
-    floor_deg: float = config.key(
-        0.0, "added to the direction's variance, an axis", unit="deg", low=0, high=90
-    )
 
 
 @dataclass(frozen=True)
