@@ -98,7 +98,8 @@ def catch_up(
     assert landed.state is not None and landed.keyframe is not None
     estimator.restart(landed.time_ns, landed.state.wTc, landed.state.covariance[:6, :6])
     since = [frame for frame in recent if frame[0] > landed.time_ns]
-    for step in np.unique(np.linspace(0, len(since) - 1, _STEPS + 1).astype(int))[1:]:
+    steps = np.linspace(0, max(len(since) - 1, 0), _STEPS + 1).astype(int)
+    for step in np.unique(steps)[1:]:
         time_ns, image = since[step]
         predicted = estimator.predict(time_ns)
         assert predicted is not None

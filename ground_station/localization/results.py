@@ -73,7 +73,8 @@ def summary(
     percentile; `latency_ms` is a frame's time from picture to pose, gated frames aside.
     """
     worked = [e for e in estimates if not e.gated]
-    stages = dict.fromkeys(stage for e in estimates for stage in e.stage_ms)
+    stages = list(dict.fromkeys(stage for e in estimates for stage in e.stage_ms))
+    stages.sort(key=lambda stage: stage == "total")  # the sum comes last
     spans = {s: percentiles([e.stage_ms[s] for e in worked if s in e.stage_ms]) for s in stages}
     return {
         "frames": {

@@ -1,0 +1,154 @@
+"""Keyframes, searches and what is published: what a wrong pose must not pass."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ground_station.geometry import poses
+from ground_station.localization.acquisition import Acquirer
+from ground_station.localization.attempt import Conditions, Stopwatch
+from ground_station.localization.estimate import Counts, no_observations
+from ground_station.localization.estimator import FilterEstimator, PoseEstimator, make_estimator
+from ground_station.localization.following import Followed, better, catch_up
+from ground_station.localization.kinematics import no_solution
+from ground_station.localization.matching import Matcher, describe
+from ground_station.localization.publishing import published_covariance
+from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
+from ground_station.localization.tracking import Keyframe
+
+HERE = np.array([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
+
+
+@pytest.fixture
+def acquirer(room, extractor):
+    settings = load_preset("default")
+    matcher = Matcher(room.map, room.camera, settings)
+    return Acquirer(room.map, matcher, extractor, settings)
+
+
+def seen_from(room, wTc):
+    return describe(room.features(wTc), room.camera, Conditions())
+
+
+def estimator_at(room, wTc, sigma=None):
+    estimator = make_estimator(room.camera, load_preset("default"))
+    estimator.restart(0, wTc, None if sigma is None else np.eye(6) * sigma**2)
+    return estimator
+
+
+def test_the_preset_names_the_estimator(room):
+    assert isinstance(make_estimator(room.camera, load_preset("default")), FilterEstimator)
+    assert isinstance(make_estimator(room.camera, load_preset("thesis")), PoseEstimator)
+
+
+def test_live_nothing_is_waited_for_and_nothing_else_changes():
+    settings = load_preset("default")
+    live = for_live(settings)
+    assert settings.tracking.features_lag_frames > 0 == live.tracking.features_lag_frames
+    again = dataclasses.replace(live.tracking, features_lag_frames=8)
+    assert dataclasses.replace(live, tracking=again) == settings
+
+
+def test_a_right_pose_explains_more_than_chance_and_wrong_ones_do_not(room, acquirer):
+    _, path = room.path(120)
+    for k in (0, 60, 119):
+        seen = seen_from(room, path[k])
+        least = load_preset("default").tracking.min_significance
+        assert acquirer.matcher.significance(seen, path[k]) > 2 * least
+        for other in ((k + 50) % 120, (k + 70) % 120):
+            assert acquirer.matcher.significance(seen, path[other]) < 0.7 * least
+        aside = path[k] @ poses.exp([0.1, -0.1, 0.1, 0.3, 0.1, 0.0])
+        assert acquirer.matcher.significance(seen, aside) < 0.7 * least
+
+
+def test_a_search_near_a_wrong_and_certain_prediction_finds_nothing(room, acquirer):
+    """Within a small radius chance matches agree with any pose: that is no find."""
+    _, path = room.path(120)
+    for k in range(0, 60, 6):
+        seen = seen_from(room, path[k])
+        estimator = estimator_at(room, path[k + 60], sigma=3e-3)
+        found = acquirer.locate(seen, estimator.predict(0), estimator, Stopwatch())
+        verified = acquirer._verified(seen, found, Stopwatch())
+        assert verified.solution.state is None and not len(verified.matches)
+        right = estimator_at(room, path[k] @ poses.exp(HERE))
+        found = acquirer.locate(seen, right.predict(0), right, Stopwatch())
+        assert acquirer._verified(seen, found, Stopwatch()) is found
+        apart = poses.log(poses.inverse(path[k]) @ found.solution.state.wTc)
+        assert np.linalg.norm(apart[3:]) < 0.02 and np.linalg.norm(apart[:3]) < 0.005
+
+
+def test_what_is_far_from_its_prediction_is_found_within_the_predictions_doubt(room, acquirer):
+    """The search radius follows the covariance: a sure prediction looks near, an unsure one far."""
+    _, path = room.path(1)
+    seen = seen_from(room, path[0])
+    aside = path[0] @ poses.exp([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])  # some 25 px
+    matches = {}
+    for sigma in (1e-4, 0.05):
+        expected = estimator_at(room, aside, sigma).predict(0)
+        matches[sigma] = acquirer.matcher.match(seen, expected, None, Stopwatch())
+    assert len(matches[1e-4]) < 0.3 * len(matches[0.05])
+
+
+def test_landmarks_are_expected_where_their_row_will_see_them(room, extractor):
+    camera = dataclasses.replace(room.camera, readout_s=0.02)
+    matcher = Matcher(room.map, camera, load_preset("default"))
+    _, path = room.path(1)
+    sights = matcher.sights(
+        [[320.0, 0.0], [320.0, 239.5], [320.0, 479.0]], np.arange(3), 2.0,
+        estimator_at(room, path[0]).predict(0), Conditions(),
+    )  # fmt: skip
+    assert np.allclose(sights.row_s, [-0.01, 0.0, 0.01])
+    off = dataclasses.replace(load_preset("default").pose, rolling_shutter=False)
+    still = Matcher(room.map, camera, dataclasses.replace(load_preset("default"), pose=off))
+    assert not still.row_s(np.array([[0.0, 0.0], [0.0, 479.0]])).any()
+
+
+def test_a_keyframe_with_far_fewer_points_does_not_replace_one_that_still_gives_many():
+    def keyframe(count):
+        return Keyframe(
+            0, np.zeros((4, 4), np.uint8), np.eye(4), np.zeros((count, 2), np.float32),
+            np.arange(count), np.zeros((count, 3)),
+        )  # fmt: skip
+
+    new, old = keyframe(30), keyframe(200)
+    still = Followed(no_solution(0, ""), Counts(inliers=150), no_observations(), 0.0, 0)
+    assert better(new, old, still) is old
+    assert better(new, None, still) is new and better(new, old, None) is new
+    poor = dataclasses.replace(still, counts=Counts(inliers=40))
+    assert better(new, old, poor) is new
+
+
+def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
+    _, path = room.path(1)
+    seen = seen_from(room, path[0])
+    estimator = estimator_at(room, path[0])
+    found = acquirer.locate(seen, estimator.predict(0), estimator, Stopwatch())
+    rng = np.random.default_rng(1)
+    noise = [rng.integers(0, 255, (480, 640)).astype(np.uint8) for _ in range(2)]
+    landed = SimpleNamespace(
+        time_ns=0,
+        state=found.solution.state,
+        keyframe=acquirer.keyframe(0, noise[0], path[0], found.observations),
+    )
+    fresh = make_estimator(room.camera, load_preset("default"))
+    assert catch_up(landed, [], acquirer.matcher, fresh)
+    assert fresh.predict(0) is not None
+    fresh = make_estimator(room.camera, load_preset("default"))
+    recent = [(k * 33_000_000, noise[k > 0]) for k in range(4)]
+    assert not catch_up(landed, recent, acquirer.matcher, fresh)
+
+
+def test_what_frames_share_is_added_to_what_is_published():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(12, 12))
+    covariance, information = A @ A.T, np.diag(np.arange(1.0, 13.0))
+    plain = published_covariance(covariance, information, CovarianceSettings())
+    assert np.array_equal(plain, covariance[:6, :6])
+    more = published_covariance(covariance, information, CovarianceSettings(scale=2.0, shared=0.5))
+    assert np.allclose(more, 4 * plain + 0.25 * np.diag(1 / np.arange(1.0, 7.0)))
+    singular = published_covariance(covariance, np.zeros((12, 12)), CovarianceSettings(shared=0.5))
+    assert np.isinf(singular).all()
