@@ -182,6 +182,10 @@ class TrackingSettings:
         0.7, "a point that misses its start by more, followed back, is dropped",
         unit="px", low=0.05, high=10,
     )  # fmt: skip
+    max_difference: float = config.key(
+        30.0, "a point whose surroundings differ by more grey levels in the mean is another",
+        low=0, high=255,
+    )  # fmt: skip
     sigma_px: float = config.key(
         3.0,
         "standard deviation of a followed point, common errors of its keyframe included",

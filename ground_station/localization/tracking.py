@@ -115,7 +115,7 @@ def _follow(
     """Where pixels (N, 2) went, and whether each was found (N,)."""
     if not len(start):
         return start, np.empty(0, bool)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
+    found, status, difference = cv2.calcOpticalFlowPyrLK(
         before,
         after,
         start,
@@ -125,4 +125,7 @@ def _follow(
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _MOST_STEPS, _EPSILON_PX),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return np.asarray(found, np.float32), status.ravel() == 1
+    # In noise a point stays where it was looked for and comes back from there: only what is around
+    # it tells that it is another.
+    alike = difference.ravel() <= settings.max_difference
+    return np.asarray(found, np.float32), (status.ravel() == 1) & alike

@@ -135,10 +135,10 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
         keyframe=acquirer.keyframe(0, noise[0], path[0], found.observations),
     )
     fresh = make_estimator(room.camera, load_preset("default"))
-    assert catch_up(landed, [], acquirer.matcher, fresh)
+    assert catch_up(landed, [(0, noise[0])], acquirer.matcher, fresh)
     assert fresh.predict(0) is not None
     fresh = make_estimator(room.camera, load_preset("default"))
-    recent = [(k * 33_000_000, noise[k > 0]) for k in range(4)]
+    recent = [(k * 33_000_000, noise[min(k, 1)]) for k in range(4)]
     assert not catch_up(landed, recent, acquirer.matcher, fresh)
 
 
