@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pi_firmware import encoder, gstreamer, link
-from pi_firmware.battery import open_gauge
+from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.gate import Decision, Gate, measure
 from pi_firmware.settings import Settings
 from pi_firmware.sources import open_source
@@ -48,11 +48,10 @@ class Payload:
 
     def __init__(self, settings: Settings) -> None:
         encoder.require(settings.encoder)
-        gauge = open_gauge(settings.battery.uri)
+        gauge = open_gauge(settings.battery.uri, settings.battery)
         self.settings = settings
         self.counters = Counters()
         self.ssrc = link.draw_ssrc(settings.link)
-        self._gauge = gauge
         self._gate = Gate(settings.gate)
         self._source = open_source(settings.camera)
         self._gst = gstreamer.load()
@@ -63,6 +62,9 @@ class Payload:
         try:
             self._pipeline = self._build()
             self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
+            self._battery = Monitor(
+                settings.battery, gauge, publish=self._telemetry.battery, announce=self._announce
+            )
         except BaseException:
             self._source.close()
             raise
@@ -76,6 +78,7 @@ class Payload:
         try:
             self._play()
             self._source.start()
+            self._battery.start(on_critical=stop.set)
             self._supervise(stop)
         except BlimpError as error:
             self._announce(messages.EVENT_FAILED, str(error))
@@ -100,7 +103,9 @@ class Payload:
         self._source.stop()
         self._pipeline.set_state(self._gst.State.NULL)
         self._source.close()
+        self._battery.stop()
         self._telemetry.close()
+        self._battery.shut_down()
 
     def _build(self) -> Any:
         settings = self.settings
@@ -196,7 +201,6 @@ class Payload:
     def _supervise(self, stop: threading.Event) -> None:
         bus = self._pipeline.get_bus()
         kinds = self._gst.MessageType.ERROR | self._gst.MessageType.EOS
-        next_battery = time.monotonic()
         flush_until: float | None = None
         while True:
             message = bus.timed_pop_filtered(_POLL_NS, kinds)
@@ -209,9 +213,6 @@ class Payload:
                     raise self._source.error
                 return
             now = time.monotonic()
-            if now >= next_battery:
-                self._telemetry.battery(self._gauge.read(time.time_ns()))
-                next_battery = now + self.settings.battery.period_s
             if stop.is_set() and flush_until is None:
                 self._source.stop()
                 flush_until = now + _FLUSH_LIMIT_S

@@ -45,8 +45,17 @@ class GateSettings:
     hysteresis_bits: float = key(
         0.2, "a gated stretch ends this much above the threshold", unit="bit", low=0, high=2
     )
+    min_sharpness_ratio: float = key(
+        0.3, "gated below this share of the last 2 s' gradient energy; 0: none", low=0, high=1
+    )
+    min_difference: float = key(
+        0.5, "gated when closer to the last one sent; 0: none", unit="grey levels", low=0, high=255
+    )
     heartbeat_s: float = key(
         1.0, "while all is gated, one frame is sent this often; 0: none", unit="s", low=0, high=60
+    )
+    idr_after_s: float = key(
+        0.5, "after a gap this long an IDR comes first", unit="s", low=0, high=1
     )
 
 
@@ -73,8 +82,27 @@ class LinkSettings:
 class BatterySettings:
     """The gauge."""
 
-    uri: str = key("fake:", "gauge: fake:")
+    uri: str = key("fake:", "gauge: i2c:CHIP@BUS:ADDRESS, fake:")
     period_s: float = key(1.0, "time between readings", unit="s", low=0.1, high=60)
+    capacity_mAh: float = key(600.0, "the cell's capacity", unit="mAh", low=50, high=20_000)
+    full_V: float = key(4.2, "its voltage when full", unit="V", low=4.0, high=4.45)
+    resistance_mohm: float = key(
+        0.0, "its series resistance at 25 degrees; 0: typical", unit="mohm", low=0, high=2000
+    )
+    temperature_C: float = key(20.0, "expected temperature of the cell", unit="C", low=-20, high=60)
+    low_percentage: float = key(0.25, "state of charge of the low alarm", low=0, high=1)
+    low_bitrate_kbps: int = key(600, "bit rate from then on", unit="kbit/s", low=100, high=20_000)
+    critical_percentage: float = key(0.05, "state of charge of the shutdown", low=0, high=0.5)
+    critical_V: float = key(3.3, "voltage under load of it", unit="V", low=2.8, high=3.8)
+    confirm_readings: int = key(3, "readings in a row before an alarm", low=1, high=60)
+    shutdown_command: list[str] = key([], "what to run after an orderly end")
+
+    def __post_init__(self) -> None:
+        if self.critical_percentage >= self.low_percentage:
+            raise ValueError(
+                f"'battery.critical_percentage' is {self.critical_percentage:g}; it must be below"
+                f" 'battery.low_percentage', {self.low_percentage:g}"
+            )
 
 
 @dataclass(frozen=True)

@@ -121,13 +121,25 @@ class Acquirer:
         assert expected is not None
         return replace(self.locate(seen, expected, estimator, watch), relocalized=True)
 
-    def keyframe(self, time_ns: int, image: Image, wTc: Array, seen: Observations) -> Keyframe:
-        """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed."""
-        pixel, landmark = seen.pixel_px[seen.inlier], seen.landmark[seen.inlier]
-        chosen = spread_out(pixel, self._settings.tracking.max_points)
-        pixel, landmark = pixel[chosen], landmark[chosen]
+    def keyframe(self, time_ns: int, image: Image, wTc: Array, found: Located) -> Keyframe:
+        """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.
+
+        Those of surely the same descriptor; others only where these are few, and less trusted: the
+        error of a match grows with its descriptors' distance (measured; landmarks seen in another
+        light, or their neighbours).
+        """
+        settings, seen = self._settings.tracking, found.observations
+        inlier = np.flatnonzero(seen.inlier)
+        distance = found.matches.distance[inlier]
+        inlier = inlier[np.argsort(distance, kind="stable")]
+        sure = int((distance <= settings.sure_distance).sum())
+        inlier = inlier[: max(sure, settings.sure_points)]
+        inlier = inlier[spread_out(seen.pixel_px[inlier], settings.max_points)]
+        pixel, landmark = seen.pixel_px[inlier], seen.landmark[inlier]
         points = np.asarray(self._landmarks.position_m[landmark], np.float64)
-        return Keyframe(time_ns, image, wTc, pixel, landmark, points)
+        ratio = found.matches.distance[inlier].astype(np.float64) / settings.doubt_distance
+        sigma = settings.sigma_px * np.maximum(1.0, ratio) ** 2
+        return Keyframe(time_ns, image, wTc, pixel, landmark, points, sigma)
 
     def promote(
         self,
@@ -191,7 +203,7 @@ class Acquirer:
         reason, count = found.solution.reason, int(found.observations.inlier.sum())
         if state is not None:
             if count >= self._settings.tracking.keyframe_min_points:
-                keyframe = self.keyframe(time_ns, image, state.wTc, found.observations)
+                keyframe = self.keyframe(time_ns, image, state.wTc, found)
             else:
                 reason = f"{count} inliers"
         spent_ms = watch.finish()["total"]

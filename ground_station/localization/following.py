@@ -59,7 +59,7 @@ def follow(
         solution = no_solution(found, f"{found} points found again")
     else:
         sights = matcher.sights(
-            tracks.pixel_px, landmark, settings.tracking.sigma_px, predicted, attempt.taken
+            tracks.pixel_px, landmark, keyframe.sigma_px[tracks.point], predicted, attempt.taken
         )
         solution = estimator.solve(predicted, sights, _tracked(settings))
         solution = believed(solution, settings, int(np.ceil(least)))

@@ -57,6 +57,7 @@ class Localizer:
         self._estimator: Estimator = self._fresh()
         self._keyframe: Keyframe | None = None
         self._followed: Followed | None = None
+        self._located: Located | None = None
         self._recent: deque[tuple[int, Image]] = deque(maxlen=following.REMEMBERED)
         self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
         self._seen: npt.NDArray[np.intp] | None = None
@@ -171,9 +172,9 @@ class Localizer:
         seen = self._acquirer.describe(image, attempt.taken)
         attempt.watch.lap("features")
         estimate = self._locate(attempt, seen)
-        if self.settings.tracking.enabled and estimate.wTc is not None:
+        if self.settings.tracking.enabled and estimate.wTc is not None and self._located:
             self._keyframe = self._acquirer.keyframe(
-                attempt.time_ns, image, estimate.wTc, attempt.observations
+                attempt.time_ns, image, estimate.wTc, self._located
             )
         return estimate
 
@@ -204,6 +205,7 @@ class Localizer:
         attempt.counts = Counts(found.features, matches.projected, matches.associated, inliers)
         attempt.observations = found.observations
         found.teach(self._matcher.thresholds)
+        self._located = found
 
     def _may_search(self, time_ns: int) -> bool:
         recovery, tried = self.settings.recovery, self._last_search_ns
@@ -264,7 +266,8 @@ class Localizer:
         gone = self._judge.after_gap(attempt.time_ns) in (State.INITIALIZING, State.LOST)
         expected = None if gone else attempt.predicted
         self._worker.submit(
-            self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken)
+            self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
+            self.settings.tracking.search_lag_frames,
         )
 
     def _land(self, attempt: Attempt) -> bool:

@@ -140,25 +140,23 @@ class Matcher:
         """
         among = self._index.near(wTc, self._lens, self.settings.projection)
         witness = Witness(seen.features, seen.pinhole_px, self._lens)
-        support = witness.support(wTc, self.landmarks, among)
-        by_chance = support.expected * support.chance
-        return float(
-            (support.expected * support.share - by_chance)
-            / np.sqrt(by_chance * (1 - support.chance) + 1)
-        )
+        return witness.support(wTc, self.landmarks, among).significance
 
     def sights(
         self,
         pixel_px: npt.ArrayLike,
         landmark: Indices,
-        sigma_px: float,
+        sigma_px: float | Array,
         expected: Kinematics,
         taken: Conditions,
     ) -> Sights:
-        """Landmarks (N,) seen at distorted pixels (N, 2), less surely where motion blurs them."""
+        """Landmarks (N,) seen at distorted pixels (N, 2), less surely where motion blurs them.
+
+        `sigma_px` (N,), or one for all, is without blur.
+        """
         pixel, blur = np.asarray(pixel_px, np.float64), self.settings.blur
         points = np.asarray(self.landmarks.position_m[landmark], np.float64)
-        sigma = np.full(len(pixel), sigma_px)
+        sigma = np.full(len(pixel), sigma_px, np.float64)
         if blur.enabled and len(pixel):
             points_c = poses.transform(poses.inverse(expected.wTc), points)
             path = expected_blur_px(self.camera, points_c, expected.twist, taken.exposure_s)

@@ -82,8 +82,6 @@ _NEIGHBOUR_M, _NEIGHBOUR_COS, _NEIGHBOURS = 4.0, 0.5, 12
 """Keyframes near a found pose that look the same way (60 degrees): what they saw should be seen."""
 _MIN_MATCHED = 12
 """Inliers of RANSAC that are worth the check that follows."""
-_MIN_EXCESS = 0.10
-"""Share of expected landmarks found, less that by chance: a smaller one is refused."""
 _MAX_SIGMA_M = 0.04
 """Of the position, from the inliers alone: beyond, a rolling shutter's shear moves it by a foot."""
 _SAME_M = 0.5
@@ -155,8 +153,12 @@ class _Search:
         feature, landmark = support.feature[good], support.landmark[good]
         if len(feature) < settings.min_inliers:
             return f"{len(feature)} of {support.expected} landmarks where they should be"
-        if support.share - support.chance < _MIN_EXCESS:
-            return f"{support.share:.0%} of the landmarks found, {support.chance:.0%} by chance"
+        beyond = support.share - support.chance
+        if beyond < settings.min_excess or support.significance < settings.min_significance:
+            return (
+                f"{support.share:.0%} of {support.expected} landmarks found, "
+                f"{support.chance:.0%} by chance"
+            )
         if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)

@@ -196,6 +196,16 @@ class TrackingSettings:
     min_inliers: int = config.key(
         10, "a followed frame with fewer is not believed", low=6, high=1000
     )
+    sure_distance: float = config.key(
+        0.5, "descriptor distance up to which a keyframe's points are followed", low=0, high=2
+    )
+    sure_points: int = config.key(
+        100, "farther ones only where those are fewer, up to so many", low=0, high=2000
+    )
+    doubt_distance: float = config.key(
+        0.3, "descriptor distance from which a point's sigma grows with its square",
+        low=0.01, high=2,
+    )  # fmt: skip
     min_significance: float = config.key(
         7.0, "of a keyframe: standard deviations by which more landmarks are seen than by chance",
         low=0, high=1000,
@@ -230,6 +240,9 @@ class TrackingSettings:
     )  # fmt: skip
     hurried_lag_frames: int = config.key(
         4, "and that keyframe's features land after so many frames at most", low=0, high=30
+    )
+    search_lag_frames: int = config.key(
+        6, "a search's result lands after so many frames at most", low=0, high=30
     )
 
 
@@ -345,6 +358,12 @@ class RecoverySettings:
     min_inliers: int = config.key(25, "a relocalization with fewer is refused", low=6, high=1000)
     min_inlier_share: float = config.key(
         0.25, "of the matches; a smaller share is refused", low=0, high=1
+    )
+    min_excess: float = config.key(
+        0.04, "share of the landmarks that should be seen and are, beyond chance", low=0, high=1
+    )
+    min_significance: float = config.key(
+        9.0, "and that excess in standard deviations of chance", low=0, high=1000
     )
     min_spread: float = config.key(
         0.06, "inliers' spread as in the state's; a smaller one is refused", low=0, high=0.5

@@ -36,7 +36,8 @@ class Keyframe:
     """A frame whose N features are known to be landmarks.
 
     `image` (H, W) grey; `wTc` (4, 4); `pixel_px` (N, 2) in the (distorted) image; `landmark` (N,)
-    indices into the map's landmarks; `points_m` (N, 3), where they are in the world.
+    indices into the map's landmarks; `points_m` (N, 3), where they are in the world; `sigma_px`
+    (N,), the standard deviation of each when it is followed.
     """
 
     time_ns: int
@@ -45,6 +46,7 @@ class Keyframe:
     pixel_px: F32
     landmark: Indices
     points_m: Array
+    sigma_px: Array
 
     def __len__(self) -> int:
         return len(self.landmark)

@@ -43,6 +43,13 @@ class Support:
     share: float
     chance: float
 
+    @property
+    def significance(self) -> float:
+        """By how many standard deviations more landmarks were found than chance finds."""
+        by_chance = self.expected * self.chance
+        deviation = np.sqrt(by_chance * (1 - self.chance) + 1)
+        return float((self.expected * self.share - by_chance) / deviation)
+
 
 class Witness:
     """A frame's features as a place to look landmarks up in."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pi_firmware.battery.bus import Counts
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 
@@ -19,10 +20,11 @@ class FakeGauge:
 
     def __init__(self, uri: Uri) -> None:
         uri.only("percentage", "minutes", "capacity_mAh")
+        self.counts = Counts()
         if uri.path:
             raise uri.fail(f"takes no path, but options, not {uri.path!r}")
         self._start = uri.number("percentage", 1.0, 0.0, 1.0)
-        self._full_s = 60 * uri.number("minutes", 20.0, 0.1, 10_000.0)
+        self._full_s = 60 * uri.number("minutes", 120.0, 0.1, 10_000.0)
         self._capacity_ah = uri.number("capacity_mAh", 600.0, 10.0, 100_000.0) / 1000
         self._start_ns: int | None = None
 
@@ -45,4 +47,8 @@ class FakeGauge:
             power_supply_status=_DISCHARGING,
             power_supply_health=_GOOD,
             power_supply_technology=_LIPO,
+            time_left_s=left * self._full_s,
         )
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -7,6 +7,7 @@ it ignores fields it does not know and gives the default to those an older write
 from __future__ import annotations
 
 import dataclasses
+import enum
 import json
 import math
 import types
@@ -17,6 +18,8 @@ from typing import Any, ClassVar, TypeVar
 from pi_firmware.wire.errors import TelemetryError
 
 M = TypeVar("M", bound="Message")
+
+ALARM_NONE, ALARM_LOW, ALARM_CRITICAL = "", "low", "critical"
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Battery(Message):
     """ROS `sensor_msgs/BatteryState`: its names, units and codes; None is ROS's unmeasured NaN."""
 
     SCHEMA: ClassVar[str] = "blimp.battery"
+    MINOR: ClassVar[int] = 1
 
     voltage: float  # V
     percentage: float | None = None  # 0 to 1
@@ -47,6 +51,22 @@ class Battery(Message):
     power_supply_health: int = 0  # 1 good
     power_supply_technology: int = 0  # 3 LiPo
     present: bool = True
+    # Ours, not of ROS.
+    time_left_s: float | None = None  # until the critical voltage, at the power of late
+    alarm: str = ALARM_NONE
+    read_errors: int = 0  # failed transfers so far; most of them were repeated with success
+    refused: int = 0  # readings that could not be, none of which was sent
+    reopened: int = 0  # times the bus was opened anew
+    resets: int = 0  # times the gauge had lost its settings
+
+
+class Reason(enum.StrEnum):
+    """Why the gate decides as it does: `PASS`, or what of a frame says too little."""
+
+    PASS = "pass"
+    ENTROPY = "entropy"
+    BLUR = "blur"
+    DUPLICATE = "duplicate"
 
 
 @dataclass(frozen=True)
@@ -55,9 +75,12 @@ class Gate(Message):
 
     `captured` = `gated` + frames handed to the encoder; `sent` of those have left it so far, which
     is all of them at the end. Heartbeats are frames sent although the gate would have dropped them.
+    `reason` is a `Reason`'s value, a heartbeat's is what gates the frames around it; an older
+    writer gave none. `difference` from the last frame sent, grey levels, is None before one was.
     """
 
     SCHEMA: ClassVar[str] = "blimp.gate"
+    MINOR: ClassVar[int] = 1
 
     capture_ns: int
     sequence: int
@@ -70,6 +93,8 @@ class Gate(Message):
     heartbeats: int
     sent: int
     ssrc: int
+    reason: str = ""
+    difference: float | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +113,10 @@ EVENT_SOURCE_CUT = "source-cut"
 EVENT_END_OF_STREAM = "end-of-stream"
 EVENT_STOPPED = "stopped"
 EVENT_FAILED = "failed"
+EVENT_BATTERY_LOW = "battery-low"
+EVENT_BATTERY_CRITICAL = "battery-critical"
+EVENT_GAUGE_FAILED = "gauge-failed"
+EVENT_GAUGE_BACK = "gauge-back"
 
 
 def encode(message: Message) -> bytes:

@@ -111,7 +111,7 @@ def test_a_keyframe_with_far_fewer_points_does_not_replace_one_that_still_gives_
     def keyframe(count):
         return Keyframe(
             0, np.zeros((4, 4), np.uint8), np.eye(4), np.zeros((count, 2), np.float32),
-            np.arange(count), np.zeros((count, 3)),
+            np.arange(count), np.zeros((count, 3)), np.ones(count),
         )  # fmt: skip
 
     new, old = keyframe(30), keyframe(200)
@@ -132,7 +132,7 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
     landed = SimpleNamespace(
         time_ns=0,
         state=found.solution.state,
-        keyframe=acquirer.keyframe(0, noise[0], path[0], found.observations),
+        keyframe=acquirer.keyframe(0, noise[0], path[0], found),
     )
     fresh = make_estimator(room.camera, load_preset("default"))
     assert catch_up(landed, [(0, noise[0])], acquirer.matcher, fresh)

@@ -54,7 +54,7 @@ class Wall:
         pixel = rng.uniform([60, 60], [580, 420], (count, 2)).astype(np.float32)
         rays = np.c_[self.camera.undistort(pixel), np.ones(count)]
         points = self.on_wall(rays, wTc)
-        return Keyframe(0, self.picture(wTc), wTc, pixel, np.arange(count), points)
+        return Keyframe(0, self.picture(wTc), wTc, pixel, np.arange(count), points, np.ones(count))
 
     def map(self) -> Map:
         """Landmarks from RootSIFT of one picture, each where its ray meets the wall."""

@@ -37,7 +37,7 @@ def test_a_camera_that_cannot_be_opened_is_named(text: str, named: str) -> None:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("i2c:ina219@1:0x40", "i2c: is not available yet (available: fake:)"),
+        ("i2c:bq27441@1:0x55", "expected i2c:CHIP@BUS:ADDRESS"),
         ("gauge:", "unknown scheme"),
         ("fake:1", "takes no path"),
         ("fake:?percentage=2", "percentage is '2'; allowed: 0 to 1"),
