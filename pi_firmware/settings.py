@@ -65,7 +65,20 @@ class EncoderSettings:
 
     name: str = key("x264enc", "GStreamer's encoder element", choices=ENCODERS)
     bitrate_kbps: int = key(2000, "target bit rate", unit="kbit/s", low=100, high=20_000)
+    min_bitrate_kbps: int = key(300, "the least it adapts to", unit="kbit/s", low=50, high=20_000)
+    adapt: bool = key(True, "bit rate and IDR interval follow what the ground reports")
+    max_round_trip_s: float = key(
+        0.3, "a longer round trip lowers the bit rate", unit="s", low=0.01, high=10
+    )
     gop_frames: int = key(15, "frames from IDR to IDR, at most 1 s", unit="frames", low=1, high=120)
+    min_gop_frames: int = key(10, "the same at 5 % loss and more", unit="frames", low=1, high=120)
+
+    def __post_init__(self) -> None:
+        if self.min_bitrate_kbps > self.bitrate_kbps:
+            raise ValueError(
+                f"'encoder.min_bitrate_kbps' is {self.min_bitrate_kbps}; it must not be above"
+                f" 'encoder.bitrate_kbps', {self.bitrate_kbps}"
+            )
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,11 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 
+_FOUND_RADIUS_PX = 15.0
+"""Around a pose that was found in the whole map: it explains its inliers to a few pixels, and what
+is left is the shear of a shutter whose motion nobody knows yet."""
+
+
 @dataclass(frozen=True)
 class Located:
     """A frame solved from features of its own, or why not.
@@ -96,10 +101,18 @@ class Acquirer:
         return describe(self._extractor.extract(image), self.matcher.camera, taken)
 
     def locate(
-        self, seen: Described, expected: Kinematics, estimator: Estimator, watch: Stopwatch
+        self,
+        seen: Described,
+        expected: Kinematics,
+        estimator: Estimator,
+        watch: Stopwatch,
+        radius_px: float | None = None,
     ) -> Located:
-        """Matches around a prediction and solves; once more, closer, if the settings say."""
-        found = self._locate_once(seen, expected, expected, estimator, None, watch)
+        """Matches around a prediction and solves; once more, closer, if the settings say.
+
+        Without a radius it follows the prediction's covariance.
+        """
+        found = self._locate_once(seen, expected, expected, estimator, radius_px, watch)
         closer_px = self._settings.association.refine_radius_px
         if found.solution.state is not None and closer_px > 0:
             state = found.solution.state
@@ -119,7 +132,8 @@ class Acquirer:
         estimator.restart(time_ns, found.wTc)
         expected = estimator.predict(time_ns)
         assert expected is not None
-        return replace(self.locate(seen, expected, estimator, watch), relocalized=True)
+        located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX)
+        return replace(located, relocalized=True)
 
     def keyframe(self, time_ns: int, image: Image, wTc: Array, found: Located) -> Keyframe:
         """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.

@@ -34,8 +34,11 @@ class Source(Protocol):
     error: BlimpError | None
     """What ended the source, when it was not its end."""
 
+    dmabuf: bool
+    """Whether the pictures are dmabufs, which a hardware encoder reads without a copy."""
+
     def elements(self) -> str:
-        """The pipeline's text from the source to raw I420 at the camera's size and rate."""
+        """The pipeline's text from the source to raw I420 or NV12 at the camera's size and rate."""
         ...
 
     def attach(self, pipeline: Any) -> None:
@@ -48,6 +51,10 @@ class Source(Protocol):
 
     def stamp(self, running_ns: int) -> Stamp:
         """The capture times of the frame that has this running time in the pipeline."""
+        ...
+
+    def explain(self, message: str) -> str:
+        """GStreamer's error message, in words of this source where it has better ones."""
         ...
 
     def stop(self) -> None:

@@ -26,6 +26,7 @@ class PatternSource:
         duration_s = uri.number("duration_s", 0.0, 0.0, 86_400.0)
         gstreamer.require(("videotestsrc",), f"camera.uri '{uri.text}'")
         self.rate_hz = camera.rate_hz
+        self.dmabuf = False
         self.cut_reason = ""
         self.error: BlimpError | None = None
         rate = Fraction(camera.rate_hz).limit_denominator(1001)
@@ -52,6 +53,9 @@ class PatternSource:
         age_ns = pipeline.get_clock().get_time() - pipeline.get_base_time() - running_ns
         captured_ns = time.time_ns() - age_ns
         return Stamp(captured_ns, captured_ns)
+
+    def explain(self, message: str) -> str:
+        return message
 
     def stop(self) -> None:
         if self._pipeline is not None:

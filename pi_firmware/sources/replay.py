@@ -59,6 +59,7 @@ class ReplaySource:
         if not uri.path:
             raise uri.fail("expected replay:FLIGHT.mcap")
         self.rate_hz = uri.number("rate_hz", camera.rate_hz, 1, 120)
+        self.dmabuf = False
         self.cut_reason = ""
         self.error: BlimpError | None = None
         self._path = Path(uri.path)
@@ -97,6 +98,9 @@ class ReplaySource:
 
     def stamp(self, running_ns: int) -> Stamp:
         return self._stamps.pop(running_ns)
+
+    def explain(self, message: str) -> str:
+        return message
 
     def stop(self) -> None:
         self._stopping.set()
