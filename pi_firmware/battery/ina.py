@@ -1,0 +1,189 @@
+"""INA219 and INA226, Texas Instruments' current and voltage monitors.
+
+Registers, bits and equations are those of the datasheets SBOS448G (INA219) and SBOS547B (INA226).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
+from pi_firmware.wire.messages import Battery
+
+CONFIGURATION, SHUNT_VOLTAGE, BUS_VOLTAGE, POWER, CURRENT, CALIBRATION = range(6)
+MANUFACTURER_ID, DIE_ID = 0xFE, 0xFF
+RESET = 0x8000
+_DISCHARGING, _CHARGING, _GOOD, _LIPO = 2, 1, 1, 3
+_INA219_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # of the programmable gain 1, 1/2, 1/4, 1/8
+
+
+@dataclass(frozen=True)
+class Shunt:
+    """The resistor and the largest current expected through it.
+
+    `discharge_positive`: a discharging current flows from IN+ to IN-.
+    """
+
+    resistance_ohm: float = 0.1
+    max_A: float = 3.0
+    discharge_positive: bool = True
+
+
+class Ina219:
+    """Voltage of the cell and its current, averaged over 128 samples (68 ms).
+
+    Raises `ValueError` for a shunt that the chip cannot measure at `max_A`.
+    """
+
+    FULL_SCALE_V = 0.32
+    AFTER_RESET = 0x399F
+
+    def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
+        _check_range(shunt, self.FULL_SCALE_V)
+        self._bus, self._shunt, self.counts = bus, shunt, counts
+        drop_v = shunt.max_A * shunt.resistance_ohm
+        self._gain = next(i for i, v in enumerate(_INA219_RANGES_V) if drop_v <= v * (1 + 1e-9))
+        # 16 V range; both converters 12 bit with 128 samples; continuous.
+        self._configuration = self._gain << 11 | 0xF << 7 | 0xF << 3 | 0x7
+        self._calibration = ina219_calibration(shunt.max_A / 2**15, shunt.resistance_ohm)
+        self._lsb_a = 0.04096 / (self._calibration * shunt.resistance_ohm)
+        self._ready = False
+
+    def read(self, time_ns: int) -> Battery:
+        """One reading; raises `GaugeError` when there is none that can be believed."""
+        self._prepare()
+        drop = signed(self._bus.read(SHUNT_VOLTAGE))
+        bus = self._bus.read(BUS_VOLTAGE)
+        current = signed(self._bus.read(CURRENT))
+        if bus & 0x1:
+            raise _refused(self.counts, "ina219: the current is beyond the calibrated range")
+        if abs(drop) >= round(_INA219_RANGES_V[self._gain] / 10e-6):
+            raise _refused(self.counts, "ina219: the shunt's voltage is beyond the range")
+        _check_reset(self, self._configuration, self._calibration)
+        # The chip measures at IN-, behind the shunt; the cell is before it while discharging.
+        voltage = ina219_bus_voltage(bus)
+        if self._shunt.discharge_positive:
+            voltage += drop * 10e-6
+        return _reading(time_ns, voltage, current * self._lsb_a, self._shunt)
+
+    def close(self) -> None:
+        """Releases the bus."""
+        self._ready = False
+        self._bus.close()
+
+    def _prepare(self) -> None:
+        if self._ready:
+            return
+        self._bus.write(CONFIGURATION, RESET)
+        found = self._bus.read(CONFIGURATION)
+        if found != self.AFTER_RESET:
+            raise GaugeError(
+                f"ina219: after a reset its configuration is {found:#06x},"
+                f" not {self.AFTER_RESET:#06x}: another chip, or a disturbed bus"
+            )
+        self._bus.write(CONFIGURATION, self._configuration)
+        self._bus.write(CALIBRATION, self._calibration)
+        self._ready = True
+
+
+class Ina226:
+    """Voltage at the pin VBUS and the current, averaged over 16 samples (35 ms).
+
+    Raises `ValueError` for a shunt that the chip cannot measure at `max_A`.
+    """
+
+    FULL_SCALE_V = 0.08192
+    MANUFACTURER, DIE = 0x5449, 0x2260
+
+    def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
+        _check_range(shunt, self.FULL_SCALE_V)
+        self._bus, self._shunt, self.counts = bus, shunt, counts
+        self._configuration = 0x4127 | 0b010 << 9  # as after a reset, but 16 averages
+        self._calibration = ina226_calibration(shunt.max_A / 2**15, shunt.resistance_ohm)
+        self._lsb_a = 0.00512 / (self._calibration * shunt.resistance_ohm)
+        self._ready = False
+
+    def read(self, time_ns: int) -> Battery:
+        """One reading; raises `GaugeError` when there is none that can be believed."""
+        self._prepare()
+        drop = signed(self._bus.read(SHUNT_VOLTAGE))
+        bus = self._bus.read(BUS_VOLTAGE)
+        current = signed(self._bus.read(CURRENT))
+        if drop in (-0x8000, 0x7FFF):
+            raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
+        _check_reset(self, self._configuration, self._calibration)
+        return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
+
+    def close(self) -> None:
+        """Releases the bus."""
+        self._ready = False
+        self._bus.close()
+
+    def _prepare(self) -> None:
+        if self._ready:
+            return
+        found = self._bus.read(MANUFACTURER_ID), self._bus.read(DIE_ID)
+        if found != (self.MANUFACTURER, self.DIE):
+            raise GaugeError(
+                f"ina226: its identity is {found[0]:#06x} {found[1]:#06x},"
+                f" not {self.MANUFACTURER:#06x} {self.DIE:#06x}: another chip"
+            )
+        self._bus.write(CONFIGURATION, RESET)
+        self._bus.write(CONFIGURATION, self._configuration)
+        self._bus.write(CALIBRATION, self._calibration)
+        self._ready = True
+
+
+def ina219_calibration(current_lsb_a: float, resistance_ohm: float) -> int:
+    """Equation 1 of SBOS448G: trunc(0.04096 / (Current_LSB · R)); bit 0 is always 0 in the chip."""
+    return min(int(0.04096 / (current_lsb_a * resistance_ohm) + 1e-9), 0xFFFF) & 0xFFFE
+
+
+def ina219_bus_voltage(register: int) -> float:
+    """Volts of the INA219's bus voltage register: 4 mV a bit, in bits 3 to 15."""
+    return (register >> 3) * 4e-3
+
+
+def ina226_calibration(current_lsb_a: float, resistance_ohm: float) -> int:
+    """Equation 1 of SBOS547B: trunc(0.00512 / (Current_LSB · R)), of 15 bits."""
+    return min(int(0.00512 / (current_lsb_a * resistance_ohm) + 1e-9), 0x7FFF)
+
+
+def ina226_bus_voltage(register: int) -> float:
+    """Volts of the INA226's bus voltage register: 1.25 mV a bit, never negative."""
+    return (register & 0x7FFF) * 1.25e-3
+
+
+def _check_range(shunt: Shunt, full_scale_v: float) -> None:
+    drop_v = shunt.max_A * shunt.resistance_ohm
+    if drop_v > full_scale_v * (1 + 1e-9):
+        raise ValueError(
+            f"{shunt.max_A:g} A through {shunt.resistance_ohm:g} ohm are {drop_v:g} V;"
+            f" the chip measures up to {full_scale_v:g} V"
+        )
+
+
+def _check_reset(gauge: Ina219 | Ina226, configuration: int, calibration: int) -> None:
+    """Refuses what a chip says that a dip of its supply has reset: its current would be zero."""
+    bus = gauge._bus
+    if bus.read(CONFIGURATION) != configuration or bus.read(CALIBRATION) != calibration:
+        gauge._ready = False
+        gauge.counts.resets += 1
+        raise _refused(gauge.counts, "the gauge has lost its settings; it is set up again")
+
+
+def _refused(counts: Counts, reason: str) -> GaugeError:
+    counts.refused += 1
+    return GaugeError(reason)
+
+
+def _reading(time_ns: int, voltage: float, through_shunt_a: float, shunt: Shunt) -> Battery:
+    current = -through_shunt_a if shunt.discharge_positive else through_shunt_a
+    return Battery(
+        time_ns=time_ns,
+        voltage=voltage,
+        current=current,
+        power_supply_status=_CHARGING if current > 0 else _DISCHARGING,
+        power_supply_health=_GOOD,
+        power_supply_technology=_LIPO,
+    )

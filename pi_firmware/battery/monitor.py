@@ -1,0 +1,191 @@
+"""Watches the battery on a thread of its own: charge, time left, alarms, orderly shutdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+from pi_firmware.battery.bus import Counts, GaugeError
+from pi_firmware.battery.charge import ChargeFilter
+from pi_firmware.battery.gauges import Gauge, cell_of
+from pi_firmware.settings import BatterySettings
+from pi_firmware.wire import messages
+from pi_firmware.wire.messages import Battery
+
+LOWEST_V, HIGHEST_V = 2.5, 4.6  # no lithium cell that still runs a computer is outside
+_LARGEST_A = 100.0
+_LOW_ENDS = 0.05  # above the threshold by this much the alarm is over
+_SILENT_AFTER = 3  # failed readings in a row before it is said
+_LONGEST_PAUSE_S = 30.0
+_COMMAND_LIMIT_S = 30.0
+_JOIN_LIMIT_S = 2.0
+_CHARGING = 1
+
+
+class Monitor:
+    """Reads a gauge every `period_s` and says what follows from it.
+
+    `publish` gets each believable reading, completed with state of charge and time left, and never
+    another; `announce` gets events. `on_low` is called once with the bit rate in kbit/s to go down
+    to, `on_critical` once: recordings must end, then the payload. Both are called on the monitor's
+    thread. A gauge that is absent or fails is tried again, ever more seldom, and stops nothing.
+    """
+
+    def __init__(
+        self,
+        settings: BatterySettings,
+        gauge: Gauge,
+        *,
+        publish: Callable[[Battery], None],
+        announce: Callable[[str, str], None],
+        on_low: Callable[[int], None] = lambda kbps: None,
+        on_critical: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.alarm = messages.ALARM_NONE
+        self._settings = settings
+        self._gauge = gauge
+        self._publish, self._announce = publish, announce
+        self._on_low, self._on_critical = on_low, on_critical
+        self._clock = clock
+        self._filter = ChargeFilter(cell_of(settings))
+        self._low_readings = self._critical_readings = self._failures = 0
+        self._silent = False
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def counts(self) -> Counts:
+        """Errors, refused readings, re-opened buses and reset chips so far."""
+        return self._gauge.counts
+
+    def start(self, on_critical: Callable[[], None] | None = None) -> None:
+        """Starts the thread; a second call does nothing."""
+        if on_critical is not None:
+            self._on_critical = on_critical
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="battery", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread and releases the gauge; waits no longer than a hung bus is worth."""
+        self._end.set()
+        thread, self._thread = self._thread, None
+        if thread is None:
+            self._gauge.close()
+        elif thread is not threading.current_thread():
+            thread.join(_JOIN_LIMIT_S)
+
+    def step(self, time_ns: int) -> float:
+        """One reading, stamped `time_ns`; returns the seconds until the next is due."""
+        try:
+            reading = self._believable(self._gauge.read(time_ns))
+        except GaugeError as error:
+            return self._failed(str(error))
+        if self._silent:
+            self._announce(messages.EVENT_GAUGE_BACK, "the battery gauge answers again")
+        self._failures, self._silent = 0, False
+        completed = self._complete(reading)
+        turned = self._judge(completed)
+        self._publish(dataclasses.replace(completed, alarm=self.alarm))
+        if turned:
+            self._alarm(completed)
+        return self._settings.period_s
+
+    def shut_down(self) -> None:
+        """Runs the configured command if the battery was critical; call it when all has ended."""
+        command = self._settings.shutdown_command
+        if self.alarm != messages.ALARM_CRITICAL or not command:
+            return
+        try:
+            subprocess.run(command, timeout=_COMMAND_LIMIT_S, check=True, stdin=subprocess.DEVNULL)
+        except (OSError, subprocess.SubprocessError) as error:
+            print(f"pi_firmware: battery.shutdown_command: {error}", file=sys.stderr)
+
+    def _run(self) -> None:
+        pause_s = 0.0
+        while not self._end.wait(pause_s):
+            try:
+                pause_s = self.step(time.time_ns())
+            except Exception as error:  # whatever it is, a flight does not end for a gauge
+                pause_s = self._failed(f"{type(error).__name__}: {error}")
+        self._gauge.close()
+
+    def _believable(self, reading: Battery) -> Battery:
+        current, share = reading.current, reading.percentage
+        reason = ""
+        if not LOWEST_V <= reading.voltage <= HIGHEST_V:  # false for NaN, too
+            reason = f"{reading.voltage:g} V is no voltage of a cell"
+        elif current is not None and not abs(current) <= _LARGEST_A:
+            reason = f"{current:g} A is no current of a cell"
+        elif share is not None and not 0 <= share <= 1:
+            reason = f"{share:g} is no state of charge"
+        if reason:
+            self._gauge.counts.refused += 1
+            raise GaugeError(f"battery gauge: {reason}")
+        return reading
+
+    def _failed(self, reason: str) -> float:
+        self._failures += 1
+        if self._failures >= _SILENT_AFTER and not self._silent:
+            self._silent = True
+            self._announce(messages.EVENT_GAUGE_FAILED, reason)
+        longer = 2.0 ** min(max(self._failures - _SILENT_AFTER, 0), 10)
+        return min(self._settings.period_s * longer, max(_LONGEST_PAUSE_S, self._settings.period_s))
+
+    def _complete(self, reading: Battery) -> Battery:
+        """The reading with state of charge, time left and the counters."""
+        capacity_ah = self._settings.capacity_mAh / 1000
+        share, left_s = reading.percentage, reading.time_left_s
+        if share is None and reading.current is not None:
+            share = self._filter.update(self._clock(), reading.voltage, -reading.current)
+            left_s = self._filter.time_left_s(self._settings.critical_V)
+        counts = self._gauge.counts
+        return dataclasses.replace(
+            reading,
+            percentage=share,
+            charge=None if share is None else share * (reading.capacity or capacity_ah),
+            design_capacity=reading.design_capacity or capacity_ah,
+            time_left_s=left_s if left_s is not None and math.isfinite(left_s) else None,
+            read_errors=counts.errors,
+            refused=counts.refused,
+            reopened=counts.reopened,
+            resets=counts.resets,
+        )
+
+    def _judge(self, reading: Battery) -> bool:
+        """Sets the alarm; whether it has just been raised."""
+        settings, share = self._settings, reading.percentage
+        charging = reading.power_supply_status == _CHARGING
+        empty = reading.voltage <= settings.critical_V or (
+            share is not None and share <= settings.critical_percentage
+        )
+        low = empty or (share is not None and share <= settings.low_percentage)
+        self._critical_readings = self._critical_readings + 1 if empty and not charging else 0
+        self._low_readings = self._low_readings + 1 if low and not charging else 0
+        before = self.alarm
+        if before == messages.ALARM_CRITICAL:
+            return False
+        if self._critical_readings >= settings.confirm_readings:
+            self.alarm = messages.ALARM_CRITICAL
+        elif self._low_readings >= settings.confirm_readings:
+            self.alarm = messages.ALARM_LOW
+        elif not low and (share is None or share > settings.low_percentage + _LOW_ENDS):
+            self.alarm = messages.ALARM_NONE
+        return self.alarm not in (before, messages.ALARM_NONE)
+
+    def _alarm(self, reading: Battery) -> None:
+        left = "" if reading.percentage is None else f", {100 * reading.percentage:.0f} % left"
+        text = f"{reading.voltage:.2f} V{left}"
+        if self.alarm == messages.ALARM_CRITICAL:
+            self._announce(messages.EVENT_BATTERY_CRITICAL, f"{text}: shutting down")
+            self._on_critical()
+        else:
+            kbps = self._settings.low_bitrate_kbps
+            self._announce(messages.EVENT_BATTERY_LOW, f"{text}: {kbps} kbit/s asked for")
+            self._on_low(kbps)
