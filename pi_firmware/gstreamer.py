@@ -13,6 +13,8 @@ _PACKAGES = {
     "appsrc": "gstreamer1.0-plugins-base",
     "videotestsrc": "gstreamer1.0-plugins-base",
     "videoconvert": "gstreamer1.0-plugins-base",
+    "videoconvertscale": "gstreamer1.0-plugins-base",
+    "libcamerasrc": "gstreamer1.0-libcamera",
 }
 _DEFAULT_PACKAGE = "gstreamer1.0-plugins-good"
 
