@@ -36,7 +36,11 @@ class Payload:
             self.media = Media(settings, self._source, self.ssrc, self._tell_gate)
             self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
             self._battery = Monitor(
-                settings.battery, gauge, publish=self._telemetry.battery, announce=self._announce
+                settings.battery,
+                gauge,
+                publish=self._telemetry.battery,
+                announce=self._announce,
+                on_low=self.media.set_bitrate,
             )
         except BaseException:
             self._source.close()

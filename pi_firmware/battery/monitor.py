@@ -43,8 +43,8 @@ class Monitor:
         *,
         publish: Callable[[Battery], None],
         announce: Callable[[str, str], None],
-        on_low: Callable[[int], None] = lambda kbps: None,
-        on_critical: Callable[[], None] = lambda: None,
+        on_low: Callable[[int], object] = lambda kbps: None,
+        on_critical: Callable[[], object] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.alarm = messages.ALARM_NONE
@@ -64,7 +64,7 @@ class Monitor:
         """Errors, refused readings, re-opened buses and reset chips so far."""
         return self._gauge.counts
 
-    def start(self, on_critical: Callable[[], None] | None = None) -> None:
+    def start(self, on_critical: Callable[[], object] | None = None) -> None:
         """Starts the thread; a second call does nothing."""
         if on_critical is not None:
             self._on_critical = on_critical

@@ -1,5 +1,6 @@
 """What the payload says and does about its battery: alarms, silence, an orderly end."""
 
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -205,6 +206,29 @@ def test_the_command_runs_after_a_critical_battery_only(
     wrong.steps(3)
     wrong.shut_down()
     assert "battery.shutdown_command" in capsys.readouterr().err
+
+
+def test_a_payload_with_an_empty_battery_ends_in_order_and_then_runs_the_command(
+    tmp_path: Path,
+) -> None:
+    mark = tmp_path / "ran"
+    command = [sys.executable, "-c", f"open({str(mark)!r}, 'w')"]
+    settings = {
+        "telemetry.enabled": "false",
+        "camera.uri": "test:?pattern=ball",
+        "battery.uri": "i2c:ina219@fake:0x40?percentage=0.03",
+        "battery.period_s": "0.1",
+        "battery.shutdown_command": str(command),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "pi_firmware"]
+        + [part for name, value in settings.items() for part in ("--set", f"{name}={value}")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "frames: " in done.stdout and mark.exists()
 
 
 def test_thresholds_must_be_in_order() -> None:

@@ -47,7 +47,7 @@ def test_check_reads_the_shipped_file_and_opens_nothing() -> None:
         (["--check", "--config", "no-such.toml"], "no-such.toml: No such file"),
         (["--check", "--set", "gate.min_entropy_bits=9"], "0 to 8"),
         (["--check", "--set", "camera.uri=webcam:"], "unknown scheme"),
-        (["--check", "--set", "battery.uri=i2c:max17048@1:0x36"], "not available yet"),
+        (["--check", "--set", "battery.uri=i2c:max17048@1:0x40"], "allowed for max17048"),
         (["--set", "camera.uri=test:?pattern=cat"], "allowed: zone-plate"),
     ],
 )
