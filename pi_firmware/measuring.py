@@ -33,13 +33,15 @@ def description(camera: CameraSettings) -> str:
     """The tee behind the source and the branch that measures.
 
     A tee without queues serves its branches in turn and in one thread, in the order of their links:
-    this branch has been measured before the frame goes on to the encoder.
+    this branch has been measured before the frame goes on to the encoder. Grey levels stay as they
+    are, whatever range the camera's colorimetry says.
     """
     width_px, height_px = low_resolution_px(camera)
     return (
-        "tee name=split split. ! videoconvertscale name=scale method=nearest-neighbour n-threads=1 "
-        "add-borders=false ! video/x-raw,format=GRAY8,pixel-aspect-ratio=1/1,"
-        f"width={width_px},height={height_px} ! fakesink name=luma sync=false async=false split."
+        "tee name=split split. ! videoconvertscale name=scale method=nearest-neighbour "
+        "matrix-mode=none add-borders=false n-threads=1 "
+        f"! video/x-raw,format=GRAY8,pixel-aspect-ratio=1/1,width={width_px},height={height_px} "
+        "! fakesink name=luma sync=false async=false split."
     )
 
 
