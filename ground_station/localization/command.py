@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ground_station.localization.estimate import PoseEstimate
+    from ground_station.localization.kinematics import Kinematics
     from ground_station.localization.localizer import Localizer
     from ground_station.localization.settings import LocalizerSettings
     from ground_station.recording.frames import FrameSource
@@ -43,6 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate-hz", type=float, default=30.0, metavar="R", help="of a folder of images (30)"
     )
+    parser.add_argument(
+        "--smoothed", metavar="SMOOTHED.txt",
+        help="also write the poses that the frames of the second after each helped to estimate",
+    )  # fmt: skip
     parser.add_argument("--json", metavar="F", help="write figures to this file")
     parser.add_argument(
         "--observations",
@@ -87,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         flight_observations,
         summary,
         write_estimates,
+        write_smoothed,
     )
     from ground_station.mapping import store
     from ground_station.mapping.observations import save_observations
@@ -98,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
         raise LocalizationError(
             f"the preset '{args.preset}' cannot find its first pose: --init TUM.txt is needed"
         )
-    for out in (args.out, args.json, args.observations):
+    if args.smoothed and settings.pose.solver != "rolling":
+        raise LocalizationError("--smoothed: only the solver 'rolling' has a smoother")
+    for out in (args.out, args.json, args.observations, args.smoothed):
         if out and not Path(out).resolve().parent.is_dir():
             raise InputError(f"{out}: its folder does not exist")
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
@@ -109,10 +117,11 @@ def run(args: argparse.Namespace) -> int:
     extractor = create(settings.features.extractor, settings.features.max_features)
     localizer = Localizer(map_, camera, extractor, settings)
     estimates: list[PoseEstimate] = []
+    smoothed: list[Kinematics] = []
     start_s = monotonic()
     interrupted = False
     try:
-        _process(source, localizer, initial, estimates)
+        _process(source, localizer, initial, estimates, smoothed)
     except KeyboardInterrupt:
         interrupted = True
     elapsed_s = monotonic() - start_s
@@ -121,6 +130,8 @@ def run(args: argparse.Namespace) -> int:
     for note in source.notes:
         _say(note)
     write_estimates(args.out, estimates)
+    if args.smoothed:
+        write_smoothed(args.smoothed, smoothed + localizer.finish())
     if args.observations:
         seen = flight_observations(estimates, Path(args.input).resolve().stem, map_, camera)
         save_observations(args.observations, seen)
@@ -149,6 +160,7 @@ def _process(
     localizer: Localizer,
     initial: Any,
     estimates: list[PoseEstimate],
+    smoothed: list[Kinematics],
 ) -> None:
     from ground_station.progress import Progress
 
@@ -163,6 +175,7 @@ def _process(
             estimates.append(
                 localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
             )
+            smoothed += localizer.smoothed()
             progress.step()
 
 

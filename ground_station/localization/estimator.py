@@ -45,6 +45,10 @@ class Estimator(Protocol):
         """States that later frames helped to estimate, each once, when they are final."""
         ...
 
+    def flush(self) -> list[Kinematics]:
+        """`smoothed` and the states that no later frame will help; all is then forgotten."""
+        ...
+
 
 class PoseEstimator:
     """Each frame's pose from its own sights alone; the last two poses predict the next (thesis)."""
@@ -84,6 +88,9 @@ class PoseEstimator:
         return solution.state
 
     def smoothed(self) -> list[Kinematics]:
+        return []
+
+    def flush(self) -> list[Kinematics]:
         return []
 
 
@@ -126,6 +133,9 @@ class FilterEstimator:
 
     def smoothed(self) -> list[Kinematics]:
         return self._smoother.smoothed()
+
+    def flush(self) -> list[Kinematics]:
+        return self._smoother.flush()
 
 
 def make_estimator(camera: Camera, settings: LocalizerSettings) -> Estimator:

@@ -55,6 +55,7 @@ class Localizer:
         self._worker.drop()
         self._judge = Judge(self.settings.state)
         self._estimator: Estimator = self._fresh()
+        self._smoothed: list[Kinematics] = []
         self._keyframe: Keyframe | None = None
         self._followed: Followed | None = None
         self._located: Located | None = None
@@ -81,15 +82,24 @@ class Localizer:
         if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6 or np.linalg.det(T) < 0:
             raise LocalizationError("initial pose: its rotation is not orthonormal")
         self._worker.drop()
+        self._replace(self._fresh())
         self._estimator.restart(time_ns, T)
         self._keyframe = None
 
     def smoothed(self) -> list[Kinematics]:
         """Poses that later frames helped to estimate, each once, some frames after its own.
 
-        Never mixed with the causal ones that `process` returns; empty without a smoother.
+        Never mixed with the causal ones that `process` returns; empty without a smoother. Those of
+        the last frames are not final before `finish`.
         """
-        return self._estimator.smoothed()
+        final, self._smoothed = self._smoothed + self._estimator.smoothed(), []
+        return final
+
+    def finish(self) -> list[Kinematics]:
+        """`smoothed` and what is still open, at a stream's end; all frames are then forgotten."""
+        final = self._smoothed + self._estimator.flush()
+        self.reset()
+        return final
 
     def process(
         self, time_ns: int, image: Image, index: int = 0, exposure_s: float | None = None
@@ -143,6 +153,10 @@ class Localizer:
 
     def _fresh(self) -> Estimator:
         return make_estimator(self.camera, self.settings)
+
+    def _replace(self, estimator: Estimator) -> None:
+        self._smoothed += self._estimator.flush()
+        self._estimator = estimator
 
     def _refuse(self, attempt: Attempt) -> PoseEstimate | None:
         last = self._last_frame_ns
@@ -292,7 +306,8 @@ class Localizer:
         attempt.watch.lap("catch_up")
         if not caught_up:
             return False
-        self._estimator, self._keyframe = estimator, landed.keyframe
+        self._replace(estimator)
+        self._keyframe = landed.keyframe
         self._judge.found_again(landed.time_ns)
         return landed.relocalized
 
@@ -300,7 +315,8 @@ class Localizer:
 
     def _begin_again(self, estimator: Estimator, state: Kinematics) -> None:
         estimator.restart(state.time_ns, state.wTc, state.covariance[:6, :6])
-        self._estimator, self._keyframe = estimator, None
+        self._replace(estimator)
+        self._keyframe = None
         self._judge.found_again(state.time_ns)
 
     def _solved(
@@ -330,8 +346,8 @@ class Localizer:
         verdict = self._judge.unsolved(attempt.time_ns)
         if verdict is State.LOST and self._keyframe is not None:
             # Found again by chance it would only repeat where the camera was.
-            self._keyframe, self._followed, self._estimator = None, None, self._fresh()
-            self._seen = None
+            self._keyframe, self._followed, self._seen = None, None, None
+            self._replace(self._fresh())
         attempt.observations = no_observations()
         return publish(attempt, verdict, reason)
 

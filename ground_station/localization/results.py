@@ -12,6 +12,7 @@ import numpy as np
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.observations import FlightObservations, landmarks_sha256
 from ground_station.mapping.store import Map
@@ -54,6 +55,13 @@ def flight_observations(
         landmark=ids,
         pixel_px=np.concatenate([*pixel_px, np.empty((0, 2))]).astype(np.float32),
     )
+
+
+def write_smoothed(path: str | Path, states: Sequence[Kinematics]) -> None:
+    """Writes what later frames helped to estimate as TUM text: another file than the causal one."""
+    ordered = sorted(states, key=lambda state: state.time_ns)
+    times = [state.time_ns for state in ordered]
+    write_tum(path, Trajectory.from_poses(times, [state.wTc for state in ordered]))
 
 
 def percentiles(values_ms: Sequence[float]) -> dict[str, float]:

@@ -108,6 +108,18 @@ def test_a_folder_becomes_a_trajectory_and_figures(flight, tmp_path, preset):
     assert figures["preset"] == preset and figures["frame"] == "world"
 
 
+def test_smoothed_poses_go_to_a_file_of_their_own(flight, tmp_path):
+    smoothed = tmp_path / "smoothed.txt"
+    more = ["--init", str(flight / "truth.txt"), "--smoothed", str(smoothed)]
+    assert command.run(_args(flight, tmp_path, *more)) == 0
+    causal, later = read_tum(tmp_path / "est.txt"), read_tum(smoothed)
+    assert later.time_ns.tolist() == causal.time_ns.tolist()
+    assert not np.array_equal(later.position_m, causal.position_m)
+    assert np.abs(later.position_m - read_tum(flight / "truth.txt").position_m).max() < 0.01
+    with pytest.raises(LocalizationError, match="--smoothed: only the solver 'rolling'"):
+        command.run(_args(flight, tmp_path, *more, "--preset", "thesis"))
+
+
 def test_what_was_seen_is_written_for_the_maps_refinement(flight, tmp_path):
     from ground_station.mapping import store
     from ground_station.mapping.observations import landmarks_sha256, load_observations
