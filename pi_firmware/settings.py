@@ -16,6 +16,7 @@ from pi_firmware.wire.errors import ConfigError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
 
+WHITE_BALANCES = ("auto", "incandescent", "fluorescent", "daylight", "cloudy")
 ENCODERS = ("x264enc", "v4l2h264enc")
 
 
@@ -23,10 +24,14 @@ ENCODERS = ("x264enc", "v4l2h264enc")
 class CameraSettings:
     """Where frames come from."""
 
-    uri: str = key("test:", "source: replay:FLIGHT.mcap, test:")
+    uri: str = key("test:", "source: libcamera:, v4l2:DEVICE, replay:FLIGHT.mcap, test:")
     width_px: int = key(640, "picture width", unit="px", low=64, high=1920)
     height_px: int = key(480, "picture height", unit="px", low=64, high=1088)
     rate_hz: float = key(30.0, "frames captured a second", unit="Hz", low=1, high=120)
+    exposure_s: float = key(0.0, "fixed exposure; 0: automatic", unit="s", low=0, high=1)
+    gain: float = key(0.0, "fixed gain; 0: automatic", low=0, high=1000)
+    white_balance: str = key("auto", "for which light", choices=WHITE_BALANCES)
+    focus_m: float = key(0.0, "fixed focus; 0: the camera's", unit="m", low=0, high=1000)
 
     def __post_init__(self) -> None:
         for name in ("width_px", "height_px"):
@@ -119,6 +124,30 @@ class BatterySettings:
 
 
 @dataclass(frozen=True)
+class AutopilotSettings:
+    """Who is told the poses, and how the camera sits."""
+
+    uri: str = key("off:", "autopilot: serial:TTY, off:")
+    period_s: float = key(1.0, "time between its states in telemetry", unit="s", low=0.1, high=60)
+    max_age_s: float = key(0.5, "older poses are not sent", unit="s", low=0.05, high=5)
+    world_heading_deg: float = key(
+        0.0, "compass heading of the map's x axis", unit="degrees", low=-360, high=360
+    )
+    mount_roll_deg: float = key(0.0, "the camera's turn", unit="degrees", low=-180, high=180)
+    mount_pitch_deg: float = key(0.0, "the camera's turn", unit="degrees", low=-180, high=180)
+    mount_yaw_deg: float = key(0.0, "the camera's turn", unit="degrees", low=-180, high=180)
+    mount_m: list[float] = key([0.0, 0.0, 0.0], "the camera's place in the vehicle", unit="m")
+    jump_m: float = key(0.5, "a jump that is a reset", unit="m", low=0.01, high=100)
+    jump_deg: float = key(20.0, "a turn that is a reset", unit="degrees", low=1, high=180)
+
+    def __post_init__(self) -> None:
+        if len(self.mount_m) != 3 or max(map(abs, self.mount_m)) > 10:
+            raise ValueError(
+                f"'autopilot.mount_m' is {self.mount_m}; expected three numbers of -10 to 10 m"
+            )
+
+
+@dataclass(frozen=True)
 class TelemetrySettings:
     """Zenoh."""
 
@@ -144,6 +173,7 @@ class Settings:
     encoder: EncoderSettings = table(EncoderSettings)
     link: LinkSettings = table(LinkSettings)
     battery: BatterySettings = table(BatterySettings)
+    autopilot: AutopilotSettings = table(AutopilotSettings)
     telemetry: TelemetrySettings = table(TelemetrySettings)
 
     def __post_init__(self) -> None:

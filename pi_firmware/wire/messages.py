@@ -108,6 +108,51 @@ class Event(Message):
     values: dict[str, int] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Pose(Message):
+    """The ground station's estimate of one frame; `time_ns` is the ground station's clock.
+
+    `capture_ns` is the frame's, of the payload's clock. Position (m) and quaternion x, y, z, w are
+    those of wTc; None where the frame was not solved. `covariance` has 36 numbers, row by row, of
+    the right tangent wTc·exp(xi) in the camera's axes, rotation (rad) before translation (m).
+    """
+
+    SCHEMA: ClassVar[str] = "blimp.pose"
+
+    capture_ns: int
+    sequence: int
+    state: str  # INITIALIZING, TRACKING, DEGRADED or LOST
+    position_m: list[float] | None = None
+    quaternion_xyzw: list[float] | None = None
+    covariance: list[float] | None = None
+    relocalized: bool = False
+
+
+@dataclass(frozen=True)
+class Autopilot(Message):
+    """What the autopilot says of itself, and what it was given; None: it has not said yet."""
+
+    SCHEMA: ClassVar[str] = "blimp.autopilot"
+
+    connected: bool  # its heartbeat was heard within 3 s
+    heartbeats: int = 0
+    armed: bool | None = None
+    mode: int | None = None  # ArduPilot's custom_mode
+    system_status: int | None = None  # MAV_STATE
+    roll_rad: float | None = None
+    pitch_rad: float | None = None
+    yaw_rad: float | None = None
+    battery_V: float | None = None
+    battery_A: float | None = None  # positive when discharging, as MAVLink has it
+    battery_percentage: float | None = None  # 0 to 1
+    sent: int = 0  # poses
+    stale: int = 0  # poses not sent: too old, or out of order
+    lost: int = 0  # not solved
+    refused: int = 0  # not valid
+    reset_counter: int = 0
+    lines_opened: int = 0  # times the serial line was opened
+
+
 EVENT_STARTED = "started"
 EVENT_SOURCE_CUT = "source-cut"
 EVENT_END_OF_STREAM = "end-of-stream"
@@ -157,6 +202,11 @@ def _value(value: Any, kind: Any, what: str) -> Any:
         if value is None:
             return None
         kind = typing.get_args(kind)[0]
+    if typing.get_origin(kind) is list:
+        if not isinstance(value, list):
+            raise TelemetryError(f"{what} must be a list, not {str(value)[:60]!r}")
+        item = typing.get_args(kind)[0]
+        return [_value(v, item, f"{what}[{i}]") for i, v in enumerate(value)]
     if typing.get_origin(kind) is dict:
         if not isinstance(value, dict):
             raise TelemetryError(f"{what} must be an object, not {str(value)[:60]!r}")
