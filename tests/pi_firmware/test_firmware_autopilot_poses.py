@@ -1,0 +1,196 @@
+"""Poses in the autopilot's frames against hand-worked ones, and which of them are sent."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from pi_firmware.autopilot.frames import Mounting, rotation, vehicle_pose
+from pi_firmware.autopilot.poses import PoseGate
+from pi_firmware.settings import AutopilotSettings
+from pi_firmware.wire import messages
+from pi_firmware.wire.errors import TelemetryError
+
+MS = 1_000_000
+HALF = math.sqrt(0.5)
+# The camera looks along the map's x axis, upright: its x is -y of the map, its y is -z, its z is x.
+ALONG_X = (-0.5, 0.5, -0.5, 0.5)
+# It looks along the map's y axis: its x is x of the map, its y is -z, its z is y.
+ALONG_Y = (-HALF, 0.0, 0.0, HALF)
+# It looks down, the top of its picture towards the map's x axis: x is -y, y is -x, z is -z.
+DOWN = (-HALF, HALF, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "mounting", "position", "degrees"),
+    [
+        # The map's x is north: y is west, z up. Ahead along x is north and level.
+        (ALONG_X, Mounting(), (1, -2, -3), (0, 0, 0)),
+        # Along y is west.
+        (ALONG_Y, Mounting(), (1, -2, -3), (0, 0, -90)),
+        # The map's x is east: y is north.
+        (ALONG_X, Mounting(heading_deg=90), (2, 1, -3), (0, 0, 90)),
+        (ALONG_Y, Mounting(heading_deg=90), (2, 1, -3), (0, 0, 0)),
+        # A camera mounted looking down, in a level vehicle that heads north.
+        (DOWN, Mounting(pitch_deg=-90), (1, -2, -3), (0, 0, 0)),
+        # A camera mounted looking to the right sees north: the vehicle heads west.
+        (ALONG_X, Mounting(yaw_deg=90), (1, -2, -3), (0, 0, -90)),
+        # Mounted tilted down by 30 degrees and level in the world: the nose is up by 30.
+        (ALONG_X, Mounting(pitch_deg=-30), (1, -2, -3), (0, 30, 0)),
+        # Mounted upside down and upright in the world: the vehicle is on its back.
+        (ALONG_X, Mounting(roll_deg=180), (1, -2, -3), (-180, 0, 0)),
+        # The camera sits 0.5 m before, 0.1 right of and 0.2 below the centre; the vehicle heads
+        # west, where forward is west, right is north and down is down.
+        (ALONG_Y, Mounting(position_m=(0.5, 0.1, 0.2)), (0.9, -1.5, -3.2), (0, 0, -90)),
+    ],
+)
+def test_hand_worked_poses(
+    quaternion: tuple[float, ...],
+    mounting: Mounting,
+    position: tuple[float, ...],
+    degrees: tuple[float, ...],
+) -> None:
+    pose = vehicle_pose((1.0, 2.0, 3.0), quaternion, None, mounting)
+    np.testing.assert_allclose(pose.position_m, position, atol=1e-12)
+    wanted = rotation(*np.radians(degrees))
+    np.testing.assert_allclose(rotation(*pose.angles_rad), wanted, atol=1e-12)
+
+
+def test_an_unknown_covariance_is_nan_in_its_first_number() -> None:
+    pose = vehicle_pose((0, 0, 0), ALONG_X, None, Mounting())
+    triangle = pose.upper_triangle()
+    assert len(triangle) == 21 and math.isnan(triangle[0])
+
+
+def test_covariance_of_a_level_camera_is_turned_by_hand() -> None:
+    """Ahead is north: the camera's forward is north, right east, down down; turns likewise."""
+    diagonal = np.diag([1.0, 2, 3, 4, 5, 6])  # about right, down, forward; along the same
+    pose = vehicle_pose((0, 0, 0), ALONG_X, diagonal, Mounting())
+    assert pose.covariance is not None
+    np.testing.assert_allclose(np.diag(pose.covariance), [6, 4, 5, 3, 1, 2], atol=1e-12)
+    triangle = pose.upper_triangle()
+    assert [triangle[i] for i in (0, 6, 11, 15, 18, 20)] == pytest.approx([6, 4, 5, 3, 1, 2])
+
+
+def test_covariance_is_what_small_turns_and_shifts_make_of_the_pose() -> None:
+    mounting = Mounting(10, -35, 20, (0.4, -0.1, 0.3), heading_deg=70)
+    rng = np.random.default_rng(3)
+    wRc = rotation(0.3, -0.4, 1.1) @ rotation(*np.radians([-90, 0, -90]))
+    position = np.array([1.0, -2.0, 1.5])
+
+    def quaternion(R: np.ndarray) -> tuple[float, ...]:
+        w = math.sqrt(max(1 + np.trace(R), 0.0)) / 2
+        v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)
+        return (*v, w)
+
+    def state(xi: np.ndarray) -> np.ndarray:
+        turned = wRc @ _turn(xi[:3])
+        pose = vehicle_pose(position + wRc @ xi[3:], quaternion(turned), None, mounting)
+        return np.concatenate([pose.position_m, pose.angles_rad])
+
+    step = 1e-6
+    columns = [(state(step * e) - state(-step * e)) / (2 * step) for e in np.eye(6)]
+    jacobian = np.array(columns).T
+    root = rng.normal(size=(6, 6))
+    covariance = root @ root.T
+    pose = vehicle_pose(position, quaternion(wRc), covariance, mounting)
+    assert pose.covariance is not None
+    np.testing.assert_allclose(pose.covariance, jacobian @ covariance @ jacobian.T, rtol=1e-5)
+
+
+def _turn(omega: np.ndarray) -> np.ndarray:
+    x, y, z = omega
+    return np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def pose(capture_ns: int, x: float = 0.0, **changes: object) -> messages.Pose:
+    made = messages.Pose(
+        time_ns=1,
+        capture_ns=capture_ns,
+        sequence=0,
+        state="TRACKING",
+        position_m=[x, 0.0, 1.0],
+        quaternion_xyzw=list(ALONG_X),
+    )
+    return dataclasses.replace(made, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("state", ["LOST", "INITIALIZING", "lost", ""])
+def test_unsupported_poses_are_not_sent(state: str) -> None:
+    gate = PoseGate(AutopilotSettings())
+    assert gate.take(pose(100 * MS, state=state), 100 * MS) is None
+    assert gate.take(pose(100 * MS, state="DEGRADED", position_m=None), 100 * MS) is None
+    assert (gate.counts.lost, gate.counts.passed) == (2, 0)
+
+
+@pytest.mark.parametrize("age_ms", [501, 60_000, -101, -3_600_000])
+def test_old_poses_and_those_of_another_clock_are_not_sent(age_ms: int) -> None:
+    gate = PoseGate(AutopilotSettings(max_age_s=0.5))
+    now_ns = 10**18
+    assert gate.take(pose(now_ns - age_ms * MS), now_ns) is None
+    assert gate.counts.stale == 1
+    assert gate.take(pose(now_ns - 500 * MS), now_ns) is not None
+
+
+def test_a_pose_out_of_order_is_not_sent_and_a_clock_set_back_is_survived() -> None:
+    gate = PoseGate(AutopilotSettings())
+    now_ns = 10**18
+    assert gate.take(pose(now_ns), now_ns) is not None
+    assert gate.take(pose(now_ns), now_ns) is None
+    assert gate.take(pose(now_ns - 33 * MS), now_ns) is None
+    back_ns = now_ns - 3600 * 10**9
+    assert gate.take(pose(back_ns), back_ns) is not None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"quaternion_xyzw": [0.0, 0.0, 0.0, 0.0]},
+        {"quaternion_xyzw": [0.0, 0.0, 1.0]},
+        {"quaternion_xyzw": None},
+        {"position_m": [0.0, 0.0]},
+        {"position_m": [1e9, 0.0, 0.0]},
+        {"covariance": [0.0] * 35},
+        {"covariance": [-1.0] * 36},
+    ],
+)
+def test_what_is_no_pose_is_refused(changes: dict[str, object]) -> None:
+    gate = PoseGate(AutopilotSettings())
+    assert gate.take(pose(5, **changes), 5) is None
+    assert gate.counts.refused == 1
+
+
+def test_the_reset_counter_counts_relocalizations_returns_and_jumps() -> None:
+    gate = PoseGate(AutopilotSettings(jump_m=0.5, jump_deg=20))
+    at = iter(range(0, 10**12, 33 * MS))
+
+    def take(x: float = 0.0, **changes: object) -> int:
+        now_ns = next(at)
+        gate.take(pose(now_ns, x, **changes), now_ns)
+        return gate.reset_counter
+
+    assert take(relocalized=True) == 0  # the first is no reset
+    assert take(0.05) == 0
+    assert take(0.05, relocalized=True) == 1
+    assert take(0.05, state="DEGRADED", position_m=None) == 1
+    assert take(0.06) == 1  # a frame without a pose is no reset
+    assert take(0.06, state="LOST", position_m=None) == 1
+    assert take(0.07) == 2
+    assert take(0.08) == 2
+    assert take(1.0) == 3
+    assert take(1.01, quaternion_xyzw=list(ALONG_Y)) == 4
+    gate.reset_counter = 255
+    assert take(9.0) == 0
+
+
+def test_a_pose_message_comes_back_as_sent_and_a_wrong_one_is_refused() -> None:
+    sent = pose(5, covariance=[0.5] * 36)
+    assert messages.decode(messages.Pose, messages.encode(sent)) == sent
+    for field, value in (("position_m", 1.0), ("position_m", ["a"]), ("covariance", [math.inf])):
+        text = messages.encode(sent).decode().replace(
+            '"position_m":[0.0,0.0,1.0]' if field == "position_m" else '"relocalized":false',
+            f'"{field}":{value}'.replace("'", '"').replace("inf", "Infinity"),
+        )  # fmt: skip
+        with pytest.raises(TelemetryError, match=field):
+            messages.decode(messages.Pose, text.encode())
