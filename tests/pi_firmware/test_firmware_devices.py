@@ -12,9 +12,12 @@ from pi_firmware.wire.errors import BlimpError, SourceError, StreamError
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("libcamera:", "libcamera: is not available yet (available: replay:, test:)"),
-        ("v4l2:/dev/video0", "v4l2: is not available yet"),
-        ("webcam:0", "unknown scheme"),
+        ("webcam:0", "unknown scheme (available: libcamera:, v4l2:, replay:, test:)"),
+        ("v4l2:video0", "expected v4l2:/dev/videoN"),
+        ("v4l2:/dev/video77", "/dev/video77': No such file"),
+        ("v4l2:/dev/null?focus=3", "focus: the device has no such control"),
+        ("v4l2:/dev/video0?focus=-1", "focus is '-1'; allowed: 0 to 65535"),
+        ("libcamera:?fps=30", "unknown option 'fps'"),
         ("flight.mcap", "expected scheme:path"),
         ("replay:", "expected replay:FLIGHT.mcap"),
         ("replay:/no/such.mcap", "/no/such.mcap: No such file"),
@@ -96,6 +99,17 @@ def test_the_pis_encoder_is_told_its_level_and_repeats_its_parameter_sets() -> N
     assert text == (
         'v4l2h264enc name=encoder extra-controls="controls,repeat_sequence_header=1,'
         'h264_i_frame_period=15,video_bitrate=2000000" ! '
+        "video/x-h264,stream-format=byte-stream,alignment=au,profile=main,level=(string)3 ! "
+        "h264parse config-interval=-1"
+    )
+
+
+def test_the_pis_encoder_reads_a_cameras_dmabufs_where_they_are() -> None:
+    settings = EncoderSettings(name="v4l2h264enc", bitrate_kbps=800)
+    text = encoder.description(settings, CameraSettings(), 30.0, dmabuf=True)
+    assert text == (
+        'v4l2h264enc name=encoder output-io-mode=dmabuf-import extra-controls="controls,'
+        'repeat_sequence_header=1,h264_i_frame_period=15,video_bitrate=800000" ! '
         "video/x-h264,stream-format=byte-stream,alignment=au,profile=main,level=(string)3 ! "
         "h264parse config-interval=-1"
     )

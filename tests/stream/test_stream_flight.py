@@ -332,7 +332,7 @@ def test_a_recording_that_cannot_be_flown_is_one_line(
     [
         ("camera.width_px=320", "640x480"),
         ("gate.min_entropy_bits=99", "0 to 8"),
-        ("camera.uri=libcamera:", "not available yet"),
+        ("camera.uri=v4l2:/dev/video77", "No such file"),
         ("link.host=no.such.host.invalid", "link.host 'no.such.host.invalid'"),
     ],
 )

@@ -1,0 +1,135 @@
+"""`v4l2:/dev/video0`, USB cameras; their controls are set and read back (Linux, videodev2.h)."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pi_firmware import gstreamer
+from pi_firmware.settings import CameraSettings
+from pi_firmware.sources.live import LiveSource, caps
+from pi_firmware.uri import Uri
+
+_QUERYCTRL = struct.Struct("=II32siiiiI8x")
+_CONTROL = struct.Struct("=Ii")
+VIDIOC_QUERYCTRL = 0xC0445624
+VIDIOC_G_CTRL = 0xC008561B
+VIDIOC_S_CTRL = 0xC008561C
+
+_AUTO_WHITE_BALANCE = 0x0098090C
+_GAIN_AUTO = 0x00980912
+_GAIN = 0x00980913
+_WHITE_BALANCE_K = 0x0098091A
+_EXPOSURE_AUTO = 0x009A0901
+_EXPOSURE_100US = 0x009A0902
+_EXPOSURE_MAY_SLOW = 0x009A0903
+_FOCUS = 0x009A090A
+_FOCUS_AUTO = 0x009A090C
+_MANUAL_EXPOSURE = 1
+
+_LIGHT_K = {"incandescent": 2800, "fluorescent": 4200, "daylight": 5500, "cloudy": 6500}
+"""Usual colour temperatures of the lights, as photographers' tables have them."""
+
+Ioctl = Callable[[int, int, bytearray], object]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """One control that the configuration asks for; an optional one may be missing."""
+
+    config_key: str
+    control: int
+    value: int
+    optional: bool = False
+
+
+def wishes(camera: CameraSettings, focus: int | None) -> list[Wish]:
+    """The controls in the order in which a device takes them: an automatic goes off first."""
+    result = [Wish("camera.rate_hz", _EXPOSURE_MAY_SLOW, 0, optional=True)]
+    if camera.exposure_s > 0:
+        ticks = max(1, round(camera.exposure_s * 1e4))
+        result.append(Wish("camera.exposure_s", _EXPOSURE_AUTO, _MANUAL_EXPOSURE))
+        result.append(Wish("camera.exposure_s", _EXPOSURE_100US, ticks))
+    if camera.gain > 0:
+        result.append(Wish("camera.gain", _GAIN_AUTO, 0, optional=True))
+        result.append(Wish("camera.gain", _GAIN, round(camera.gain)))
+    if camera.white_balance != "auto":
+        result.append(Wish("camera.white_balance", _AUTO_WHITE_BALANCE, 0))
+        kelvin = _LIGHT_K[camera.white_balance]
+        result.append(Wish("camera.white_balance", _WHITE_BALANCE_K, kelvin))
+    if focus is not None:
+        result.append(Wish("focus", _FOCUS_AUTO, 0, optional=True))
+        result.append(Wish("focus", _FOCUS, focus))
+    return result
+
+
+def apply(wish: Wish, file: int, ioctl: Ioctl = fcntl.ioctl) -> str:
+    """Sets one control and reads it back; why the device refuses, or nothing."""
+    query = bytearray(_QUERYCTRL.pack(wish.control, 0, b"", 0, 0, 0, 0, 0))
+    try:
+        ioctl(file, VIDIOC_QUERYCTRL, query)
+    except OSError:
+        return "" if wish.optional else f"{wish.config_key}: the device has no such control"
+    _, _, _, low, high, step, _, _ = _QUERYCTRL.unpack(query)
+    if not low <= wish.value <= high:
+        return f"{wish.config_key}: the device takes {low} to {high}, not {wish.value}"
+    control = bytearray(_CONTROL.pack(wish.control, wish.value))
+    try:
+        ioctl(file, VIDIOC_S_CTRL, control)
+        ioctl(file, VIDIOC_G_CTRL, control)
+    except OSError as error:
+        return f"{wish.config_key}: the device refuses {wish.value}: {error.strerror or error}"
+    got = _CONTROL.unpack(control)[1]
+    if abs(got - wish.value) > max(0, step - 1):
+        return f"{wish.config_key}: the device says {got} after it was set to {wish.value}"
+    return ""
+
+
+class V4l2Source(LiveSource):
+    """A V4L2 device; frames carry the driver's timestamps. Raises `SourceError` when it refuses."""
+
+    def __init__(self, uri: Uri, camera: CameraSettings) -> None:
+        uri.only("focus")
+        if not uri.path.startswith("/dev/"):
+            raise uri.fail("expected v4l2:/dev/videoN")
+        if camera.focus_m > 0:
+            raise uri.fail("camera.focus_m: V4L2 knows no metres; give focus=N in the URI")
+        gstreamer.require(("v4l2src",), f"camera.uri '{uri.text}'")
+        focus = int(uri.number("focus", -1, 0, 65_535)) if "focus" in uri.options else None
+        self._uri = uri
+        self._set_controls(camera, focus)
+        # Many USB cameras have YUY2 only; where the formats agree, nothing is converted.
+        sized = caps(camera, "{I420,NV12,YUY2,UYVY}")
+        super().__init__(
+            camera,
+            f"v4l2src name=source ! {sized} ! videoconvert n-threads=1 "
+            "! video/x-raw,format=(string){I420,NV12}",
+        )
+        # What was set was read back.
+        self.exposure_s = camera.exposure_s or None
+        self.gain = camera.gain or None
+
+    def attach(self, pipeline: object) -> None:
+        super().attach(pipeline)
+        self._pipeline.get_by_name("source").set_property("device", self._uri.path)
+
+    def explain(self, message: str) -> str:
+        if "negotiat" in message or "data stream error" in message:
+            return self._unavailable(f"camera.uri '{self._uri.text}'", message)
+        return message
+
+    def _set_controls(self, camera: CameraSettings, focus: int | None) -> None:
+        try:
+            file = os.open(self._uri.path, os.O_RDWR | os.O_NONBLOCK)
+        except OSError as error:
+            raise self._uri.fail(error.strerror or str(error)) from None
+        try:
+            for wish in wishes(camera, focus):
+                refusal = apply(wish, file)
+                if refusal:
+                    raise self._uri.fail(refusal)
+        finally:
+            os.close(file)
