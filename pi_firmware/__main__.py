@@ -36,12 +36,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from pi_firmware import battery, settings, sources
+    from pi_firmware import autopilot, battery, settings, sources
 
     loaded = settings.load(arguments.config, arguments.set)
     if arguments.check:
         sources.check(loaded.camera.uri)
-        battery.open_gauge(loaded.battery.uri)
+        battery.open_gauge(loaded.battery.uri, loaded.battery)
+        autopilot.open_autopilot(loaded.autopilot)
         print("configuration is good")
         return
     from pi_firmware.payload import Payload

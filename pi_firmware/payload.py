@@ -6,6 +6,7 @@ import threading
 import time
 
 from pi_firmware import encoder, gstreamer, link
+from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.gate import Decision, Verdict
 from pi_firmware.media import Counters, Media
@@ -28,6 +29,9 @@ class Payload:
     def __init__(self, settings: Settings) -> None:
         encoder.require(settings.encoder)
         gauge = open_gauge(settings.battery.uri, settings.battery)
+        self._autopilot = open_autopilot(
+            settings.autopilot, lambda state: self._telemetry.autopilot(state)
+        )
         self.settings = settings
         self.ssrc = link.draw_ssrc(settings.link)
         self._source = open_source(settings.camera)
@@ -56,6 +60,8 @@ class Payload:
             self.media.play()
             self._source.start()
             self._battery.start(on_critical=stop.set)
+            self._autopilot.start()
+            self._telemetry.on_pose(self._autopilot.on_pose)
             self._supervise(stop)
         except BlimpError as error:
             self._announce(messages.EVENT_FAILED, str(error))
@@ -85,6 +91,7 @@ class Payload:
         self._source.stop()
         self.media.stop()
         self._source.close()
+        self._autopilot.stop()
         self._battery.stop()
         self._telemetry.close()
         self._battery.shut_down()

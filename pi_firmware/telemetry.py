@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from typing import Any
 
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, open_session
 
 
@@ -16,13 +19,15 @@ class Telemetry:
         self._session: Session | None = None
         self._publishers: dict[str, Any] = {}
         self._alive: Any = None
+        self._payload_id = payload_id
+        self._subscribers: list[Any] = []
         if not settings.enabled:
             return
         import zenoh
 
         self._session = open_session(listen=settings.listen, connect=settings.connect)
         session = self._session.zenoh
-        for kind in (keys.BATTERY, keys.GATE, keys.EVENT):
+        for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT):
             # Events are rare and must arrive; of the others a newer one follows at once.
             control = zenoh.CongestionControl
             self._publishers[kind] = session.declare_publisher(
@@ -47,6 +52,25 @@ class Telemetry:
     def event(self, message: messages.Event) -> None:
         """Publishes an event."""
         self._put(keys.EVENT, message)
+
+    def autopilot(self, message: messages.Autopilot) -> None:
+        """Publishes the autopilot's state."""
+        self._put(keys.AUTOPILOT, message)
+
+    def on_pose(self, take: Callable[[messages.Pose], None]) -> None:
+        """Calls `take` with each pose of this payload that the ground station publishes.
+
+        It is called on a thread of the session; what is no pose as agreed is dropped.
+        """
+        if self._session is None:
+            return
+
+        def received(sample: Any) -> None:
+            with contextlib.suppress(TelemetryError):
+                take(messages.decode(messages.Pose, sample.payload.to_bytes()))
+
+        key = keys.key(self._payload_id, keys.POSE)
+        self._subscribers.append(self._session.zenoh.declare_subscriber(key, received))
 
     def close(self) -> None:
         """Withdraws the liveliness token and closes the session."""

@@ -1,0 +1,303 @@
+"""The autopilot's line over a pseudo-terminal, with a second MAVLink endpoint at its end."""
+
+import math
+import os
+import pty
+import select
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from pi_firmware import autopilot
+from pi_firmware.settings import AutopilotSettings
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import SourceError
+from pi_firmware.wire.telemetry import open_session
+
+LEVEL = [-0.5, 0.5, -0.5, 0.5]  # the camera looks along the map's x axis
+LIMIT_S = 20.0
+
+
+class Vehicle:
+    """An ArduPilot vehicle at the far end: MAVLink on a pseudo-terminal's master."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self.coder = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.coder.robust_parsing = True
+        self.heard: list[Any] = []
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def unplug(self) -> None:
+        os.close(self.master)
+
+    def say(self, message: Any) -> None:
+        os.write(self.master, message.pack(self.coder))
+
+    def listen(self) -> None:
+        if select.select([self.master], [], [], 0.02)[0]:
+            try:
+                data = os.read(self.master, 4096)
+            except OSError:  # nobody has the other end open
+                time.sleep(0.02)
+                return
+            self.heard += self.coder.parse_buffer(data) or []
+
+    def estimates(self) -> list[Any]:
+        return [m for m in self.heard if m.get_type() == "VISION_POSITION_ESTIMATE"]
+
+    def live(self) -> None:
+        """What an autopilot says all the time."""
+        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self.say(mavlink.MAVLink_heartbeat_message(7, 3, armed, 5, mavlink.MAV_STATE_ACTIVE, 3))
+        self.say(mavlink.MAVLink_attitude_message(1000, 0.1, -0.2, 1.5, 0, 0, 0))
+        self.say(mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 3900, 250, 80, 0, 0, 0, 0, 0, 0))
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Iterator[Vehicle]:
+    made = Vehicle(tmp_path / "tty")
+    yield made
+    os.close(made.master)
+
+
+class Pilot:
+    """The payload's side, with all the states it told."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.told: list[messages.Autopilot] = []
+        settings = AutopilotSettings(uri=f"serial:{vehicle.link}?baud=921600", period_s=0.1)
+        self.autopilot = autopilot.open_autopilot(settings, self.told.append)
+
+    def pose(self, x: float, age_ns: int = 0, **changes: Any) -> None:
+        now_ns = time.time_ns()
+        values = {
+            "state": "TRACKING",
+            "position_m": [x, 2.0, 3.0],
+            "quaternion_xyzw": LEVEL,
+            "covariance": [0.01 if i % 7 == 0 else 0.0 for i in range(36)],
+        } | changes
+        self.autopilot.on_pose(
+            messages.Pose(time_ns=now_ns, capture_ns=now_ns - age_ns, sequence=0, **values)
+        )
+
+
+@pytest.fixture
+def pilot(vehicle: Vehicle) -> Iterator[Pilot]:
+    made = Pilot(vehicle)
+    made.autopilot.start()
+    yield made
+    made.autopilot.stop()
+
+
+def until(done: Callable[[], Any], also: Callable[[], Any] = lambda: None) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not done():
+        assert time.monotonic() < end_s, "it did not come"
+        also()
+
+
+def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
+    vehicle: Vehicle, pilot: Pilot
+) -> None:
+    def give() -> None:
+        pilot.pose(1.0)
+        vehicle.listen()
+
+    until(lambda: vehicle.estimates(), give)
+    first = vehicle.estimates()[0]
+    assert (first.x, first.y, first.z) == pytest.approx((1, -2, -3))
+    assert (first.roll, first.pitch, first.yaw) == pytest.approx((0, 0, 0), abs=1e-6)
+    assert len(first.covariance) == 21
+    diagonal = [first.covariance[i] for i in (0, 6, 11, 15, 18, 20)]
+    assert diagonal == pytest.approx([0.01] * 6, rel=1e-5)
+    assert first.reset_counter == 0
+    assert abs(first.usec / 1e6 - time.time()) < LIMIT_S
+    assert first.get_srcComponent() == 197
+    assert vehicle.heard[0].get_type() == "HEARTBEAT"  # it says that it is there before all else
+
+    def give_relocalized() -> None:
+        pilot.pose(1.0, relocalized=True)
+        vehicle.listen()
+
+    until(lambda: vehicle.estimates()[-1].reset_counter >= 1, give_relocalized)
+
+
+def test_stale_and_lost_poses_never_arrive(vehicle: Vehicle, pilot: Pilot) -> None:
+    count = 0
+
+    def give() -> None:
+        nonlocal count
+        count += 1
+        pilot.pose(50.0, age_ns=2 * 10**9) if count % 2 else pilot.pose(60.0, state="LOST")
+        vehicle.listen()
+
+    until(lambda: pilot.told and pilot.told[-1].stale > 3 and pilot.told[-1].lost > 3, give)
+
+    def give_good() -> None:
+        pilot.pose(1.0)
+        vehicle.listen()
+
+    until(lambda: vehicle.estimates(), give_good)
+    assert {m.x for m in vehicle.estimates()} == {1.0}
+
+
+def test_its_heartbeat_attitude_and_battery_come_back(vehicle: Vehicle, pilot: Pilot) -> None:
+    os.write(vehicle.master, b"\xfd\x00garbage\xfe\xff" * 20)  # noise before and between
+
+    def live() -> None:
+        vehicle.live()
+        os.write(vehicle.master, b"\xfd\xff\x00")
+        vehicle.listen()
+
+    until(lambda: pilot.told and pilot.told[-1].battery_V, live)
+    state = pilot.told[-1]
+    assert state.connected and state.heartbeats > 0
+    assert state.armed is True and state.mode == 5
+    assert state.system_status == mavlink.MAV_STATE_ACTIVE
+    angles = (state.roll_rad, state.pitch_rad, state.yaw_rad)
+    assert angles == pytest.approx((0.1, -0.2, 1.5), rel=1e-6)
+    assert (state.battery_V, state.battery_A, state.battery_percentage) == (3.9, 2.5, 0.8)
+    assert messages.decode(messages.Autopilot, messages.encode(state)) == state
+
+
+def test_unknown_figures_and_other_senders_are_not_taken(vehicle: Vehicle, pilot: Pilot) -> None:
+    ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    beat = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    unknown = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 65535, -1, -1, 0, 0, 0, 0, 0, 0)
+    nan = mavlink.MAVLink_attitude_message(0, math.nan, 0, 0, 0, 0, 0)
+    os.write(vehicle.master, beat.pack(ground))
+    vehicle.say(unknown)
+    vehicle.say(nan)
+    before = len(pilot.told)
+    until(lambda: len(pilot.told) > before + 5, vehicle.listen)
+    state = pilot.told[-1]
+    assert not state.connected and state.heartbeats == 0
+    assert (state.battery_V, state.battery_A, state.battery_percentage) == (None, None, None)
+    assert state.roll_rad is None
+
+
+def test_a_line_that_is_unplugged_is_opened_again_and_nothing_waits_for_it(
+    vehicle: Vehicle, pilot: Pilot
+) -> None:
+    def give() -> None:
+        pilot.pose(1.0)
+        vehicle.listen()
+
+    until(lambda: vehicle.estimates(), give)
+    vehicle.unplug()
+    for _ in range(1000):
+        pilot.pose(1.0)
+    vehicle.plug()
+    vehicle.heard.clear()
+    until(lambda: vehicle.estimates(), give)
+    until(lambda: pilot.told[-1].lines_opened >= 2, give)
+
+
+def test_a_line_that_nobody_reads_neither_blocks_poses_nor_the_end(
+    vehicle: Vehicle, pilot: Pilot
+) -> None:
+    for _ in range(3000):  # more than a terminal's buffer holds
+        pilot.pose(1.0)
+        time.sleep(0.0002)
+    ended = threading.Thread(target=pilot.autopilot.stop)
+    ended.start()
+    ended.join(5)
+    assert not ended.is_alive()
+
+
+def test_a_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
+    told: list[messages.Autopilot] = []
+    settings = AutopilotSettings(uri=f"serial:{tmp_path}/none", period_s=0.1)
+    waiting = autopilot.open_autopilot(settings, told.append)
+    waiting.start()
+    until(lambda: len(told) > 1, lambda: time.sleep(0.01))
+    waiting.stop()
+    assert not told[-1].connected and told[-1].lines_opened == 0
+
+
+def test_a_pose_from_the_ground_reaches_the_autopilot_through_the_program(
+    vehicle: Vehicle,
+) -> None:
+    settings = {
+        "camera.uri": "test:?pattern=ball",
+        "telemetry.connect": "[]",
+        "telemetry.listen": "['tcp/127.0.0.1:0']",
+        "autopilot.uri": f"serial:{vehicle.link}",
+        "autopilot.period_s": "0.1",
+        "autopilot.max_age_s": "5",
+    }
+    command = [sys.executable, "-m", "pi_firmware"]
+    command += [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert program.stdout is not None and "payload blimp-1" in program.stdout.readline()
+        endpoint = program.stdout.readline().split()[-1]
+        ground = open_session(connect=[endpoint])
+        states: list[messages.Autopilot] = []
+        ground.zenoh.declare_subscriber(
+            keys.key("blimp-1", keys.AUTOPILOT),
+            lambda s: states.append(messages.decode(messages.Autopilot, s.payload.to_bytes())),
+        )
+
+        def give() -> None:
+            made = messages.Pose(
+                time_ns=1, capture_ns=time.time_ns(), sequence=0, state="TRACKING",
+                position_m=[1.0, 2.0, 3.0], quaternion_xyzw=LEVEL,
+            )  # fmt: skip
+            ground.zenoh.put(keys.key("blimp-1", keys.POSE), b"no pose")
+            ground.zenoh.put(keys.key("blimp-1", keys.POSE), messages.encode(made))
+            vehicle.live()
+            vehicle.listen()
+
+        until(lambda: vehicle.estimates() and states and states[-1].connected, give)
+        assert vehicle.estimates()[-1].z == pytest.approx(-3)
+        ground.close()
+        program.terminate()
+        _, errors = program.communicate(timeout=LIMIT_S)
+        assert (program.returncode, errors) == (0, "")
+    finally:
+        program.kill()
+        program.communicate()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("udp:127.0.0.1", "unknown scheme (available: serial:, off:)"),
+        ("serial:", "expected serial:/dev/TTY?baud=RATE"),
+        ("serial:/dev/x?baud=1", "baud is '1'; allowed: 1200 to 4e+06"),
+        ("serial:/dev/x?rate=1", "unknown option 'rate'"),
+        ("off:x", "takes no path"),
+    ],
+)
+def test_a_wrong_autopilot_is_refused_in_one_line(text: str, named: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        autopilot.open_autopilot(AutopilotSettings(uri=text))
+    assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_nothing_of_it_is_imported_while_it_is_off() -> None:
+    code = (
+        "import sys; from pi_firmware import autopilot, battery, settings\n"
+        "autopilot.open_autopilot(settings.AutopilotSettings()).start()\n"
+        "battery.open_gauge('fake:')\n"
+        "print(sorted({'serial', 'pymavlink', 'smbus2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[]\n"
