@@ -7,27 +7,46 @@ from collections.abc import Callable
 from pi_firmware import uri
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Source, Stamp
-from pi_firmware.sources.clock import ClockSource
-from pi_firmware.sources.libcamera import LibcameraSource
-from pi_firmware.sources.pattern import PatternSource
-from pi_firmware.sources.replay import ReplaySource
-from pi_firmware.sources.v4l2 import V4l2Source
 
 __all__ = ["Source", "Stamp", "check", "open_source"]
 
 WHAT = "camera.uri"
 
 
-def _test_source(parsed: uri.Uri, camera: CameraSettings) -> Source:
+# Each source is imported where it is chosen: a payload that flies loads no reader of recordings.
+
+
+def _libcamera(parsed: uri.Uri, camera: CameraSettings) -> Source:
+    from pi_firmware.sources.libcamera import LibcameraSource
+
+    return LibcameraSource(parsed, camera)
+
+
+def _v4l2(parsed: uri.Uri, camera: CameraSettings) -> Source:
+    from pi_firmware.sources.v4l2 import V4l2Source
+
+    return V4l2Source(parsed, camera)
+
+
+def _replay(parsed: uri.Uri, camera: CameraSettings) -> Source:
+    from pi_firmware.sources.replay import ReplaySource
+
+    return ReplaySource(parsed, camera)
+
+
+def _test(parsed: uri.Uri, camera: CameraSettings) -> Source:
+    from pi_firmware.sources.clock import ClockSource
+    from pi_firmware.sources.pattern import PatternSource
+
     is_clock = parsed.options.get("pattern") == "clock"
     return ClockSource(parsed, camera) if is_clock else PatternSource(parsed, camera)
 
 
 _SOURCES: dict[str, Callable[[uri.Uri, CameraSettings], Source]] = {
-    "libcamera": LibcameraSource,
-    "v4l2": V4l2Source,
-    "replay": ReplaySource,
-    "test": _test_source,
+    "libcamera": _libcamera,
+    "v4l2": _v4l2,
+    "replay": _replay,
+    "test": _test,
 }
 
 
