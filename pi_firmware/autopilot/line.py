@@ -60,6 +60,7 @@ class SerialAutopilot:
         self._thread: threading.Thread | None = None
         self._values: dict[str, Any] = {}
         self._heard_s = -math.inf
+        self._reason = ""
         self._heartbeats = self._lines = 0
         self._sent = 0
         self._next_heartbeat_s = self._next_state_s = 0.0
@@ -87,9 +88,13 @@ class SerialAutopilot:
     def state(self) -> State:
         """What is known of the autopilot now, and the counters."""
         counts = self.poses.counts
+        connected = time.monotonic() - self._heard_s < _SILENT_S
+        if not connected:
+            self._values = {}  # what it said before it fell silent is no longer so
         return State(
             time_ns=time.time_ns(),
-            connected=time.monotonic() - self._heard_s < _SILENT_S,
+            connected=connected,
+            reason=self._reason,
             heartbeats=self._heartbeats,
             sent=self._sent,
             stale=counts.stale,
@@ -109,14 +114,16 @@ class SerialAutopilot:
                     self._path, self._baud, timeout=0, write_timeout=_WRITE_LIMIT_S, exclusive=True
                 ) as port:
                     self._lines += 1
+                    self._reason = ""
                     self._talk(port)
-            except (OSError, ValueError):  # pyserial's errors are OSError, too
-                pass
+            except Exception as error:  # whatever it is, a flight does not end for a line
+                self._reason = str(error)[:200]
             pause_s = _FIRST_PAUSE_S if self._lines > lines else min(2 * pause_s, _LONGEST_PAUSE_S)
             until_s = time.monotonic() + pause_s
             while not self._end.is_set() and time.monotonic() < until_s:
-                self._judge_waiting()
-                self._tell()
+                with contextlib.suppress(Exception):
+                    self._judge_waiting()
+                    self._tell()
                 self._end.wait(_TICK_S)
 
     def _talk(self, port: Any) -> None:

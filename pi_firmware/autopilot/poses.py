@@ -13,6 +13,7 @@ from pi_firmware.wire.messages import Pose
 
 _SENT_STATES = ("TRACKING", "DEGRADED")
 _FARTHEST_M = 10_000.0
+_LARGEST_VARIANCE = 1e12  # MAVLink's numbers have single precision
 _SPEED_M_S = 3.0  # no indoor blimp is faster; what moves farther has jumped
 _TURN_DEG_S = 120.0
 _FUTURE_NS = 100_000_000  # a capture time so far ahead is of another clock
@@ -82,7 +83,7 @@ class PoseGate:
             if len(message.covariance) != 36:
                 return None
             covariance = np.array(message.covariance, float).reshape(6, 6)
-            if np.diag(covariance).min() < 0:
+            if np.diag(covariance).min() < 0 or np.abs(covariance).max() > _LARGEST_VARIANCE:
                 return None
         try:
             return vehicle_pose(position, quaternion, covariance, self._mounting)

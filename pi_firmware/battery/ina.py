@@ -55,11 +55,11 @@ class Ina219:
         drop = signed(self._bus.read(SHUNT_VOLTAGE))
         bus = self._bus.read(BUS_VOLTAGE)
         current = signed(self._bus.read(CURRENT))
+        _check_reset(self, self._configuration, self._calibration)
         if bus & 0x1:
             raise _refused(self.counts, "ina219: the current is beyond the calibrated range")
         if abs(drop) >= round(_INA219_RANGES_V[self._gain] / 10e-6):
             raise _refused(self.counts, "ina219: the shunt's voltage is beyond the range")
-        _check_reset(self, self._configuration, self._calibration)
         # The chip measures at IN-, behind the shunt; the cell is before it while discharging.
         voltage = ina219_bus_voltage(bus)
         if self._shunt.discharge_positive:
@@ -109,9 +109,9 @@ class Ina226:
         drop = signed(self._bus.read(SHUNT_VOLTAGE))
         bus = self._bus.read(BUS_VOLTAGE)
         current = signed(self._bus.read(CURRENT))
+        _check_reset(self, self._configuration, self._calibration)
         if drop in (-0x8000, 0x7FFF):
             raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
-        _check_reset(self, self._configuration, self._calibration)
         return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
 
     def close(self) -> None:

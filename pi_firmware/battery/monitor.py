@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import subprocess
@@ -91,10 +92,9 @@ class Monitor:
             self._announce(messages.EVENT_GAUGE_BACK, "the battery gauge answers again")
         self._failures, self._silent = 0, False
         completed = self._complete(reading)
-        turned = self._judge(completed)
-        self._publish(dataclasses.replace(completed, alarm=self.alarm))
-        if turned:
+        if self._judge(completed):
             self._alarm(completed)
+        self._publish(dataclasses.replace(completed, alarm=self.alarm))
         return self._settings.period_s
 
     def shut_down(self) -> None:
@@ -113,7 +113,9 @@ class Monitor:
             try:
                 pause_s = self.step(time.time_ns())
             except Exception as error:  # whatever it is, a flight does not end for a gauge
-                pause_s = self._failed(f"{type(error).__name__}: {error}")
+                pause_s = self._settings.period_s
+                with contextlib.suppress(Exception):  # telling of it may fail, too
+                    pause_s = self._failed(f"{type(error).__name__}: {error}")
         self._gauge.close()
 
     def _believable(self, reading: Battery) -> Battery:
@@ -180,12 +182,13 @@ class Monitor:
         return self.alarm not in (before, messages.ALARM_NONE)
 
     def _alarm(self, reading: Battery) -> None:
+        """Acts first and says it then: a link that hangs must not hold up a shutdown."""
         left = "" if reading.percentage is None else f", {100 * reading.percentage:.0f} % left"
         text = f"{reading.voltage:.2f} V{left}"
         if self.alarm == messages.ALARM_CRITICAL:
-            self._announce(messages.EVENT_BATTERY_CRITICAL, f"{text}: shutting down")
             self._on_critical()
+            self._announce(messages.EVENT_BATTERY_CRITICAL, f"{text}: shutting down")
         else:
             kbps = self._settings.low_bitrate_kbps
-            self._announce(messages.EVENT_BATTERY_LOW, f"{text}: {kbps} kbit/s asked for")
             self._on_low(kbps)
+            self._announce(messages.EVENT_BATTERY_LOW, f"{text}: {kbps} kbit/s asked for")

@@ -151,6 +151,7 @@ class Autopilot(Message):
     refused: int = 0  # not valid
     reset_counter: int = 0
     lines_opened: int = 0  # times the serial line was opened
+    reason: str = ""  # why it is not open
 
 
 EVENT_STARTED = "started"

@@ -229,6 +229,37 @@ def test_a_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
     until(lambda: len(told) > 1, lambda: time.sleep(0.01))
     waiting.stop()
     assert not told[-1].connected and told[-1].lines_opened == 0
+    assert "No such file" in told[-1].reason
+
+
+def test_a_vehicle_that_falls_silent_is_not_quoted_any_more(
+    vehicle: Vehicle, pilot: Pilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    until(lambda: pilot.told and pilot.told[-1].connected, vehicle.live)
+    monkeypatch.setattr("pi_firmware.autopilot.line._SILENT_S", 0.05)
+    until(lambda: not pilot.told[-1].connected, vehicle.listen)
+    assert pilot.told[-1].battery_V is None and pilot.told[-1].armed is None
+
+
+def test_a_telemetry_that_fails_does_not_stop_the_poses(vehicle: Vehicle) -> None:
+    def broken(state: messages.Autopilot) -> None:
+        raise RuntimeError("closed")
+
+    settings = AutopilotSettings(uri=f"serial:{vehicle.link}", period_s=60)
+    pilot = autopilot.open_autopilot(settings, broken)
+    pilot.start()
+
+    def give() -> None:
+        pilot.on_pose(
+            messages.Pose(
+                time_ns=1, capture_ns=time.time_ns(), sequence=0, state="TRACKING",
+                position_m=[1.0, 2.0, 3.0], quaternion_xyzw=LEVEL,
+            )
+        )  # fmt: skip
+        vehicle.listen()
+
+    until(lambda: len(vehicle.estimates()) > 3, give)
+    pilot.stop()
 
 
 def test_a_pose_from_the_ground_reaches_the_autopilot_through_the_program(

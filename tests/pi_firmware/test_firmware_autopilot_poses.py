@@ -153,6 +153,7 @@ def test_a_pose_out_of_order_is_not_sent_and_a_clock_set_back_is_survived() -> N
         {"position_m": [1e9, 0.0, 0.0]},
         {"covariance": [0.0] * 35},
         {"covariance": [-1.0] * 36},
+        {"covariance": [1e300] * 36},
     ],
 )
 def test_what_is_no_pose_is_refused(changes: dict[str, object]) -> None:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +186,36 @@ def test_the_thread_outlives_whatever_a_gauge_throws() -> None:
     unused = Script({"voltage": 3.8})
     battery.Monitor(settings, unused, publish=lambda m: None, announce=lambda n, t: None).stop()
     assert unused.closed
+
+
+def test_a_link_that_fails_does_not_hold_up_the_end() -> None:
+    ended = threading.Event()
+
+    def broken(*_: Any) -> None:
+        raise RuntimeError("the link hangs")
+
+    monitor = battery.Monitor(
+        BatterySettings(confirm_readings=1, period_s=0.1),
+        Script({"voltage": 3.2}),
+        publish=broken,
+        announce=broken,
+        on_critical=ended.set,
+    )
+    monitor.start()
+    assert ended.wait(10)
+    monitor.stop()
+    failing = battery.Monitor(
+        BatterySettings(period_s=0.1),
+        silent := Script(*[GaugeError("gone")] * 6, {"voltage": 3.8}),
+        publish=broken,
+        announce=broken,
+    )
+    failing.start()
+    end_s = time.monotonic() + 20
+    while len(silent.readings) > 1 and time.monotonic() < end_s:
+        time.sleep(0.05)
+    assert len(silent.readings) == 1
+    failing.stop()
 
 
 def test_the_command_runs_after_a_critical_battery_only(
