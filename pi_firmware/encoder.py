@@ -73,12 +73,13 @@ class Adaptation:
     def __init__(self, encoder: EncoderSettings) -> None:
         self._settings = encoder
         self.bitrate_kbps = float(encoder.bitrate_kbps)
+        self.ceiling_kbps = encoder.bitrate_kbps
         self.gop_frames = encoder.gop_frames
 
     def limited(self, kbps: float) -> float:
         """A bit rate within the bounds."""
         settings = self._settings
-        return max(settings.min_bitrate_kbps, min(settings.bitrate_kbps, kbps))
+        return max(settings.min_bitrate_kbps, min(self.ceiling_kbps, kbps))
 
     def report(self, lost: float, round_trip_s: float) -> None:
         """Takes a report: the share of packets lost, 0 to 1, and the round trip.
@@ -132,6 +133,11 @@ class Encoder:
                 controls = self._gst.Structure.from_string(text)[0]
                 self._element.set_property("extra-controls", controls)
         return limited
+
+    def limit_bitrate(self, kbps: int) -> int:
+        """Never more than this from now on, whatever the link bears; returns the one now set."""
+        self._adaptation.ceiling_kbps = min(kbps, self._settings.bitrate_kbps)
+        return self.set_bitrate(round(self._adaptation.bitrate_kbps))
 
     def link_report(self, lost: float, round_trip_s: float) -> None:
         """Adapts to what the ground saw, unless `encoder.adapt` is false."""

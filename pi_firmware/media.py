@@ -87,6 +87,10 @@ class Media:
         """Asks the encoder for this bit rate, within the configured bounds; returns the one set."""
         return self._encoder.set_bitrate(kbps)
 
+    def limit_bitrate(self, kbps: int) -> int:
+        """Holds the encoder to this bit rate from now on; returns the one now set."""
+        return self._encoder.limit_bitrate(kbps)
+
     def force_idr(self) -> None:
         """Makes the next frame an IDR."""
         self._encoder.force_idr()

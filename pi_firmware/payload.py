@@ -44,7 +44,7 @@ class Payload:
                 gauge,
                 publish=self._telemetry.battery,
                 announce=self._announce,
-                on_low=self.media.set_bitrate,
+                on_low=self.media.limit_bitrate,
             )
         except BaseException:
             self._source.close()

@@ -11,7 +11,7 @@ import pytest
 
 from pi_firmware import battery
 from pi_firmware.battery.bus import Counts, GaugeError
-from pi_firmware.settings import BatterySettings, load
+from pi_firmware.settings import BatterySettings, EncoderSettings, load
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import ConfigError
 from pi_firmware.wire.messages import Battery
@@ -237,6 +237,24 @@ def test_the_command_runs_after_a_critical_battery_only(
     wrong.steps(3)
     wrong.shut_down()
     assert "battery.shutdown_command" in capsys.readouterr().err
+
+
+def test_a_low_battery_holds_the_encoder_down_whatever_the_link_bears() -> None:
+    from pi_firmware.encoder import Encoder
+
+    class Element:
+        """Where a GStreamer element would be."""
+
+        def set_property(self, name: str, value: int) -> None:
+            self.bitrate = value
+
+    element = Element()
+    encoder = Encoder(element, EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=200), 30.0)
+    encoder.set_bitrate(400)
+    assert encoder.limit_bitrate(600) == 400  # a bad link already asked for less
+    for _ in range(50):
+        encoder.link_report(0.0, 0.01)  # and a good one asks for more
+    assert encoder.bitrate_kbps == element.bitrate == 600
 
 
 def test_a_payload_with_an_empty_battery_ends_in_order_and_then_runs_the_command(
