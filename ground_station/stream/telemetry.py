@@ -1,4 +1,4 @@
-"""What the payloads say: battery, gate, events and liveliness, kept per payload."""
+"""What the payloads say: battery, gate, autopilot, events and liveliness, kept per payload."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ _KINDS: dict[str, type[messages.Message]] = {
     keys.BATTERY: messages.Battery,
     keys.GATE: messages.Gate,
     keys.EVENT: messages.Event,
+    keys.AUTOPILOT: messages.Autopilot,
 }
 _KEPT_DECISIONS = 10_000
 _KEPT_EVENTS = 200
@@ -43,6 +44,7 @@ class PayloadState:
     alive: bool = False
     battery: messages.Battery | None = None
     gate: messages.Gate | None = None
+    autopilot: messages.Autopilot | None = None
     decisions: dict[int, messages.Gate] = field(default_factory=dict)
     events: list[messages.Event] = field(default_factory=list)
     refused: int = 0
@@ -178,6 +180,8 @@ def _keep(state: PayloadState, message: messages.Message) -> None:
     """Puts a message into its payload's state."""
     if isinstance(message, messages.Battery):
         state.battery = message
+    elif isinstance(message, messages.Autopilot):
+        state.autopilot = message
     elif isinstance(message, messages.Gate):
         state.gate = message
         state.decisions[message.sequence] = message

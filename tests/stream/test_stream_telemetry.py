@@ -53,6 +53,15 @@ def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
     two.close()
 
 
+def test_an_autopilots_state_is_kept(listener: TelemetryListener) -> None:
+    telemetry = payload(listener)
+    sent = messages.Autopilot(time_ns=3, connected=True, armed=False, battery_V=3.9)
+    telemetry.autopilot(sent)
+    state = listener.wait("blimp-1", lambda s: s.autopilot is not None, LIMIT_S)
+    assert state is not None and state.autopilot == sent
+    telemetry.close()
+
+
 def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryListener) -> None:
     telemetry = payload(listener)
     for sequence in range(50):
