@@ -21,3 +21,7 @@ class InputError(GroundStationError):
 
 class MapError(GroundStationError):
     """A map that cannot be built, read or used with this localizer."""
+
+
+class KeysError(GroundStationError):
+    """An authority, certificate or key that cannot be made, read or used."""

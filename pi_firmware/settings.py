@@ -152,13 +152,14 @@ class TelemetrySettings:
     """Zenoh."""
 
     enabled: bool = key(True, "false sends no telemetry")
-    connect: list[str] = key([LOCAL_ENDPOINT], "endpoints to connect to, tcp/HOST:PORT")
-    listen: list[str] = key([], "endpoints to listen on, tcp/HOST:PORT; port 0: any free one")
+    connect: list[str] = key([LOCAL_ENDPOINT], "endpoints to connect to, tcp/ or tls/HOST:PORT")
+    listen: list[str] = key([], "endpoints to listen on; port 0: any free one")
+    certificates: str = key("", "folder that `blimp keys payload` wrote; empty: loopback only")
 
     def __post_init__(self) -> None:
         for endpoint in (*self.connect, *self.listen):
             try:
-                check_endpoint(endpoint)
+                check_endpoint(endpoint, certified=bool(self.certificates))
             except TelemetryError as error:
                 raise ValueError(str(error)) from None
 

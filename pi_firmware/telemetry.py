@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pi_firmware.settings import TelemetrySettings
-from pi_firmware.wire import keys, messages
+from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, open_session
 
@@ -25,7 +25,16 @@ class Telemetry:
             return
         import zenoh
 
-        self._session = open_session(listen=settings.listen, connect=settings.connect)
+        if settings.certificates:
+            held = credentials.load(settings.certificates)
+            if held.name != f"{credentials.PAYLOAD}.{payload_id}":
+                raise TelemetryError(
+                    f"certificates in {settings.certificates} are {held.name}'s,"
+                    f" not payload.{payload_id}'s"
+                )
+        self._session = open_session(
+            listen=settings.listen, connect=settings.connect, certificates=settings.certificates
+        )
         session = self._session.zenoh
         for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT):
             # Events are rare and must arrive; of the others a newer one follows at once.

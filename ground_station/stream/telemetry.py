@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from pi_firmware.wire import keys, messages
@@ -72,8 +73,9 @@ class TelemetryListener:
     """Listens to all payloads; a context manager. Its methods can be called from any thread.
 
     An endpoint `tcp/127.0.0.1:0` takes a free port, which `endpoints` then tells. Raises
-    `TelemetryError` with one line when an endpoint is in use. `on_event` is called with the
-    payload's id for each event, on a thread of the session.
+    `TelemetryError` with one line when an endpoint is in use. `certificates` is the folder that
+    `blimp keys ground` wrote, without which only loopback is spoken to. `on_event` is called with
+    the payload's id for each event, on a thread of the session.
     """
 
     def __init__(
@@ -81,12 +83,13 @@ class TelemetryListener:
         listen: Sequence[str] = (LOCAL_ENDPOINT,),
         *,
         connect: Sequence[str] = (),
+        certificates: str | Path = "",
         on_event: Callable[[str, messages.Event], None] | None = None,
     ) -> None:
         self._states: dict[str, PayloadState] = {}
         self._changed = threading.Condition()
         self._on_event = on_event
-        self._session = open_session(listen=listen, connect=connect)
+        self._session = open_session(listen=listen, connect=connect, certificates=certificates)
         self.endpoints = self._session.listening
         session = self._session.zenoh
         # One subscriber for all kinds keeps the order in which a payload said things.

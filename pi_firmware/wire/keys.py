@@ -9,6 +9,7 @@ from pi_firmware.wire.errors import TelemetryError
 ROOT = "blimp"
 BATTERY, HEALTH, GATE, EVENT, POSE = "battery", "health", "gate", "event", "pose"
 COMMAND, ALIVE, AUTOPILOT = "command", "alive", "autopilot"
+CLOCK, TIME = "clock", "time"  # the payload answers the one, the ground station the other
 
 _PAYLOAD_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 

@@ -1,0 +1,1 @@
+"""The small authority of the ground station: certificates and keys, and who may use them."""

@@ -1,0 +1,242 @@
+"""The authority's folder: what it signed, for whom, and the folders to copy to the machines.
+
+    FOLDER/authority.json         members and the step of a rotation
+    FOLDER/authorities/N.pem|key  the authorities, newest last
+    FOLDER/payload/ID/            to copy to the payload: certificate, access list, SRTP, SSH
+    FOLDER/ground/NAME/           to copy to the ground station: the same, and all SRTP keys
+
+Zenoh reads no revocation list. A revoked name leaves the access lists of all others, which holds on
+each machine once its new folder is there and its program was started anew; a rotation of the
+authority ends what the old one signed, whatever the lists say.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import KeysError
+from ground_station.keys import certificates
+from ground_station.keys.certificates import Pair
+from pi_firmware.wire import credentials, keys
+from pi_firmware.wire.credentials import GROUND, PAYLOAD
+
+SCHEMA = "blimp.authority/1"
+AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 730
+STEPS = ("settled", "both trusted", "new certificates")
+SRTP, SSH = "srtp.key", "ssh_ed25519"
+
+
+class Authority:
+    """An authority's folder, read; raises `KeysError` with one line when it is none."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            document = json.loads((folder / "authority.json").read_bytes())
+            self.members: dict[str, dict[str, Any]] = dict(document["members"])
+            self.trusted: list[int] = [int(number) for number in document["trusted"]]
+            self.signing, self.step = int(document["signing"]), int(document["step"])
+            known = document["schema"] == SCHEMA and 0 <= self.step < len(STEPS)
+            for name in self.members:
+                credentials.check_name(name)
+        except FileNotFoundError:
+            raise KeysError(f"{folder}: no authority here; make one with 'init'") from None
+        except OSError as error:
+            raise KeysError(f"{folder}: {error.strerror or error}") from None
+        except (ValueError, KeyError, TypeError, RecursionError, AttributeError):
+            known = False
+        if not known:
+            raise KeysError(f"{folder}/authority.json: not of schema {SCHEMA}")
+
+    @classmethod
+    def create(cls, folder: Path) -> Authority:
+        """A new authority; raises `KeysError` when the folder holds anything."""
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise KeysError(f"{folder}: exists already, and keys are never overwritten")
+        _folder(folder)
+        self = cls.__new__(cls)
+        self.folder, self.members, self.trusted, self.signing, self.step = folder, {}, [1], 1, 0
+        self._make(1)
+        self._save()
+        return self
+
+    def add(self, role: str, member: str, days: int = CERTIFICATE_DAYS) -> Path:
+        """A new machine's folder; raises `KeysError` when the name is taken or was revoked."""
+        name = f"{role}.{_member(member)}"
+        if name in self.members:
+            state = "was revoked" if self.members[name]["revoked"] else "exists already"
+            raise KeysError(f"{role} '{member}' {state}; take another name")
+        folder = _folder(self.of(name))
+        self._sign(name, days)
+        private, public = certificates.make_ssh_key()
+        write_private(folder / SSH, private)
+        write_private(folder / f"{SSH}.pub", public)
+        if role == PAYLOAD:
+            write_private(folder / SRTP, certificates.make_srtp_key())
+        self.members[name] = {"revoked": False, "days": days}
+        self._save()
+        return folder
+
+    def revoke(self, name: str) -> None:
+        """Takes a name out of all access lists; its files move to `revoked/`."""
+        credentials.check_name(name)
+        if name not in self.members or self.members[name]["revoked"]:
+            raise KeysError(f"{name}: no such member, or revoked already")
+        self.members[name]["revoked"] = True
+        self._save()
+        _folder(self.folder / "revoked")
+        shutil.move(self.of(name), self.folder / "revoked" / name)
+
+    def rotate(self) -> str:
+        """Goes one step of a rotation and says which it was.
+
+        First all trust the old and the new authority, then all get certificates of the new one,
+        then the old one goes. Machines whose folders were copied after each step speak throughout.
+        """
+        if self.step == 0:
+            self._make(self.signing + 1)
+            self.trusted = [self.signing, self.signing + 1]
+        elif self.step == 1:
+            self.signing = self.trusted[-1]
+            for name in self.live():
+                self._sign(name, self.members[name]["days"])
+        else:
+            self.trusted = [self.signing]
+        self.step = (self.step + 1) % len(STEPS)
+        self._save()
+        return STEPS[self.step]
+
+    def live(self) -> list[str]:
+        """The common names that are not revoked, sorted."""
+        return sorted(name for name, entry in self.members.items() if not entry["revoked"])
+
+    def of(self, name: str) -> Path:
+        """The folder of a common name's files."""
+        return self.folder.joinpath(*name.split(".", 1))
+
+    def check(self, now: datetime.datetime, soon_days: int = 30) -> list[str]:
+        """What is wrong, one line each: missing or open files, wrong or ending certificates."""
+        problems = []
+        for name in self.live():
+            try:
+                held = credentials.load(self.of(name))
+                common, until = certificates.inspect(
+                    (held.folder / credentials.CERTIFICATE).read_bytes(),
+                    (held.folder / credentials.AUTHORITIES).read_bytes(),
+                )
+            except (credentials.TelemetryError, KeysError, OSError) as error:
+                problems.append(f"{name}: {error}")
+                continue
+            if common != name or held.name != name:
+                problems.append(f"{name}: the certificate is {common}'s")
+            if set(held.peers) != set(self._peers(name)):
+                problems.append(f"{name}: its access list is not the authority's")
+            if until - now < datetime.timedelta(days=soon_days):
+                problems.append(f"{name}: ends on {until:%Y-%m-%d}")
+        for path in sorted(self.folder.rglob("*")):
+            if path.is_file() and path.stat().st_mode & 0o077:
+                problems.append(f"{path}: others can read it; allowed is mode 0600")
+        return problems
+
+    def _peers(self, name: str) -> list[str]:
+        other = GROUND if name.startswith(PAYLOAD) else PAYLOAD
+        return [peer for peer in self.live() if peer.startswith(other + ".")]
+
+    def _sign(self, name: str, days: int) -> None:
+        pair = certificates.make_certificate(name, self._pair(self.signing), _until(days))
+        write_private(self.of(name) / credentials.KEY, pair.key, replace=True)
+        write_private(self.of(name) / credentials.CERTIFICATE, pair.certificate, replace=True)
+
+    def _make(self, number: int) -> None:
+        pair = certificates.make_authority(f"blimp authority {number}", _until(AUTHORITY_DAYS))
+        folder = _folder(self.folder / "authorities")
+        # A step that was cut short leaves its authority behind; it signed nothing yet.
+        write_private(folder / f"{number}.key", pair.key, replace=True)
+        write_private(folder / f"{number}.pem", pair.certificate, replace=True)
+
+    def _pair(self, number: int) -> Pair:
+        folder = self.folder / "authorities"
+        try:
+            return Pair(
+                (folder / f"{number}.pem").read_bytes(), (folder / f"{number}.key").read_bytes()
+            )
+        except OSError as error:
+            raise KeysError(f"{error.filename}: {error.strerror}") from None
+
+    def _save(self) -> None:
+        """Writes the members' trust and access lists, then the authority's own file."""
+        bundle = b"".join(self._pair(number).certificate for number in self.trusted)
+        live = self.live()
+        for name in live:
+            access = {"schema": credentials.SCHEMA, "name": name, "peers": self._peers(name)}
+            folder = self.of(name)
+            write_private(folder / credentials.AUTHORITIES, bundle, replace=True)
+            write_private(folder / credentials.ACCESS, _json(access), replace=True)
+            if name.startswith(GROUND):
+                self._give_srtp(folder, [peer for peer in live if peer.startswith(PAYLOAD)])
+        document = {
+            "schema": SCHEMA,
+            "signing": self.signing,
+            "trusted": self.trusted,
+            "step": self.step,
+            "members": self.members,
+        }
+        write_private(self.folder / "authority.json", _json(document), replace=True)
+
+    def _give_srtp(self, ground: Path, payloads: list[str]) -> None:
+        folder = _folder(ground / "srtp")
+        kept = {f"{name.partition('.')[2]}.key": self.of(name) / SRTP for name in payloads}
+        for old in folder.iterdir():
+            if old.name not in kept:
+                old.unlink()
+        for file_name, source in kept.items():
+            write_private(folder / file_name, source.read_bytes(), replace=True)
+
+
+def write_private(path: Path, data: bytes, *, replace: bool = False) -> None:
+    """Writes a file that only its owner can read, whole or not at all.
+
+    Raises `KeysError` with one line when it exists and `replace` is not set.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        if path.exists() and not replace:
+            raise KeysError(f"{path}: exists already, and keys are never overwritten")
+        part.unlink(missing_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+        with os.fdopen(os.open(part, flags, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise KeysError(f"{path}: {error.strerror or error}") from None
+
+
+def _folder(path: Path) -> Path:
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise KeysError(f"{path}: {error.strerror or error}") from None
+    return path
+
+
+def _member(member: str) -> str:
+    try:
+        return keys.check_payload_id(member)
+    except credentials.TelemetryError as error:
+        raise KeysError(str(error).replace("payload_id", "name", 1)) from None
+
+
+def _until(days: int) -> datetime.datetime:
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    return now + datetime.timedelta(days=days)
+
+
+def _json(document: Any) -> bytes:
+    return (json.dumps(document, indent=2) + "\n").encode()

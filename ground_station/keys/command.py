@@ -1,0 +1,94 @@
+"""`blimp keys`: the authority's command line."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ground_station.errors import KeysError
+
+if TYPE_CHECKING:
+    from ground_station.keys.authority import Authority
+
+_EXAMPLE = """example:
+  blimp keys init
+  blimp keys ground main
+  blimp keys payload blimp-1     # copy the folder it names to the payload
+  blimp keys revoke payload.blimp-1
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = _EXAMPLE
+    parser.add_argument(
+        "--folder", type=Path, help="the authority's folder (default: ~/.local/share/blimp/keys)"
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions.add_parser("init", help="make a new authority")
+    for role, what in (("payload", "a payload"), ("ground", "a ground station")):
+        add = actions.add_parser(role, help=f"make the certificate and keys of {what}")
+        add.add_argument("name", help="1 to 32 of a-z, 0-9, - and _")
+        add.add_argument("--days", type=int, default=730, help="valid for, days, 1 to 3650")
+    actions.add_parser("list", help="who has a certificate, and until when")
+    revoke = actions.add_parser("revoke", help="take a name out of everyone's access list")
+    revoke.add_argument("name", help="payload.ID or ground.NAME")
+    actions.add_parser("rotate", help="go one step of the three that replace the authority")
+    actions.add_parser("check", help="say what is wrong or ends within 30 days; status 1 if any")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Runs one action; raises `BlimpError` with one line."""
+    from ground_station.keys.authority import Authority
+
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
+    folder = arguments.folder or Path(data) / "blimp" / "keys"
+    action = arguments.action
+    if action == "init":
+        Authority.create(folder)
+        print(f"authority in {folder}: keep a copy of it away from the network")
+        return 0
+    authority = Authority(folder)
+    if action in ("payload", "ground"):
+        if not 1 <= arguments.days <= 3650:
+            raise KeysError(f"--days is {arguments.days}; allowed: 1 to 3650")
+        print(authority.add(action, arguments.name, arguments.days))
+        print("the other side's folders list it now: copy them again, and restart its programs")
+    elif action == "revoke":
+        authority.revoke(arguments.name)
+        print(
+            f"{arguments.name} is off all lists: copy the folders again, restart the programs"
+        )
+    elif action == "rotate":
+        print(f"authority: {authority.rotate()}; copy all folders before the next step")
+    elif action == "list":
+        _list(authority)
+    else:
+        problems = authority.check(datetime.datetime.now(datetime.UTC))
+        print("\n".join(problems) or "all certificates and lists are good")
+        return 1 if problems else 0
+    return 0
+
+
+def _list(authority: Authority) -> None:
+    from ground_station.keys import certificates
+    from ground_station.keys.authority import STEPS
+    from pi_firmware.wire import credentials
+
+    print(f"authority {authority.signing}: {STEPS[authority.step]}")
+    for name, entry in sorted(authority.members.items()):
+        state = "revoked"
+        if not entry["revoked"]:
+            folder = authority.of(name)
+            try:
+                _, until = certificates.inspect(
+                    (folder / credentials.CERTIFICATE).read_bytes(),
+                    (folder / credentials.AUTHORITIES).read_bytes(),
+                )
+                state = f"until {until:%Y-%m-%d}"
+            except (KeysError, OSError) as error:
+                state = str(error)
+        print(f"{name}  {state}")

@@ -1,0 +1,140 @@
+"""With certificates only those on the list are heard, each under its own keys only."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from ground_station.keys.authority import Authority
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.settings import TelemetrySettings
+from pi_firmware.telemetry import Telemetry
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.telemetry import Session, check_endpoint, open_session
+
+LIMIT_S = 20.0
+PATIENCE_S = 1.5
+FREE = "tls/127.0.0.1:0"
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    made = Authority.create(tmp_path_factory.mktemp("authority") / "keys")
+    made.add("ground", "main")
+    made.add("payload", "blimp-1")
+    made.add("payload", "blimp-2")
+    return made
+
+
+def folder(authority: Authority, name: str) -> str:
+    return str(authority.of(name))
+
+
+def heard(listener: TelemetryListener, session: Session, payload_id: str, wait_s: float) -> bool:
+    """Whether a battery message under a payload's key arrives; it is said again until then."""
+    said = threading.Event()
+
+    def say() -> None:
+        body = messages.encode(messages.Battery(time_ns=1, voltage=3.9))
+        while not said.wait(0.1):
+            session.zenoh.put(keys.key(payload_id, keys.BATTERY), body)
+
+    speaker = threading.Thread(target=say)
+    speaker.start()
+    state = listener.wait(payload_id, lambda s: s.battery is not None, wait_s)
+    said.set()
+    speaker.join()
+    session.close()
+    return state is not None
+
+
+def test_a_payload_with_its_certificate_is_heard(authority: Authority) -> None:
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        settings = TelemetrySettings(
+            connect=list(listener.endpoints), certificates=folder(authority, "payload.blimp-1")
+        )
+        telemetry = Telemetry("blimp-1", settings)
+        assert listener.wait("blimp-1", lambda s: s.alive, LIMIT_S)
+        telemetry.battery(messages.Battery(time_ns=1, voltage=3.5))
+        assert listener.wait("blimp-1", lambda s: s.battery is not None, LIMIT_S)
+        telemetry.close()
+        assert listener.wait("blimp-1", lambda s: not s.alive, LIMIT_S)
+
+
+def test_another_payloads_keys_are_refused(authority: Authority) -> None:
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        certificates = folder(authority, "payload.blimp-1")
+        for payload_id, expected, wait_s in (("blimp-1", True, LIMIT_S), ("blimp-2", False, 3.0)):
+            session = open_session(connect=listener.endpoints, certificates=certificates)
+            assert heard(listener, session, payload_id, wait_s) is expected, payload_id
+
+
+def test_a_foreign_authority_is_refused(authority: Authority, tmp_path: Path) -> None:
+    foreign = Authority.create(tmp_path / "foreign")
+    foreign.add("ground", "main")
+    foreign.add("payload", "blimp-1")
+    # Even one that trusts the right authority, as a stolen bundle would allow.
+    bundle = (authority.of("payload.blimp-1") / "ca.pem").read_bytes()
+    (foreign.of("payload.blimp-1") / "ca.pem").write_bytes(bundle)
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        certificates = folder(foreign, "payload.blimp-1")
+        session = open_session(connect=listener.endpoints, certificates=certificates)
+        assert not heard(listener, session, "blimp-1", PATIENCE_S)
+        assert listener.payloads() == []
+
+
+def test_a_revoked_payload_is_refused(tmp_path: Path) -> None:
+    made = Authority.create(tmp_path / "keys")
+    made.add("ground", "main")
+    made.add("payload", "blimp-1")
+    made.revoke("payload.blimp-1")
+    stolen = made.folder / "revoked" / "payload.blimp-1"
+    with TelemetryListener([FREE], certificates=folder(made, "ground.main")) as listener:
+        session = open_session(connect=listener.endpoints, certificates=stolen)
+        assert not heard(listener, session, "blimp-1", PATIENCE_S)
+        assert listener.payloads() == []
+
+
+@pytest.mark.parametrize(("name", "allowed"), [("ground.main", True), ("payload.blimp-2", False)])
+def test_only_the_ground_commands(authority: Authority, name: str, allowed: bool) -> None:
+    certificates = folder(authority, "payload.blimp-1")
+    session = open_session(listen=[FREE], certificates=certificates)
+    command = keys.key("blimp-1", keys.COMMAND) + "/idr"
+    obeyed = threading.Event()
+
+    def answer(query: object) -> None:
+        obeyed.set()
+        query.reply(command, b"done")  # type: ignore[attr-defined]
+
+    served = session.zenoh.declare_queryable(command, answer)
+    sender = open_session(connect=session.listening, certificates=folder(authority, name))
+    answers: list[bytes] = []
+    for _ in range(100 if allowed else 8):
+        answers += [r.ok.payload.to_bytes() for r in sender.zenoh.get(command, timeout=1.0) if r.ok]
+        if answers or obeyed.wait(0.15):
+            break
+    assert (answers[:1] == [b"done"]) is allowed and obeyed.is_set() is allowed
+    served.undeclare()
+    sender.close()
+    session.close()
+
+
+def test_a_payload_does_not_take_another_ones_certificate(authority: Authority) -> None:
+    settings = TelemetrySettings(connect=[], certificates=folder(authority, "payload.blimp-2"))
+    with pytest.raises(TelemetryError, match=r"are payload.blimp-2's, not payload.blimp-1's"):
+        Telemetry("blimp-1", settings)
+
+
+def test_endpoints_and_certificates_must_fit(authority: Authority, tmp_path: Path) -> None:
+    assert check_endpoint("tls/10.0.0.1:7447", certified=True) == ("10.0.0.1", 7447)
+    for endpoint, certified, reason in (
+        ("tls/127.0.0.1:7447", False, "needs a folder of certificates"),
+        ("tcp/10.0.0.1:7447", False, "only loopback"),
+        ("tcp/127.0.0.1:7447", True, "only tls/HOST:PORT"),
+        ("tls/10.0.0.1:7447?x=1", True, "expected tls/HOST:PORT"),
+    ):
+        with pytest.raises(TelemetryError, match=reason):
+            check_endpoint(endpoint, certified=certified)
+    with pytest.raises(TelemetryError, match=r"'ca.pem' is missing"):
+        open_session(listen=[FREE], certificates=tmp_path)
