@@ -2,10 +2,10 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo test check bench lock sample
+.PHONY: help setup demo test check bench lock sample virtual-camera
 
 help:  ## Show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
 
 setup:  ## Install system packages (root or sudo for these only) and the locked Python environment
 	@sh deploy/ground_station/setup.sh
@@ -29,6 +29,9 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 	@$(BLIMP) simulate --sample maps/atrium
 	@$(BLIMP) map build maps/atrium/mapping.mcap --settings maps/atrium/mapping.toml --out maps/atrium
 	@$(BLIMP) map register maps/atrium --pairs maps/atrium/PAIRS.csv
+
+virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
+	@sh tests/pi_firmware/virtual_camera/setup.sh
 
 lock:  ## Resolve requirements.lock anew from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv

@@ -152,7 +152,8 @@ def scaled(luma: np.ndarray, colorimetry: str = "bt601") -> np.ndarray:
     pipeline = gstreamer.launch(
         "appsrc name=source format=time "
         f"caps=video/x-raw,format=I420,width={width},height={height},framerate=30/1"
-        f",colorimetry=(string){colorimetry} ! {measuring.description(camera)} ! fakesink name=whole sync=false async=false"
+        f",colorimetry=(string){colorimetry} "
+        f"! {measuring.description(camera)} ! fakesink name=whole sync=false async=false"
     )
     seen, order = [], []
     measuring.attach(pipeline, camera, lambda low, ns: (seen.append(low), order.append("low")))

@@ -1,6 +1,8 @@
 """Cameras: what is asked of a device is verified, and times of capture are true at the receiver."""
 
 import errno
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -137,3 +139,52 @@ def test_a_bad_camera_setting_is_named(key: str, named: str) -> None:
     with pytest.raises(Exception, match=named) as caught:
         load(None, [key])
     assert "\n" not in str(caught.value)
+
+
+def fly_virtual_camera(port: int, *settings: str) -> subprocess.Popen[str]:
+    """The payload in the Debian 13 whose libcamera has a virtual camera."""
+    if not (VIRTUAL / ".stamp").exists():
+        pytest.skip("out/virtual_camera is missing: run `make virtual-camera` (as root)")
+    if os.geteuid() != 0:
+        pytest.skip("the virtual camera runs in a root file system of its own: only as root")
+    program = VIRTUAL / "root" / "opt" / "blimp" / "pi_firmware"
+    shutil.rmtree(program, ignore_errors=True)
+    ignore = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "pi_firmware", program, ignore=ignore)
+    command = [
+        "chroot", str(VIRTUAL / "root"), "env", "-i", "PATH=/usr/bin:/bin", "PYTHONPATH=/opt/blimp",
+        "LD_PRELOAD=/usr/local/lib/dma_buffers.so", "LIBCAMERA_LOG_LEVELS=*:ERROR",
+        "/usr/bin/python3", "-m", "pi_firmware",
+    ]  # fmt: skip
+    for setting in (f"link.port={port}", "telemetry.enabled=false", *settings):
+        command += ["--set", setting]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_libcamera_flies_with_its_sensors_times() -> None:
+    with Receiver(0, queue_frames=200) as receiver:
+        process = fly_virtual_camera(receiver.port, "camera.uri=libcamera:", "gate.enabled=false")
+        frames = [frame for _ in range(60) if (frame := receiver.get(20.0))]
+        process.terminate()
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert [frame.sequence for frame in frames] == list(range(60)), out
+    assert frames[0].image.shape == (480, 640) and frames[0].image.std() > 10
+    gaps_ms = np.diff([frame.time_ns for frame in frames]) / 1e6
+    assert gaps_ms.min() > 0 and np.median(gaps_ms) == pytest.approx(1000 / 30, abs=1)
+    assert all(frame.time_ns < frame.arrival_ns < frame.time_ns + 10**9 for frame in frames)
+    assert frames[0].exposure_s is None  # libcamerasrc does not tell
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (["camera.uri=libcamera:none"], "libcamera has no such camera"),
+        (["camera.uri=libcamera:", "camera.width_px=320"], "does not deliver 320x480 at 30 Hz"),
+    ],
+)
+def test_what_a_libcamera_refuses_is_one_line(settings: list[str], named: str) -> None:
+    process = fly_virtual_camera(9, *settings)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert err.count("\n") == 1 and named in err
