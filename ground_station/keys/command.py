@@ -59,9 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         print("the other side's folders list it now: copy them again, and restart its programs")
     elif action == "revoke":
         authority.revoke(arguments.name)
-        print(
-            f"{arguments.name} is off all lists: copy the folders again, restart the programs"
-        )
+        print(f"{arguments.name} is off all lists: copy the folders again, restart the programs")
     elif action == "rotate":
         print(f"authority: {authority.rotate()}; copy all folders before the next step")
     elif action == "list":
