@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable
 from typing import Any
 
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.wire import credentials, keys, messages
+from pi_firmware.wire.clock_offset import Clock, serve
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, open_session
 
@@ -15,10 +17,13 @@ from pi_firmware.wire.telemetry import Session, open_session
 class Telemetry:
     """Publishes under one payload's keys; does nothing when disabled. Safe from any thread."""
 
-    def __init__(self, payload_id: str, settings: TelemetrySettings) -> None:
+    def __init__(
+        self, payload_id: str, settings: TelemetrySettings, clock: Clock = time.time_ns
+    ) -> None:
         self._session: Session | None = None
         self._publishers: dict[str, Any] = {}
         self._alive: Any = None
+        self._clock: Any = None
         self._payload_id = payload_id
         self._subscribers: list[Any] = []
         if not settings.enabled:
@@ -43,6 +48,7 @@ class Telemetry:
                 keys.key(payload_id, kind),
                 congestion_control=control.BLOCK if kind == keys.EVENT else control.DROP,
             )
+        self._clock = serve(session, keys.key(payload_id, keys.CLOCK), clock)
         self._alive = session.liveliness().declare_token(keys.key(payload_id, keys.ALIVE))
 
     @property
@@ -85,6 +91,7 @@ class Telemetry:
         """Withdraws the liveliness token and closes the session."""
         if self._session is not None:
             self._alive.undeclare()
+            self._clock.undeclare()
             self._session.close()
             self._session = None
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ground_station.stream.clock import ClockFollower
 from pi_firmware.wire import keys, messages
+from pi_firmware.wire.clock_offset import Offset
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, open_session
 
@@ -99,6 +102,11 @@ class TelemetryListener:
                 keys.every_payload(keys.ALIVE), self._take_liveliness, history=True
             ),
         ]
+        self._clocks = ClockFollower(session, self._living, time.time_ns)
+
+    def _living(self) -> list[str]:
+        with self._changed:
+            return sorted(name for name, state in self._states.items() if state.alive)
 
     def __enter__(self) -> TelemetryListener:
         return self
@@ -106,8 +114,13 @@ class TelemetryListener:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def clock(self, payload_id: str) -> Offset | None:
+        """How far a payload's clock is from this machine's; None before it answered."""
+        return self._clocks.offset(payload_id)
+
     def close(self) -> None:
         """Stops listening; what was heard stays readable."""
+        self._clocks.close()
         self._session.close()
 
     def payloads(self) -> list[str]:

@@ -1,6 +1,7 @@
 """With certificates only those on the list are heard, each under its own keys only."""
 
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import keys, messages
+from pi_firmware.wire.clock_offset import ask
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, check_endpoint, open_session
 
@@ -60,6 +62,30 @@ def test_a_payload_with_its_certificate_is_heard(authority: Authority) -> None:
         assert listener.wait("blimp-1", lambda s: s.battery is not None, LIMIT_S)
         telemetry.close()
         assert listener.wait("blimp-1", lambda s: not s.alive, LIMIT_S)
+
+
+def test_a_payload_that_boots_in_1970_has_exact_latencies(authority: Authority) -> None:
+    booted_ns = time.time_ns() - 30 * 10**9
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        settings = TelemetrySettings(
+            connect=list(listener.endpoints), certificates=folder(authority, "payload.blimp-1")
+        )
+        telemetry = Telemetry("blimp-1", settings, lambda: time.time_ns() - booted_ns)
+        deadline = time.monotonic() + LIMIT_S
+        while (offset := listener.clock("blimp-1")) is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert offset is not None
+        captured_ns = time.time_ns() - booted_ns
+        assert abs(offset.offset_ns + booted_ns) <= offset.uncertainty_ns < 2 * 10**9
+        assert abs(time.time_ns() - offset.to_ours(captured_ns)) < 10**9
+        certificates = folder(authority, "payload.blimp-1")
+        session = open_session(connect=listener.endpoints, certificates=certificates)
+        served = None
+        while served is None and time.monotonic() < deadline:
+            served = ask(session.zenoh, keys.key("blimp-1", keys.TIME), lambda: 0)
+        assert served is not None and abs(served.received_ns - time.time_ns()) < 60 * 10**9
+        session.close()
+        telemetry.close()
 
 
 def test_another_payloads_keys_are_refused(authority: Authority) -> None:
