@@ -16,7 +16,7 @@ from ground_station.localization.settings import load_preset
 from ground_station.mapping import store
 from ground_station.recording.flight import trajectory_of
 from ground_station.service import flight_report
-from ground_station.service.replay import ReplayResult, ReplaySettings, replay
+from ground_station.service.replay import ReplayResult, replay, settings_for
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 BLIMP = Path(sys.executable).with_name("blimp")
@@ -24,16 +24,23 @@ BLIMP = Path(sys.executable).with_name("blimp")
 
 @pytest.fixture(scope="module")
 def flown() -> ReplayResult:
-    settings = ReplaySettings(
-        recording=SAMPLE / "flight.mcap",
-        rate_hz=5.0,
-        preset="thesis",
-        init="truth",
-        start_s=2.0,
-        duration_s=4.0,
-        queue_frames=64,
+    settings = settings_for(
+        "thesis", SAMPLE / "flight.mcap", start_s=2.0, duration_s=4.0, queue_frames=64
     )
     return replay(store.load(SAMPLE), load_preset("thesis"), settings)
+
+
+def test_the_default_localizer_keeps_every_frame_of_a_30_hz_flight_it_starts_in() -> None:
+    """However slow the machine: frames wait in the queue, and none waits for a keyframe."""
+    settings = settings_for(
+        "default", SAMPLE / "flight.mcap", start_s=2.0, duration_s=3.0, queue_frames=1024
+    )
+    result = replay(store.load(SAMPLE), load_preset("default"), settings)
+    accounts = result.live.accounts()
+    assert accounts["captured"] == accounts["received"] == 90 and accounts["dropped"] == 0
+    assert accounts["localized"] >= 60
+    assert result.evaluation is not None
+    assert result.evaluation.errors["none"].position_m.max() < 0.1
 
 
 def test_every_frame_is_accounted_for(flown: ReplayResult) -> None:
@@ -109,9 +116,12 @@ def test_a_recording_without_truth_needs_a_first_pose(tmp_path: Path) -> None:
         )  # fmt: skip
         for _, sample in zip(range(30), reader.video(), strict=False):
             writer.write_video(sample.time_ns, sample.data)
+    replay = [BLIMP, "replay", bare, "--map", SAMPLE, "--out", tmp_path / "out"]
     run = subprocess.run(
-        [BLIMP, "replay", bare, "--map", SAMPLE, "--out", tmp_path / "out"],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        [*replay, "--preset", "thesis"], capture_output=True, text=True, timeout=60
+    )
     assert run.returncode == 2
     assert "--init truth: the recording has no true poses" in run.stderr
+    # The default localizer finds its place itself.
+    run = subprocess.run(replay, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
