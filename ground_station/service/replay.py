@@ -193,7 +193,11 @@ def _payload_config(
     if settings.duration_s:
         options.append(f"duration_s={settings.duration_s:g}")
     path = settings.recording.resolve()
-    bits = settings.gate_min_entropy_bits
+    gate: dict[str, float] = {}
+    if settings.preset == "thesis":  # its gate knows entropy only
+        gate = {"min_sharpness_ratio": 0.0, "min_difference": 0.0}
+    if settings.gate_min_entropy_bits is not None:
+        gate["min_entropy_bits"] = settings.gate_min_entropy_bits
     return {
         "payload_id": PAYLOAD_ID,
         "camera": {
@@ -201,7 +205,7 @@ def _payload_config(
             "width_px": camera.width_px,
             "height_px": camera.height_px,
         },
-        "gate": {} if bits is None else {"min_entropy_bits": bits},
+        "gate": gate,
         "encoder": {"bitrate_kbps": settings.bitrate_kbps},
         "link": {"port": port},
         "telemetry": {"connect": list(endpoints)},
