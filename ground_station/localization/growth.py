@@ -55,8 +55,8 @@ class MadeUp:
     name, sha256, dimension = "made-up", "0" * 64, _DIMENSION
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:
-        """Never asked: the features are made."""
-        raise NotImplementedError
+        """Never asked: the features are made. Raises `BenchError` if it is."""
+        raise BenchError("a made-up map has no pictures")
 
 
 @dataclass(frozen=True)

@@ -203,12 +203,13 @@ class Localizer:
             reason = found.solution.reason
         else:
             attempt.counts = Counts(features=len(seen))
-        if self._may_search(attempt.time_ns):
+        relocalize = self.settings.recovery.relocalize and self._gone(attempt.time_ns)
+        if relocalize and self._may_search(attempt.time_ns):
             self._last_search_ns = attempt.time_ns
             found = self._acquirer.relocalize(seen, attempt.time_ns, self._fresh, attempt.watch)
             self._note(attempt, found)
             if (state := found.solution.state) is not None:
-                self._begin_again(self._fresh(), state)
+                self._begin_again(state)
                 return self._solved(attempt, found.solution, relocalized=True)
             reason = found.solution.reason
         return self._unsolved(attempt, reason)
@@ -221,11 +222,14 @@ class Localizer:
         found.teach(self._matcher.thresholds)
         self._located = found
 
+    def _gone(self, time_ns: int) -> bool:
+        """Whether nothing is known any more that a frame could be looked for around."""
+        return self._judge.after_gap(time_ns) in (State.INITIALIZING, State.LOST)
+
     def _may_search(self, time_ns: int) -> bool:
-        recovery, tried = self.settings.recovery, self._last_search_ns
-        waited = tried is None or time_ns - tried >= recovery.interval_s * 1e9
-        gone = self._judge.after_gap(time_ns) in (State.INITIALIZING, State.LOST)
-        return recovery.relocalize and waited and gone
+        """Whether the last search is long enough ago."""
+        tried = self._last_search_ns
+        return tried is None or time_ns - tried >= self.settings.recovery.interval_s * 1e9
 
     # Frames that are followed from a keyframe
 
@@ -272,13 +276,10 @@ class Localizer:
 
     def _search(self, attempt: Attempt, image: Image) -> None:
         """Asks for this frame to be found, near its prediction or anywhere."""
-        recovery, tried = self.settings.recovery, self._last_search_ns
-        waited = tried is None or attempt.time_ns - tried >= recovery.interval_s * 1e9
-        if self._worker.busy or not waited:
+        if self._worker.busy or not self._may_search(attempt.time_ns):
             return
         self._last_search_ns = attempt.time_ns
-        gone = self._judge.after_gap(attempt.time_ns) in (State.INITIALIZING, State.LOST)
-        expected = None if gone else attempt.predicted
+        expected = None if self._gone(attempt.time_ns) else attempt.predicted
         self._worker.submit(
             self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
             self.settings.tracking.search_lag_frames,
@@ -313,7 +314,8 @@ class Localizer:
 
     # What becomes of a frame
 
-    def _begin_again(self, estimator: Estimator, state: Kinematics) -> None:
+    def _begin_again(self, state: Kinematics) -> None:
+        estimator = self._fresh()
         estimator.restart(state.time_ns, state.wTc, state.covariance[:6, :6])
         self._replace(estimator)
         self._keyframe = None
@@ -356,4 +358,5 @@ class Localizer:
         patience_s = max(self.settings.state.lost_after_s, self.settings.motion.coast_s)
         verdict = self._judge.unsolved(attempt.time_ns, patience_s)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
+        self._idle_since_s = perf_counter()
         return publish(attempt, verdict, reason, gated=True)

@@ -29,7 +29,23 @@ class Shunt:
     discharge_positive: bool = True
 
 
-class Ina219:
+class _Ina:
+    """What both chips have: a bus, a shunt, and settings that are written before the first read."""
+
+    FULL_SCALE_V: float
+
+    def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
+        _check_range(shunt, self.FULL_SCALE_V)
+        self._bus, self._shunt, self.counts = bus, shunt, counts
+        self._ready = False
+
+    def close(self) -> None:
+        """Releases the bus."""
+        self._ready = False
+        self._bus.close()
+
+
+class Ina219(_Ina):
     """Voltage of the cell and its current, averaged over 128 samples (68 ms).
 
     Raises `ValueError` for a shunt that the chip cannot measure at `max_A`.
@@ -39,15 +55,13 @@ class Ina219:
     AFTER_RESET = 0x399F
 
     def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
-        _check_range(shunt, self.FULL_SCALE_V)
-        self._bus, self._shunt, self.counts = bus, shunt, counts
+        super().__init__(bus, shunt, counts)
         drop_v = shunt.max_A * shunt.resistance_ohm
         self._gain = next(i for i, v in enumerate(_INA219_RANGES_V) if drop_v <= v * (1 + 1e-9))
         # 16 V range; both converters 12 bit with 128 samples; continuous.
         self._configuration = self._gain << 11 | 0xF << 7 | 0xF << 3 | 0x7
         self._calibration = ina219_calibration(shunt.max_A / 2**15, shunt.resistance_ohm)
         self._lsb_a = 0.04096 / (self._calibration * shunt.resistance_ohm)
-        self._ready = False
 
     def read(self, time_ns: int) -> Battery:
         """One reading; raises `GaugeError` when there is none that can be believed."""
@@ -66,11 +80,6 @@ class Ina219:
             voltage += drop * 10e-6
         return _reading(time_ns, voltage, current * self._lsb_a, self._shunt)
 
-    def close(self) -> None:
-        """Releases the bus."""
-        self._ready = False
-        self._bus.close()
-
     def _prepare(self) -> None:
         if self._ready:
             return
@@ -86,7 +95,7 @@ class Ina219:
         self._ready = True
 
 
-class Ina226:
+class Ina226(_Ina):
     """Voltage at the pin VBUS and the current, averaged over 16 samples (35 ms).
 
     Raises `ValueError` for a shunt that the chip cannot measure at `max_A`.
@@ -96,12 +105,10 @@ class Ina226:
     MANUFACTURER, DIE = 0x5449, 0x2260
 
     def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
-        _check_range(shunt, self.FULL_SCALE_V)
-        self._bus, self._shunt, self.counts = bus, shunt, counts
+        super().__init__(bus, shunt, counts)
         self._configuration = 0x4127 | 0b010 << 9  # as after a reset, but 16 averages
         self._calibration = ina226_calibration(shunt.max_A / 2**15, shunt.resistance_ohm)
         self._lsb_a = 0.00512 / (self._calibration * shunt.resistance_ohm)
-        self._ready = False
 
     def read(self, time_ns: int) -> Battery:
         """One reading; raises `GaugeError` when there is none that can be believed."""
@@ -113,11 +120,6 @@ class Ina226:
         if drop in (-0x8000, 0x7FFF):
             raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
         return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
-
-    def close(self) -> None:
-        """Releases the bus."""
-        self._ready = False
-        self._bus.close()
 
     def _prepare(self) -> None:
         if self._ready:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from refining import _world, world  # noqa: F401 - fixtures of the tests of refining
 
 from ground_station.features import extractors
 from ground_station.features.extractor import Features
