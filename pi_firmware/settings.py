@@ -90,10 +90,11 @@ class EncoderSettings:
 class LinkSettings:
     """Where the video goes."""
 
-    host: str = key("127.0.0.1", "the ground station's address")
+    host: str = key("127.0.0.1", "the ground station's address; auto: the one telemetry found")
     port: int = key(video.PORT, "its UDP port", low=1, high=65535)
     ssrc: int = key(0, "RTP stream id; 0 draws one at random", low=0, high=0xFFFFFFFF)
     mtu_bytes: int = key(1400, "largest RTP packet", unit="bytes", low=200, high=8900)
+    encrypted: bool = key(True, "SRTP with the key of telemetry.certificates, or loopback only")
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,42 @@ class AutopilotSettings:
 
 
 @dataclass(frozen=True)
+class RecordingSettings:
+    """What stays on the payload's own card."""
+
+    folder: str = key("", "where recordings go; empty: none are made")
+    at_start: bool = key(False, "records from the start; otherwise on command")
+    max_file_MB: int = key(512, "a file ends at this size", unit="MB", low=1, high=4000)
+    max_total_MB: int = key(4096, "oldest are deleted beyond", unit="MB", low=1, high=1_000_000)
+    min_free_MB: int = key(512, "left free on the card", unit="MB", low=0, high=1_000_000)
+    sync_s: float = key(1.0, "the most that a power cut costs", unit="s", low=0.1, high=60)
+
+
+@dataclass(frozen=True)
+class WifiSettings:
+    """The radio."""
+
+    interface: str = key("auto", "as wlan0; auto: the first one; empty: left alone")
+    restart_after_s: float = key(
+        20.0, "restarted when the ground is silent so long; 0: never", unit="s", low=0, high=3600
+    )
+
+
+@dataclass(frozen=True)
+class SupervisionSettings:
+    """What happens when frames stop coming."""
+
+    period_s: float = key(1.0, "time between health messages", unit="s", low=0.2, high=60)
+    frame_timeout_s: float = key(
+        2.0, "camera or encoder restarted without a frame for", unit="s", low=0.5, high=14
+    )
+    restarts: int = key(5, "of camera or encoder in a row; then the process", low=1, high=100)
+    process_restarts: int = key(3, "without a frame in a row; then the board", low=1, high=100)
+    state: str = key("", "file that counts them across restarts; empty: not counted")
+    reboot_command: list[str] = key([], "what reboots the board; empty: nothing does")
+
+
+@dataclass(frozen=True)
 class TelemetrySettings:
     """Zenoh."""
 
@@ -155,6 +192,7 @@ class TelemetrySettings:
     connect: list[str] = key([LOCAL_ENDPOINT], "endpoints to connect to, tcp/ or tls/HOST:PORT")
     listen: list[str] = key([], "endpoints to listen on; port 0: any free one")
     certificates: str = key("", "folder that `blimp keys payload` wrote; empty: loopback only")
+    discover: str = key("", "interface to find the ground station on, by scouting; empty: none")
 
     def __post_init__(self) -> None:
         for endpoint in (*self.connect, *self.listen):
@@ -175,6 +213,9 @@ class Settings:
     link: LinkSettings = table(LinkSettings)
     battery: BatterySettings = table(BatterySettings)
     autopilot: AutopilotSettings = table(AutopilotSettings)
+    recording: RecordingSettings = table(RecordingSettings)
+    wifi: WifiSettings = table(WifiSettings)
+    supervision: SupervisionSettings = table(SupervisionSettings)
     telemetry: TelemetrySettings = table(TelemetrySettings)
 
     def __post_init__(self) -> None:

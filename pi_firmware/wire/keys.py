@@ -10,6 +10,7 @@ ROOT = "blimp"
 BATTERY, HEALTH, GATE, EVENT, POSE = "battery", "health", "gate", "event", "pose"
 COMMAND, ALIVE, AUTOPILOT = "command", "alive", "autopilot"
 CLOCK, TIME = "clock", "time"  # the payload answers the one, the ground station the other
+LINK = "link"  # the ground station's report of the video
 
 _PAYLOAD_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 
@@ -27,6 +28,11 @@ def check_payload_id(payload_id: str) -> str:
 def key(payload_id: str, kind: str) -> str:
     """The key of one kind of message of one payload, as `blimp/blimp-1/battery`."""
     return f"{ROOT}/{check_payload_id(payload_id)}/{kind}"
+
+
+def command(payload_id: str, name: str) -> str:
+    """The key at which a payload answers a command, as `blimp/blimp-1/command/idr`."""
+    return f"{key(payload_id, COMMAND)}/{name}"
 
 
 def every_payload(kind: str) -> str:

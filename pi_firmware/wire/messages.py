@@ -73,14 +73,14 @@ class Reason(enum.StrEnum):
 class Gate(Message):
     """The gate's decision on one captured frame, and the counters after it.
 
-    `captured` = `gated` + frames handed to the encoder; `sent` of those have left it so far, which
-    is all of them at the end. Heartbeats are frames sent although the gate would have dropped them.
+    `captured` = `gated` + frames handed to the encoder; `sent` of those have left it so far, and
+    `discarded` never will: the encoder dropped them or was restarted. Heartbeats are frames sent although the gate would have dropped them.
     `reason` is a `Reason`'s value, a heartbeat's is what gates the frames around it; an older
     writer gave none. `difference` from the last frame sent, grey levels, is None before one was.
     """
 
     SCHEMA: ClassVar[str] = "blimp.gate"
-    MINOR: ClassVar[int] = 1
+    MINOR: ClassVar[int] = 2
 
     capture_ns: int
     sequence: int
@@ -95,6 +95,7 @@ class Gate(Message):
     ssrc: int
     reason: str = ""
     difference: float | None = None
+    discarded: int = 0
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,79 @@ class Autopilot(Message):
     reason: str = ""  # why it is not open
 
 
+@dataclass(frozen=True)
+class Health(Message):
+    """How payload and board are; None: this board cannot tell, or nothing was heard."""
+
+    SCHEMA: ClassVar[str] = "blimp.health"
+
+    uptime_s: float  # of the program
+    captured: int = 0
+    gated: int = 0
+    sent: int = 0
+    discarded: int = 0
+    rate_hz: float = 0.0  # frames that left the encoder, of late
+    bitrate_kbps: int = 0  # asked of the encoder
+    lost: float | None = None  # share of packets, as the ground reports it
+    round_trip_s: float | None = None
+    temperature_C: float | None = None
+    cpu: float | None = None  # share of all cores, 0 to 1
+    memory_MB: float | None = None  # resident, of the program
+    memory_free_MB: float | None = None
+    disk_free_MB: float | None = None
+    throttled: list[str] | None = None  # what the board is held back by now, or was
+    wifi_interface: str = ""
+    wifi_signal_dBm: float | None = None
+    wifi_quality: float | None = None  # 0 to 1
+    wifi_restarts: int = 0
+    camera_restarts: int = 0
+    encoder_restarts: int = 0
+    process_restarts: int = 0
+    board_restarts: int = 0
+    late: list[str] = field(default_factory=list)  # tasks that missed their watchdog
+    recording: str = ""  # the file's name; empty: none
+    recording_MB: float = 0.0
+    recording_dropped: int = 0  # frames that a slow disk did not take
+
+
+@dataclass(frozen=True)
+class LinkReport(Message):
+    """What a ground station sees of a payload's video, once a second; `time_ns` is its own clock.
+
+    `packets` and `packets_lost` count since it first saw the stream, `lost` is the share of late.
+    """
+
+    SCHEMA: ClassVar[str] = "blimp.link"
+
+    ground: str  # its name
+    video_port: int  # where it takes the video
+    ssrc: int | None = None  # the stream that it takes; None: none
+    packets: int = 0
+    packets_lost: int = 0
+    lost: float = 0.0
+    round_trip_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Command(Message):
+    """What the ground asks for; its name stands in the key. `time_ns` is the ground's clock."""
+
+    SCHEMA: ClassVar[str] = "blimp.command"
+
+    arguments: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Answer(Message):
+    """What became of a command: done, or why not; `values` is what is set now."""
+
+    SCHEMA: ClassVar[str] = "blimp.answer"
+
+    done: bool
+    reason: str = ""
+    values: dict[str, float] = field(default_factory=dict)
+
+
 EVENT_STARTED = "started"
 EVENT_SOURCE_CUT = "source-cut"
 EVENT_END_OF_STREAM = "end-of-stream"
@@ -163,6 +237,13 @@ EVENT_BATTERY_LOW = "battery-low"
 EVENT_BATTERY_CRITICAL = "battery-critical"
 EVENT_GAUGE_FAILED = "gauge-failed"
 EVENT_GAUGE_BACK = "gauge-back"
+EVENT_CAMERA_RESTARTED = "camera-restarted"
+EVENT_ENCODER_RESTARTED = "encoder-restarted"
+EVENT_STREAMING_AGAIN = "streaming-again"
+EVENT_RECORDING_STARTED = "recording-started"
+EVENT_RECORDING_ENDED = "recording-ended"
+EVENT_RADIO_RESTARTED = "radio-restarted"
+EVENT_COMMAND = "command"
 
 
 def encode(message: Message) -> bytes:
