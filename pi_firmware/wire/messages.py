@@ -74,7 +74,8 @@ class Gate(Message):
     """The gate's decision on one captured frame, and the counters after it.
 
     `captured` = `gated` + frames handed to the encoder; `sent` of those have left it so far, and
-    `discarded` never will: the encoder dropped them or was restarted. Heartbeats are frames sent although the gate would have dropped them.
+    `discarded` never will: the encoder dropped them or was restarted. Heartbeats are frames sent
+    although the gate would have dropped them.
     `reason` is a `Reason`'s value, a heartbeat's is what gates the frames around it; an older
     writer gave none. `difference` from the last frame sent, grey levels, is None before one was.
     """
