@@ -109,8 +109,8 @@ def access_rules(credentials: Credentials) -> dict[str, Any]:
     for peer in credentials.peers:
         payload = peer.partition(".")[2] if ground else credentials.member
         own = keys.key(payload, "**")
-        kinds = (f"{keys.COMMAND}/**", keys.POSE, keys.LINK)
-        given = [keys.key(payload, kind) for kind in kinds]
+        to_it = (f"{keys.COMMAND}/**", keys.POSE, keys.LINK)
+        given = [keys.key(payload, kind) for kind in to_it]
         time, clock = keys.key(payload, keys.TIME), keys.key(payload, keys.CLOCK)
         command = given[0]
         table = (
