@@ -60,6 +60,8 @@ def _run(arguments: argparse.Namespace) -> None:
             sep="\n",
             flush=True,
         )
+        if payload.notice:
+            print(f"pi_firmware: {payload.notice}", file=sys.stderr)
         payload.run(stop)
         if payload.cut_reason:
             notice = (

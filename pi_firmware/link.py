@@ -1,15 +1,27 @@
-"""The video's way out: access units into RTP packets over UDP (RFC 6184)."""
+"""The video's way out: access units into RTP packets over UDP (RFC 6184).
+
+A pipeline of its own, which lives as long as the program: cameras and encoders are restarted in
+front of it while sequence numbers and timestamps go on, so that a receiver sees a pause and no
+other stream.
+"""
 
 from __future__ import annotations
 
+import ipaddress
 import secrets
 import socket
-from typing import Any
+import threading
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import video
 from pi_firmware.wire.errors import StreamError
+
+DISCOVERED = "auto"
+"""`link.host` that waits for a ground station to say where it is."""
+_QUEUE_UNITS = 10
+_RESOLVE_S = 2.0
+_FLUSH_LIMIT_NS = 5_000_000_000
 
 
 def draw_ssrc(link: LinkSettings) -> int:
@@ -18,12 +30,12 @@ def draw_ssrc(link: LinkSettings) -> int:
 
 
 def description(link: LinkSettings, ssrc: int) -> str:
-    """The link's part of the pipeline, from whole access units to datagrams.
+    """The pipeline, from whole access units to datagrams.
 
     The address is not in it: `Link` sets that, whatever characters it has.
     """
     return (
-        "appsrc name=link is-live=true format=time "
+        "appsrc name=link is-live=true format=time max-bytes=0 "
         "caps=video/x-h264,stream-format=byte-stream,alignment=au "
         f"! rtph264pay pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={link.mtu_bytes} "
         "config-interval=0 aggregate-mode=none "
@@ -32,34 +44,112 @@ def description(link: LinkSettings, ssrc: int) -> str:
 
 
 class Link:
-    """Hands access units to the sending part of a pipeline built from `description`.
+    """Sends access units to where the settings, or a ground station that was found, say.
 
-    Raises `StreamError` with one line when the host has no address.
+    A name that has no address yet is tried again in the background: Wi-Fi may come later than the
+    camera. A network that takes nothing costs whole stretches up to the next IDR, never memory.
     """
 
-    def __init__(self, pipeline: Any, link: LinkSettings) -> None:
+    def __init__(self, link: LinkSettings, ssrc: int) -> None:
         self._gst = gstreamer.load()
-        sink = pipeline.get_by_name("out")
-        sink.set_property("host", _address(link))
-        sink.set_property("port", link.port)
-        self._source = pipeline.get_by_name("link")
+        self._pipeline = gstreamer.launch(description(link, ssrc))
+        self._source = self._pipeline.get_by_name("link")
+        self._sink = self._pipeline.get_by_name("out")
+        self._first_ns: int | None = None
+        self._to: tuple[str, int] | None = None
+        self._waits_for_idr = False
+        self._closing = threading.Event()
+        self._resolver: threading.Thread | None = None
+        self.problem = ""
+        """Why there is nowhere to send to, in one line; empty when there is."""
+        if link.host == DISCOVERED:
+            self.problem = f"link.host '{DISCOVERED}': no ground station was found yet"
+        elif not self._resolve(link):
+            self._resolver = threading.Thread(
+                target=self._resolve_later, args=(link,), name="link-host", daemon=True
+            )
+            self._resolver.start()
 
-    def send(self, access_unit: bytes, running_ns: int) -> bool:
-        """Queues one access unit; False when the pipeline no longer takes any."""
+    @property
+    def destination(self) -> tuple[str, int] | None:
+        """Numeric address and port that packets go to; None while there is none."""
+        return self._to
+
+    def start(self) -> None:
+        """Sets the pipeline to playing; raises `StreamError` with one line."""
+        if self._pipeline.set_state(self._gst.State.PLAYING) == self._gst.StateChangeReturn.FAILURE:
+            message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
+            reason = message.parse_error()[0].message if message else "it does not start"
+            raise StreamError(f"video link: {reason}")
+
+    def redirect(self, host: str, port: int) -> None:
+        """Sends to another numeric address from the next packet on."""
+        if (host, port) != self._to:
+            self._sink.set_property("host", host)
+            self._sink.set_property("port", port)
+            self._to = (host, port)
+            self.problem = ""
+
+    def send(self, access_unit: bytes, clock_ns: int, *, idr: bool) -> bool:
+        """Queues one access unit of an instant on a clock that only rises; whether it will leave.
+
+        It will not when there is nowhere to send to, when the network takes nothing, and from then
+        on until the next IDR: what hangs on a missing frame is worth nothing.
+        """
+        full = self._source.get_property("current-level-buffers") >= _QUEUE_UNITS
+        if self._to is None or full or (self._waits_for_idr and not idr):
+            self._waits_for_idr = True
+            return False
+        self._waits_for_idr = False
+        if self._first_ns is None:
+            self._first_ns = clock_ns
         buffer = self._gst.Buffer.new_wrapped(access_unit)
-        buffer.pts = running_ns
+        buffer.pts = clock_ns - self._first_ns
         return bool(self._source.emit("push-buffer", buffer) == self._gst.FlowReturn.OK)
 
-    def end(self) -> None:
-        """Ends the stream behind what is queued."""
+    @property
+    def waits_for_idr(self) -> bool:
+        """Whether frames were held back, so that only an IDR is of use now."""
+        return self._waits_for_idr
+
+    def failure(self) -> str | None:
+        """What ended the pipeline, in GStreamer's words; None while it lives."""
+        message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
+        return str(message.parse_error()[0].message) if message else None
+
+    def flush(self) -> bool:
+        """Waits until all that is queued has left; whether it did within 5 s."""
         self._source.emit("end-of-stream")
+        kinds = self._gst.MessageType.EOS | self._gst.MessageType.ERROR
+        message = self._pipeline.get_bus().timed_pop_filtered(_FLUSH_LIMIT_NS, kinds)
+        return message is not None and message.type == self._gst.MessageType.EOS
+
+    def stop(self) -> None:
+        """Stops the pipeline, whatever is queued."""
+        self._closing.set()
+        self._pipeline.set_state(self._gst.State.NULL)
+        if self._resolver is not None:
+            self._resolver.join(_RESOLVE_S)
+
+    def _resolve_later(self, link: LinkSettings) -> None:
+        while not self._closing.wait(_RESOLVE_S) and not self._resolve(link):
+            pass
+
+    def _resolve(self, link: LinkSettings) -> bool:
+        """Finds the host's numeric address: the sink would send nowhere without a word."""
+        try:
+            found = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            self.problem = f"link.host '{link.host}': {reason}; it is tried again"
+            return False
+        self.redirect(str(found[0][4][0]), link.port)
+        return True
 
 
-def _address(link: LinkSettings) -> str:
-    """The host's numeric address: the sink would send nowhere without a word if it had none."""
+def is_loopback(host: str) -> bool:
+    """Whether a numeric address is this machine's own."""
     try:
-        found = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise StreamError(f"link.host '{link.host}': {reason}") from None
-    return str(found[0][4][0])
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

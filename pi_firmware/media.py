@@ -1,4 +1,4 @@
-"""The frames' way through the payload: camera, gate, encoder, link, each in GStreamer's threads.
+"""The frames' way from the camera through the gate and the encoder, in GStreamer's threads.
 
 Python sees of a frame its luma at low resolution, its timestamps and its finished access unit; the
 picture itself never enters it.
@@ -6,6 +6,8 @@ picture itself never enters it.
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pi_firmware import encoder, gstreamer, link, measuring
+from pi_firmware import encoder, gstreamer, measuring
 from pi_firmware.gate import Decision, Gate, Verdict, measure
 from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
@@ -22,53 +24,93 @@ from pi_firmware.wire.errors import StreamError
 from pi_firmware.wire.video import MAX_IDR_INTERVAL_NS
 
 _START_LIMIT_NS = 5_000_000_000
+_STOP_LIMIT_S = 5.0
 
 
 @dataclass
 class Counters:
-    """Frames so far: `captured` = `gated` + those encoded; `sent` of these have left."""
+    """Frames so far: `captured` = `gated` + those that went to the encoder.
+
+    Of these `sent` have left the payload, `discarded` never will, and the others are inside.
+    """
 
     captured: int = 0
     gated: int = 0
     heartbeats: int = 0
     sent: int = 0
+    discarded: int = 0
 
     def __str__(self) -> str:
+        lost = f", {self.discarded} discarded" if self.discarded else ""
         return (
             f"{self.captured} captured, {self.gated} gated, {self.sent} sent"
-            f" ({self.heartbeats} as heartbeat)"
+            f" ({self.heartbeats} as heartbeat){lost}"
         )
 
 
+@dataclass(frozen=True)
+class Unit:
+    """A frame that left the encoder: its numbers, and its access unit with them inside.
+
+    `clock_ns` is the frame's instant on the system's monotonic clock.
+    """
+
+    info: sei.FrameInfo
+    data: bytes
+    clock_ns: int
+    idr: bool
+
+
 Decided = Callable[[sei.FrameInfo, Verdict], None]
+Leave = Callable[[Unit], bool]
 
 
 class Media:
-    """The pipeline of one flight: `play` it, look at `error` and `bus` meanwhile, `stop` it.
+    """Camera and encoder from their start to their end: `play`, look at `error` and `bus`, `stop`.
 
-    `decided` is called with each captured frame and the gate's verdict, on the camera's thread.
-    Raises `BlimpError` with one line for what cannot be built.
+    `decided` is called with each captured frame and the gate's verdict, on the camera's thread;
+    `leave` with each finished one, on the encoder's, and says whether it was sent. `counters` may
+    go on from an earlier one's. Raises `BlimpError` with one line for what cannot be built.
     """
 
-    def __init__(self, settings: Settings, source: Source, ssrc: int, decided: Decided) -> None:
-        self.counters = Counters()
+    def __init__(
+        self,
+        settings: Settings,
+        source: Source,
+        counters: Counters,
+        decided: Decided,
+        leave: Leave,
+    ) -> None:
+        self.counters = counters
         self.error: Exception | None = None
         """What failed on one of the pipeline's threads."""
+        self.encoded = 0
+        """Frames that left the encoder since `play`."""
+        self.last_captured_s: float | None = None
+        """When the camera last delivered, on `time.monotonic`'s clock; None before it did."""
         self._settings = settings
         self._source = source
-        self._decided = decided
+        self._decided, self._leave = decided, leave
         self._gate = Gate(settings.gate)
         self._gst = gstreamer.load()
         self._verdict: Verdict | None = None
-        self._in_encoder: dict[int, sei.FrameInfo] = {}
+        self._in_encoder: dict[int, tuple[sei.FrameInfo, float]] = {}
         self._last_idr_ns = 0
         self._last_passed_ns: int | None = None
-        self._pipeline = self._build(ssrc)
+        self._stopped = False
+        self._pipeline = self._build()
 
     @property
     def bus(self) -> Any:
         """The pipeline's messages, its errors and its end among them."""
         return self._pipeline.get_bus()
+
+    @property
+    def waiting_since_s(self) -> float | None:
+        """Since when the encoder owes a frame, on `time.monotonic`'s clock; None: it owes none."""
+        for _, entered_s in list(self._in_encoder.values()):
+            return entered_s
+        return None
 
     def play(self) -> None:
         """Sets the pipeline to playing; raises `StreamError` with one line."""
@@ -79,9 +121,20 @@ class Media:
             raise StreamError(f"video pipeline: {self._source.explain(text)}")
         self._pipeline.get_state(_START_LIMIT_NS)
 
-    def stop(self) -> None:
-        """Stops the pipeline, whatever is inside."""
-        self._pipeline.set_state(self._gst.State.NULL)
+    def stop(self) -> bool:
+        """Stops the pipeline, whatever is inside; False when something in it hangs.
+
+        It then goes on hanging on a thread of its own, and only the process's end ends it.
+        """
+        stopping = threading.Thread(
+            target=self._pipeline.set_state, args=(self._gst.State.NULL,), name="stop", daemon=True
+        )
+        stopping.start()
+        stopping.join(_STOP_LIMIT_S)
+        self._stopped = True  # what hangs may come back to life, and must count no more
+        self.counters.discarded += len(self._in_encoder)
+        self._in_encoder.clear()
+        return not stopping.is_alive()
 
     def set_bitrate(self, kbps: int) -> int:
         """Asks the encoder for this bit rate, within the configured bounds; returns the one set."""
@@ -91,6 +144,11 @@ class Media:
         """Holds the encoder to this bit rate from now on; returns the one now set."""
         return self._encoder.limit_bitrate(kbps)
 
+    @property
+    def bitrate_kbps(self) -> int:
+        """The bit rate last asked for."""
+        return self._encoder.bitrate_kbps
+
     def force_idr(self) -> None:
         """Makes the next frame an IDR."""
         self._encoder.force_idr()
@@ -99,7 +157,7 @@ class Media:
         """What the ground saw of late: the share of packets lost, 0 to 1, and the round trip."""
         self._encoder.link_report(lost, round_trip_s)
 
-    def _build(self, ssrc: int) -> Any:
+    def _build(self) -> Any:
         settings, source = self._settings, self._source
         encoding = encoder.description(
             settings.encoder, settings.camera, source.rate_hz, dmabuf=source.dmabuf
@@ -107,22 +165,20 @@ class Media:
         pipeline = gstreamer.launch(
             f"{source.elements()} ! {measuring.description(settings.camera)} ! {encoding} "
             "! video/x-h264,stream-format=byte-stream,alignment=au "
-            "! appsink name=encoded emit-signals=true sync=false async=false "
-            f"{link.description(settings.link, ssrc)}"
+            "! appsink name=encoded emit-signals=true sync=false async=false"
         )
-        self._link = link.Link(pipeline, settings.link)
         element = pipeline.get_by_name("encoder")
         self._encoder = encoder.Encoder(element, settings.encoder, source.rate_hz)
         measuring.attach(pipeline, settings.camera, self._on_luma)
         element.get_static_pad("sink").add_probe(self._gst.PadProbeType.BUFFER, self._on_frame)
-        encoded = pipeline.get_by_name("encoded")
-        encoded.connect("new-sample", self._on_encoded)
-        encoded.connect("eos", lambda _: self._link.end())
+        pipeline.get_by_name("encoded").connect("new-sample", self._on_encoded)
         source.attach(pipeline)
         return pipeline
 
     def _on_luma(self, luma: NDArray[np.uint8], running_ns: int) -> None:
         """The gate, on the camera's thread, before the frame itself goes on."""
+        if self._stopped:
+            return
         try:
             self._verdict = self._judge(luma, running_ns)
         except Exception as error:  # a callback cannot raise: the main thread does it
@@ -131,7 +187,7 @@ class Media:
     def _on_frame(self, pad: Any, probe: Any) -> Any:
         """Whether the frame that was just judged reaches the encoder."""
         verdict, self._verdict = self._verdict, None
-        if verdict is None and self.error is None:
+        if verdict is None and self.error is None and not self._stopped:
             self.error = StreamError("a frame came to the encoder that the gate had not seen")
         result = self._gst.PadProbeReturn
         passes = verdict is not None and verdict.decision is not Decision.GATED
@@ -153,10 +209,11 @@ class Media:
         )
         self.counters.captured += 1
         self.counters.heartbeats += info.heartbeat
+        self.last_captured_s = time.monotonic()
         if verdict.decision is Decision.GATED:
             self.counters.gated += 1
         else:
-            self._in_encoder[running_ns] = info
+            self._in_encoder[running_ns] = info, self.last_captured_s
             self._keep_idr_interval(running_ns)
         self._decided(info, verdict)
         return verdict
@@ -173,20 +230,28 @@ class Media:
 
     def _on_encoded(self, sink: Any) -> Any:
         """On the encoder's thread: puts the frame's numbers into its access unit and sends it."""
+        if self._stopped:
+            return self._gst.FlowReturn.EOS
         try:
             sample = sink.emit("pull-sample")
             buffer = sample.get_buffer()
             running_ns = sample.get_segment().to_running_time(self._gst.Format.TIME, buffer.pts)
             access_unit = buffer.extract_dup(0, buffer.get_size())
-            if annexb.is_idr(access_unit):
+            idr = annexb.is_idr(access_unit)
+            if idr:
                 self._last_idr_ns = running_ns
                 self._encoder.saw_idr()
             for earlier in [ns for ns in list(self._in_encoder) if ns < running_ns]:
                 del self._in_encoder[earlier]  # the encoder keeps order: it dropped this one
-            info = self._in_encoder.pop(running_ns)
+                self.counters.discarded += 1
+            info, _ = self._in_encoder.pop(running_ns)
             stamped = annexb.insert_before_slice(access_unit, sei.encode(info))
-            if self._link.send(stamped, running_ns):
+            self.encoded += 1
+            clock_ns = self._pipeline.get_base_time() + running_ns
+            if self._leave(Unit(info, stamped, clock_ns, idr)):
                 self.counters.sent += 1
+            else:
+                self.counters.discarded += 1
             return self._gst.FlowReturn.OK
         except Exception as error:  # a callback cannot raise: the main thread does it
             self.error = self.error or error

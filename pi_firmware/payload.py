@@ -1,23 +1,32 @@
-"""The payload's state: from the camera through the gate and the encoder to the link."""
+"""The payload's state: what is opened, who hears of whom, and the order in which all of it ends."""
 
 from __future__ import annotations
 
+import dataclasses
+import subprocess
+import sys
 import threading
 import time
+from concurrent.futures import Future
+from queue import Empty, SimpleQueue
 
-from pi_firmware import encoder, gstreamer, link
+from pi_firmware import encoder, link
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
-from pi_firmware.gate import Decision, Verdict
-from pi_firmware.media import Counters, Media
-from pi_firmware.settings import Settings
-from pi_firmware.sources import open_source
+from pi_firmware.capture import Capture
+from pi_firmware.commands import Action, Commands, Refusal, Values
+from pi_firmware.ground import Ground
+from pi_firmware.media import Counters, Unit
+from pi_firmware.reporting import Reporter
+from pi_firmware.settings import CameraSettings, Settings
 from pi_firmware.telemetry import Telemetry
-from pi_firmware.wire import messages, sei
+from pi_firmware.wire import messages
+from pi_firmware.wire.config import range_of
 from pi_firmware.wire.errors import BlimpError, StreamError
 
-_POLL_NS = 50_000_000
 _FLUSH_LIMIT_S = 10.0
+_COMMAND_LIMIT_S = 30.0
+_EXPOSURE_LIMIT_S = 10.0
 
 
 class Payload:
@@ -29,127 +38,178 @@ class Payload:
     def __init__(self, settings: Settings) -> None:
         encoder.require(settings.encoder)
         gauge = open_gauge(settings.battery.uri, settings.battery)
+        self.settings = settings
+        self.ssrc = link.draw_ssrc(settings.link)
+        self._stop = threading.Event()
+        self._afterwards: list[str] = []
+        self._requests: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._autopilot = open_autopilot(
             settings.autopilot, lambda state: self._telemetry.autopilot(state)
         )
-        self.settings = settings
-        self.ssrc = link.draw_ssrc(settings.link)
-        self._source = open_source(settings.camera)
-        self._gst = gstreamer.load()
+        self._link = link.Link(settings.link, self.ssrc)
+        self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
         try:
-            self.media = Media(settings, self._source, self.ssrc, self._tell_gate)
-            self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
-            self._battery = Monitor(
-                settings.battery,
-                gauge,
-                publish=self._telemetry.battery,
-                announce=self._announce,
-                on_low=self.media.limit_bitrate,
+            self._reporter = Reporter(settings, self.ssrc, self._telemetry)
+            self._capture = Capture(
+                settings, self._reporter.gate, self._leave, self._reporter.announce
             )
         except BaseException:
-            self._source.close()
+            self._telemetry.close()
+            self._link.stop()
             raise
+        self._reporter.counters = self._capture.counters
+        self._ground = Ground(settings.link, self.ssrc, self._link, self._capture, self._telemetry)
+        self._battery = Monitor(
+            settings.battery,
+            gauge,
+            publish=self._telemetry.battery,
+            announce=self._reporter.announce,
+            on_low=self._capture.limit_bitrate,
+        )
+        self._commands = Commands(
+            self._actions(), lambda text: self._reporter.announce(messages.EVENT_COMMAND, text)
+        )
 
     def run(self, stop: threading.Event) -> None:
         """Flies until the source ends or `stop` is set, then sends what is still inside.
 
         Raises `BlimpError` when camera, encoder or link fail on the way.
         """
-        self._announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
+        self._stop = stop
+        announce = self._reporter.announce
+        announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
         try:
-            self.media.play()
-            self._source.start()
-            self._battery.start(on_critical=stop.set)
+            self._link.start()
+            self._capture.start()
+            self._battery.start(on_critical=self._on_critical)
             self._autopilot.start()
             self._telemetry.on_pose(self._autopilot.on_pose)
-            self._supervise(stop)
+            self._telemetry.on_link(self._ground.heard)
+            self._telemetry.on_command(self._commands.ask)
+            self._fly(stop)
         except BlimpError as error:
-            self._announce(messages.EVENT_FAILED, str(error))
+            announce(messages.EVENT_FAILED, str(error))
             raise
-        if self._source.cut_reason:
-            self._announce(messages.EVENT_SOURCE_CUT, self._source.cut_reason)
+        if self.cut_reason:
+            announce(messages.EVENT_SOURCE_CUT, self.cut_reason)
         name = messages.EVENT_STOPPED if stop.is_set() else messages.EVENT_END_OF_STREAM
-        self._announce(name, str(self.counters))
+        announce(name, str(self.counters))
 
     @property
     def counters(self) -> Counters:
         """Frames so far."""
-        return self.media.counters
+        return self._capture.counters
 
     @property
     def cut_reason(self) -> str:
         """Why the source ended early, in words; empty when it did not."""
-        return self._source.cut_reason
+        return self._capture.cut_reason
 
     @property
     def listening(self) -> tuple[str, ...]:
         """Telemetry endpoints that this payload listens on."""
         return self._telemetry.listening
 
+    @property
+    def notice(self) -> str:
+        """What a person should know from the start, in one line; empty when there is nothing."""
+        return self._link.problem
+
     def close(self) -> None:
-        """Stops the pipeline and releases everything."""
-        self._source.stop()
-        self.media.stop()
-        self._source.close()
+        """Stops everything and releases it; then runs what was asked for after the end."""
+        self._capture.close()
+        self._link.stop()
+        self._commands.close()
         self._autopilot.stop()
         self._battery.stop()
         self._telemetry.close()
-        self._battery.shut_down()
+        _run_last(self._afterwards)
 
-    def _supervise(self, stop: threading.Event) -> None:
-        bus = self.media.bus
-        kinds = self._gst.MessageType.ERROR | self._gst.MessageType.EOS
+    def _fly(self, stop: threading.Event) -> None:
         flush_until: float | None = None
-        while True:
-            message = bus.timed_pop_filtered(_POLL_NS, kinds)
-            if self.media.error is not None:
-                raise self.media.error
-            if message is not None and message.type == self._gst.MessageType.ERROR:
-                reason = self._source.explain(message.parse_error()[0].message)
-                raise StreamError(f"video pipeline: {reason}")
-            if message is not None:
-                if self._source.error is not None:
-                    raise self._source.error
-                return
-            now = time.monotonic()
+        while self._capture.step():
+            self._serve()
+            if failure := self._link.failure():
+                raise StreamError(f"video link: {failure}")
             if stop.is_set() and flush_until is None:
-                self._source.stop()
-                flush_until = now + _FLUSH_LIMIT_S
-            if flush_until is not None and now > flush_until:
+                self._capture.end()
+                flush_until = time.monotonic() + _FLUSH_LIMIT_S
+            if flush_until is not None and time.monotonic() > flush_until:
                 raise StreamError(f"the encoder did not end within {_FLUSH_LIMIT_S:g} s")
+        self._link.flush()
 
-    def _tell_gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
-        counters = self.counters
-        self._telemetry.gate(
-            messages.Gate(
-                time_ns=time.time_ns(),
-                capture_ns=info.time_ns,
-                sequence=info.sequence,
-                passed=verdict.decision is not Decision.GATED,
-                heartbeat=info.heartbeat,
-                entropy_bits=info.entropy_bits,
-                sharpness=info.sharpness,
-                captured=counters.captured,
-                gated=counters.gated,
-                heartbeats=counters.heartbeats,
-                sent=counters.sent,
-                ssrc=self.ssrc,
-                reason=verdict.reason,
-                difference=verdict.difference,
-            )
-        )
+    def _leave(self, unit: Unit) -> bool:
+        """On the encoder's thread: a finished frame's way out."""
+        return self._link.send(unit.data, unit.clock_ns, idr=unit.idr)
 
-    def _announce(self, name: str, text: str) -> None:
-        camera, counters = self.settings.camera, self.counters
-        values = {
-            "ssrc": self.ssrc,
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "captured": counters.captured,
-            "gated": counters.gated,
-            "heartbeats": counters.heartbeats,
-            "sent": counters.sent,
+    def _on_critical(self) -> None:
+        self._afterwards = self.settings.battery.shutdown_command
+        self._stop.set()
+
+    def _actions(self) -> dict[str, Action]:
+        """The table of commands."""
+        camera, settings = CameraSettings, self.settings
+        return {
+            "idr": Action(self._capture.force_idr),
+            "bitrate": Action(
+                lambda kbps: {"kbps": self._capture.set_bitrate(round(kbps))},
+                {"kbps": (50, 20_000)},
+                frozenset({"kbps"}),
+            ),
+            "exposure": Action(
+                self._expose,
+                {name: range_of(camera, name) for name in ("exposure_s", "gain")},
+            ),
+            "shutdown": Action(
+                lambda: self._end("battery.shutdown_command", settings.battery.shutdown_command)
+            ),
+            "reboot": Action(
+                lambda: self._end("supervision.reboot_command", settings.supervision.reboot_command)
+            ),
         }
-        self._telemetry.event(
-            messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values)
-        )
+
+    def _end(self, key: str, command: list[str]) -> None:
+        if not command:
+            raise Refusal(f"'{key}' is empty: this payload does not know how")
+        self._afterwards = command
+        self._stop.set()
+
+    def _expose(self, exposure_s: float | None = None, gain: float | None = None) -> Values:
+        """Starts the camera anew with another exposure or gain, on the thread that may."""
+        if not self._capture.live:
+            raise Refusal("a recording is exposed already")
+        camera = self._capture.camera
+        if exposure_s is not None:
+            camera = dataclasses.replace(camera, exposure_s=exposure_s)
+        if gain is not None:
+            camera = dataclasses.replace(camera, gain=gain)
+        done: Future[None] = Future()
+        self._requests.put((camera, done))
+        try:
+            done.result(_EXPOSURE_LIMIT_S)
+        except TimeoutError:
+            raise Refusal(f"the camera did not answer within {_EXPOSURE_LIMIT_S:g} s") from None
+        return {"exposure_s": camera.exposure_s, "gain": camera.gain}
+
+    def _serve(self) -> None:
+        """What others asked of the camera, on the thread that may restart it."""
+        try:
+            camera, done = self._requests.get_nowait()
+        except Empty:
+            return
+        try:
+            self._capture.use(camera)
+        except BlimpError as error:
+            done.set_exception(error)
+        else:
+            done.set_result(None)
+
+
+def _run_last(command: list[str]) -> None:
+    """Runs what ends or reboots the board, if anything does."""
+    if not command:
+        return
+    try:
+        subprocess.run(command, timeout=_COMMAND_LIMIT_S, check=True, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.SubprocessError) as error:
+        print(f"pi_firmware: {command[0]}: {error}", file=sys.stderr)

@@ -1,29 +1,47 @@
-"""The payload's telemetry: publishes messages and holds the liveliness token."""
+"""The payload's telemetry: publishes messages, takes what the ground says, and is asked things."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.wire import credentials, keys, messages
-from pi_firmware.wire.clock_offset import Clock, serve
+from pi_firmware.wire.clock_offset import Clock, RoundTrip, ask, serve
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, open_session
 
+M = TypeVar("M", bound=messages.Message)
+_HOST = re.compile(r"^[a-z]+/(\[[^\]]+\]|[^/:]+):\d+")
+
+Tap = Callable[[str, messages.Message], None]
+Asked = Callable[[str, messages.Command, Callable[[messages.Answer], None]], None]
+
 
 class Telemetry:
-    """Publishes under one payload's keys; does nothing when disabled. Safe from any thread."""
+    """Publishes under one payload's keys; sends nothing when disabled. Safe from any thread.
+
+    `tap` gets each message with its kind as well, sent or not: the recorder.
+    """
 
     def __init__(
-        self, payload_id: str, settings: TelemetrySettings, clock: Clock = time.time_ns
+        self,
+        payload_id: str,
+        settings: TelemetrySettings,
+        clock: Clock = time.time_ns,
+        tap: Tap = lambda kind, message: None,
     ) -> None:
+        self._tap = tap
         self._session: Session | None = None
         self._publishers: dict[str, Any] = {}
         self._alive: Any = None
         self._clock: Any = None
+        self._commands: Any = None
+        self._certified = bool(settings.certificates)
+        self._now = clock
         self._payload_id = payload_id
         self._subscribers: list[Any] = []
         if not settings.enabled:
@@ -38,10 +56,12 @@ class Telemetry:
                     f" not payload.{payload_id}'s"
                 )
         self._session = open_session(
-            listen=settings.listen, connect=settings.connect, certificates=settings.certificates
+            listen=settings.listen,
+            connect=settings.connect,
+            certificates=settings.certificates,
         )
         session = self._session.zenoh
-        for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT):
+        for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT, keys.HEALTH):
             # Events are rare and must arrive; of the others a newer one follows at once.
             control = zenoh.CongestionControl
             self._publishers[kind] = session.declare_publisher(
@@ -72,29 +92,91 @@ class Telemetry:
         """Publishes the autopilot's state."""
         self._put(keys.AUTOPILOT, message)
 
-    def on_pose(self, take: Callable[[messages.Pose], None]) -> None:
-        """Calls `take` with each pose of this payload that the ground station publishes.
+    def health(self, message: messages.Health) -> None:
+        """Publishes how payload and board are."""
+        self._put(keys.HEALTH, message)
 
-        It is called on a thread of the session; what is no pose as agreed is dropped.
-        """
+    def on_pose(self, take: Callable[[messages.Pose], None]) -> None:
+        """Calls `take` with each pose of this payload that the ground station publishes."""
+        self._subscribe(keys.POSE, messages.Pose, take)
+
+    def on_link(self, take: Callable[[messages.LinkReport], None]) -> None:
+        """Calls `take` with each report of a ground station on this payload's video."""
+        self._subscribe(keys.LINK, messages.LinkReport, take)
+
+    def _subscribe(self, kind: str, of: type[M], take: Callable[[M], None]) -> None:
+        """`take` is called on a thread of the session; what is not as agreed is dropped."""
         if self._session is None:
             return
 
         def received(sample: Any) -> None:
             with contextlib.suppress(TelemetryError):
-                take(messages.decode(messages.Pose, sample.payload.to_bytes()))
+                take(messages.decode(of, sample.payload.to_bytes()))
 
-        key = keys.key(self._payload_id, keys.POSE)
+        key = keys.key(self._payload_id, kind)
         self._subscribers.append(self._session.zenoh.declare_subscriber(key, received))
+
+    def on_command(self, ask: Asked) -> None:
+        """Hands each command to `ask` with its name and what takes the answer.
+
+        A question to several commands at once is one to a command that does not exist.
+        """
+        if self._session is None:
+            return
+
+        def asked(query: Any) -> None:
+            key = str(query.key_expr)
+
+            def answer(message: messages.Answer) -> None:
+                with contextlib.suppress(Exception):  # whoever asked may be gone
+                    query.reply(key, messages.encode(message))
+                    query.drop()
+
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            try:
+                command = messages.decode(messages.Command, payload)
+            except TelemetryError as error:
+                answer(messages.Answer(time_ns=time.time_ns(), done=False, reason=str(error)))
+                return
+            ask(key.rpartition("/")[2], command, answer)
+
+        key = keys.command(self._payload_id, "*")
+        self._commands = self._session.zenoh.declare_queryable(key, asked)
+
+    def ground_address(self, ground: str) -> str | None:
+        """The numeric address of a ground station that is connected; None when it is not.
+
+        With certificates it is the one whose certificate says its name; without, on loopback, the
+        only one there is.
+        """
+        if self._session is None:
+            return None
+        hosts = set()
+        for link in self._session.zenoh.info.links():
+            identity = str(link.auth_identifier or "")
+            if not self._certified or identity == f"{credentials.GROUND}.{ground}":
+                match = _HOST.search(str(link.dst))
+                if match:
+                    hosts.add(match[1].strip("[]"))
+        return hosts.pop() if len(hosts) == 1 else None
+
+    def ask_time(self) -> RoundTrip | None:
+        """One round trip to the ground station's clock; None without an answer."""
+        if self._session is None:
+            return None
+        return ask(self._session.zenoh, keys.key(self._payload_id, keys.TIME), self._now)
 
     def close(self) -> None:
         """Withdraws the liveliness token and closes the session."""
         if self._session is not None:
             self._alive.undeclare()
             self._clock.undeclare()
+            if self._commands is not None:
+                self._commands.undeclare()
             self._session.close()
             self._session = None
 
     def _put(self, kind: str, message: messages.Message) -> None:
+        self._tap(kind, message)
         if self._session is not None:
             self._publishers[kind].put(messages.encode(message))

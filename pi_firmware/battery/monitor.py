@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +21,6 @@ _LARGEST_A = 100.0
 _LOW_ENDS = 0.05  # above the threshold by this much the alarm is over
 _SILENT_AFTER = 3  # failed readings in a row before it is said
 _LONGEST_PAUSE_S = 30.0
-_COMMAND_LIMIT_S = 30.0
 _JOIN_LIMIT_S = 2.0
 _CHARGING = 1
 
@@ -96,16 +93,6 @@ class Monitor:
             self._alarm(completed)
         self._publish(dataclasses.replace(completed, alarm=self.alarm))
         return self._settings.period_s
-
-    def shut_down(self) -> None:
-        """Runs the configured command if the battery was critical; call it when all has ended."""
-        command = self._settings.shutdown_command
-        if self.alarm != messages.ALARM_CRITICAL or not command:
-            return
-        try:
-            subprocess.run(command, timeout=_COMMAND_LIMIT_S, check=True, stdin=subprocess.DEVNULL)
-        except (OSError, subprocess.SubprocessError) as error:
-            print(f"pi_firmware: battery.shutdown_command: {error}", file=sys.stderr)
 
     def _run(self) -> None:
         pause_s = 0.0

@@ -36,6 +36,13 @@ def key(
     return dataclasses.field(default=default, metadata=meta)
 
 
+def range_of(cls: type, name: str) -> tuple[float, float]:
+    """The bounds of a number that is declared with `key`, inclusive; infinite where it has none."""
+    meta = next(field.metadata for field in dataclasses.fields(cls) if field.name == name)
+    low, high = meta["low"], meta["high"]
+    return (-math.inf if low is None else low, math.inf if high is None else high)
+
+
 def table(cls: type[T]) -> T:
     """A dataclass field that is a sub-table of the file, described by the dataclass `cls`."""
     return dataclasses.field(default_factory=cls)

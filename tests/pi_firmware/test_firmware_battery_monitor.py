@@ -218,27 +218,6 @@ def test_a_link_that_fails_does_not_hold_up_the_end() -> None:
     failing.stop()
 
 
-def test_the_command_runs_after_a_critical_battery_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    mark = tmp_path / "ran"
-    command = [sys.executable, "-c", f"open({str(mark)!r}, 'w')"]
-    settings = BatterySettings(shutdown_command=command, confirm_readings=1)
-    good = Watched(Script({"voltage": 3.8}), settings)
-    good.steps(3)
-    good.shut_down()
-    assert not mark.exists()
-    empty = Watched(Script({"voltage": 3.2}), settings)
-    empty.steps(1)
-    assert not mark.exists()  # first all ends, then it is called
-    empty.shut_down()
-    assert mark.exists()
-    wrong = Watched(Script({"voltage": 3.2}), BatterySettings(shutdown_command=["/no/such"]))
-    wrong.steps(3)
-    wrong.shut_down()
-    assert "battery.shutdown_command" in capsys.readouterr().err
-
-
 def test_a_low_battery_holds_the_encoder_down_whatever_the_link_bears() -> None:
     from pi_firmware.encoder import Encoder
 

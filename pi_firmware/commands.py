@@ -1,0 +1,109 @@
+"""What the ground may ask for: each command by name, with its numbers and their ranges.
+
+Who may ask is settled before: by the access rules of the certificates, or by loopback.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from queue import Empty, Full, Queue
+
+from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.messages import Answer, Command
+
+_WAITING = 8
+_JOIN_LIMIT_S = 2.0
+
+Values = Mapping[str, float]
+
+
+class Refusal(BlimpError):
+    """A command that is not carried out, and why."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """What a command does: `run` gets its numbers by name and returns what is set now.
+
+    `numbers` has the range of each; `needed` must be given. `run` raises `BlimpError` to refuse.
+    """
+
+    run: Callable[..., Values | None]
+    numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    needed: frozenset[str] = frozenset()
+
+
+class Commands:
+    """Carries out one command after the other on a thread of its own, and answers each.
+
+    `announce` gets a text of each, so that telemetry and recordings tell who was asked what.
+    """
+
+    def __init__(self, actions: Mapping[str, Action], announce: Callable[[str], None]) -> None:
+        self._actions = actions
+        self._announce = announce
+        self._waiting: Queue[tuple[str, Command, Callable[[Answer], None]]] = Queue(_WAITING)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="commands", daemon=True)
+        self._thread.start()
+
+    def ask(self, name: str, command: Command, answer: Callable[[Answer], None]) -> None:
+        """Queues a command; `answer` is called when it was carried out or refused."""
+        try:
+            self._waiting.put_nowait((name, command, answer))
+        except Full:
+            answer(_refused(f"{_WAITING} commands wait already"))
+
+    def carry_out(self, name: str, command: Command) -> Answer:
+        """Carries out one command now."""
+        try:
+            values = self._checked(name).run(**self._numbers(name, command.arguments))
+        except BlimpError as error:
+            return _refused(str(error))
+        except Exception as error:  # a command must never end a flight
+            return _refused(f"{type(error).__name__}: {error}")
+        return Answer(time_ns=time.time_ns(), done=True, values=dict(values or {}))
+
+    def close(self) -> None:
+        """Ends the thread; what still waits gets no answer."""
+        self._closing.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_LIMIT_S)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                name, command, answer = self._waiting.get(timeout=0.2)
+            except Empty:
+                continue
+            done = self.carry_out(name, command)
+            answer(done)
+            self._announce(f"{name}: {'done' if done.done else done.reason}")
+
+    def _checked(self, name: str) -> Action:
+        if name not in self._actions:
+            known = ", ".join(sorted(self._actions))
+            raise Refusal(f"no command {name[:40]!r} (there are: {known})")
+        return self._actions[name]
+
+    def _numbers(self, name: str, given: Mapping[str, float]) -> dict[str, float]:
+        action = self._actions[name]
+        for number in given:
+            if number not in action.numbers:
+                known = ", ".join(action.numbers) or "none"
+                raise Refusal(f"{name}: unknown number {number[:40]!r} (it takes: {known})")
+        for number in sorted(action.needed - set(given)):
+            raise Refusal(f"{name}: '{number}' is missing")
+        for number, value in given.items():
+            low, high = action.numbers[number]
+            if not (math.isfinite(value) and low <= value <= high):
+                raise Refusal(f"{name}: '{number}' is {value:g}; allowed: {low:g} to {high:g}")
+        return dict(given)
+
+
+def _refused(reason: str) -> Answer:
+    return Answer(time_ns=time.time_ns(), done=False, reason=reason)

@@ -1,0 +1,82 @@
+"""The ground stations as the payload sees them: who takes the video, and how well it arrives."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pi_firmware.capture import Capture
+from pi_firmware.link import DISCOVERED, Link
+from pi_firmware.settings import LinkSettings
+from pi_firmware.telemetry import Telemetry
+from pi_firmware.wire.messages import LinkReport
+
+_SILENT_S = 5.0
+_LOWEST_PORT, _HIGHEST_PORT = 1, 65_535
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The newest report of the video: the share of packets lost, and the round trip."""
+
+    ground: str
+    lost: float
+    round_trip_s: float | None
+    heard_s: float
+
+
+class Ground:
+    """Takes the ground stations' reports, and sends the video where one of them is.
+
+    With `link.host` = "auto" it goes to the first that reports, and to another only when that one
+    has been silent for 5 s. Reports of other streams than ours change nothing else.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        ssrc: int,
+        link: Link,
+        capture: Capture,
+        telemetry: Telemetry,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._discovers = settings.host == DISCOVERED
+        self._ssrc = ssrc
+        self._link, self._capture, self._telemetry = link, capture, telemetry
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._followed = ""
+        self._followed_s = 0.0
+        self._seen: Seen | None = None
+
+    @property
+    def seen(self) -> Seen | None:
+        """The newest report of our video; None when none came within 5 s."""
+        seen = self._seen
+        return seen if seen and self._clock() - seen.heard_s < _SILENT_S else None
+
+    def heard(self, report: LinkReport) -> None:
+        """Takes a report; on any thread. One that cannot be changes nothing."""
+        if not (_LOWEST_PORT <= report.video_port <= _HIGHEST_PORT and 0 <= report.lost <= 1):
+            return
+        now_s = self._clock()
+        with self._lock:
+            if self._discovers:
+                self._follow(report, now_s)
+            if report.ssrc != self._ssrc:
+                return
+            trip_s = report.round_trip_s
+            self._seen = Seen(report.ground, report.lost, trip_s, now_s)
+        self._capture.link_report(report.lost, 0.0 if trip_s is None else trip_s)
+
+    def _follow(self, report: LinkReport, now_s: float) -> None:
+        other = report.ground != self._followed
+        if other and self._followed and now_s - self._followed_s < _SILENT_S:
+            return
+        address = self._telemetry.ground_address(report.ground)
+        if address is not None:
+            self._followed, self._followed_s = report.ground, now_s
+            self._link.redirect(address, report.video_port)
