@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from pi_firmware.wire import keys
-from pi_firmware.wire.clock_offset import Clock, Offset, OffsetFilter, ask, serve
+from pi_firmware.wire.clock_offset import ASK_TIMEOUT_S, Clock, Offset, OffsetFilter, ask, serve
 
 _PERIOD_S = 1.0
 
@@ -24,6 +25,7 @@ class ClockFollower:
         self._clock = clock
         self._filters: dict[str, OffsetFilter] = {}
         self._offsets: dict[str, Offset] = {}
+        self._round_trips_s: dict[str, float | None] = {}
         self._served: dict[str, Any] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock-follower", daemon=True)
@@ -32,6 +34,14 @@ class ClockFollower:
     def offset(self, payload_id: str) -> Offset | None:
         """The newest offset of a payload's clock to ours; None before the first answer."""
         return self._offsets.get(payload_id)
+
+    def round_trip_s(self, payload_id: str) -> float | None:
+        """How long the newest question was on its way, there and back.
+
+        Not the shortest, which the offset is made of: this one tells how the link is now. It is at
+        least this long where no answer came in time; None where nobody serves the clock.
+        """
+        return self._round_trips_s.get(payload_id)
 
     def close(self) -> None:
         """Stops asking; to be called before its session closes."""
@@ -50,9 +60,15 @@ class ClockFollower:
         if payload_id not in self._served:
             key = keys.key(payload_id, keys.TIME)
             self._served[payload_id] = serve(self._session, key, self._clock)
+        asked_s = time.monotonic()
         trip = ask(self._session, keys.key(payload_id, keys.CLOCK), self._clock)
         if trip is None:
+            # A question that reaches nobody ends at once; one that is not answered waits.
+            waited_s = time.monotonic() - asked_s
+            self._round_trips_s[payload_id] = waited_s if waited_s >= ASK_TIMEOUT_S else None
             return
+        if trip.delay_ns >= 0:  # otherwise a clock stepped meanwhile
+            self._round_trips_s[payload_id] = trip.delay_ns / 1e9
         offset = self._filters.setdefault(payload_id, OffsetFilter()).add(trip)
         if offset is not None:
             self._offsets[payload_id] = offset

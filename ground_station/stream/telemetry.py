@@ -1,4 +1,4 @@
-"""What the payloads say: battery, gate, autopilot, events and liveliness, kept per payload."""
+"""What the payloads say: battery, health, gate, autopilot, events and life, kept per payload."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.stream.clock import ClockFollower
-from pi_firmware.wire import keys, messages
+from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.clock_offset import Offset
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, open_session
@@ -20,7 +20,10 @@ _KINDS: dict[str, type[messages.Message]] = {
     keys.GATE: messages.Gate,
     keys.EVENT: messages.Event,
     keys.AUTOPILOT: messages.Autopilot,
+    keys.HEALTH: messages.Health,
 }
+LOCAL_NAME = "local"
+"""What a ground station without a certificate is called."""
 _KEPT_DECISIONS = 10_000
 _KEPT_EVENTS = 200
 _KEPT_PAYLOADS = 64
@@ -28,12 +31,16 @@ _KEPT_PAYLOADS = 64
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """The payload's own account: `captured` = `gated` + `sent` once its stream has ended."""
+    """The payload's own account: captured = gated + sent + discarded once its stream has ended.
+
+    `discarded` frames passed the gate and never left the encoder; an older payload tells none.
+    """
 
     captured: int
     gated: int
     heartbeats: int
     sent: int
+    discarded: int = 0
 
 
 @dataclass
@@ -49,6 +56,7 @@ class PayloadState:
     battery: messages.Battery | None = None
     gate: messages.Gate | None = None
     autopilot: messages.Autopilot | None = None
+    health: messages.Health | None = None
     decisions: dict[int, messages.Gate] = field(default_factory=dict)
     events: list[messages.Event] = field(default_factory=list)
     refused: int = 0
@@ -60,9 +68,11 @@ class PayloadState:
         if last is not None and (self.gate is None or last.time_ns >= self.gate.time_ns):
             v = last.values
             if {"captured", "gated", "heartbeats", "sent"} <= v.keys():
-                return FrameCounts(v["captured"], v["gated"], v["heartbeats"], v["sent"])
-        g = self.gate
-        return FrameCounts(g.captured, g.gated, g.heartbeats, g.sent) if g else None
+                counts = (v["captured"], v["gated"], v["heartbeats"], v["sent"])
+                return FrameCounts(*counts, discarded=v.get("discarded", 0))
+        if (g := self.gate) is None:
+            return None
+        return FrameCounts(g.captured, g.gated, g.heartbeats, g.sent, g.discarded)
 
     @property
     def ssrc(self) -> int | None:
@@ -78,7 +88,8 @@ class TelemetryListener:
     An endpoint `tcp/127.0.0.1:0` takes a free port, which `endpoints` then tells. Raises
     `TelemetryError` with one line when an endpoint is in use. `certificates` is the folder that
     `blimp keys ground` wrote, without which only loopback is spoken to. `on_event` is called with
-    the payload's id for each event, on a thread of the session.
+    the payload's id for each event, on a thread of the session. `session` is there for what else
+    the ground station says to its payloads; `name` is the ground station's own.
     """
 
     def __init__(
@@ -92,9 +103,10 @@ class TelemetryListener:
         self._states: dict[str, PayloadState] = {}
         self._changed = threading.Condition()
         self._on_event = on_event
-        self._session = open_session(listen=listen, connect=connect, certificates=certificates)
-        self.endpoints = self._session.listening
-        session = self._session.zenoh
+        self.name = credentials.load(certificates).member if str(certificates) else LOCAL_NAME
+        self.session = open_session(listen=listen, connect=connect, certificates=certificates)
+        self.endpoints = self.session.listening
+        session = self.session.zenoh
         # One subscriber for all kinds keeps the order in which a payload said things.
         self._subscribers = [
             session.declare_subscriber(keys.every_payload("*"), self._take),
@@ -102,11 +114,7 @@ class TelemetryListener:
                 keys.every_payload(keys.ALIVE), self._take_liveliness, history=True
             ),
         ]
-        self._clocks = ClockFollower(session, self._living, time.time_ns)
-
-    def _living(self) -> list[str]:
-        with self._changed:
-            return sorted(name for name, state in self._states.items() if state.alive)
+        self._clocks = ClockFollower(session, self.living, time.time_ns)
 
     def __enter__(self) -> TelemetryListener:
         return self
@@ -118,15 +126,24 @@ class TelemetryListener:
         """How far a payload's clock is from this machine's; None before it answered."""
         return self._clocks.offset(payload_id)
 
+    def round_trip_s(self, payload_id: str) -> float | None:
+        """The newest round trip to a payload; None before it answered."""
+        return self._clocks.round_trip_s(payload_id)
+
     def close(self) -> None:
         """Stops listening; what was heard stays readable."""
         self._clocks.close()
-        self._session.close()
+        self.session.close()
 
     def payloads(self) -> list[str]:
         """The ids of all payloads heard of, sorted."""
         with self._changed:
             return sorted(self._states)
+
+    def living(self) -> list[str]:
+        """The ids of the payloads that are alive now, sorted."""
+        with self._changed:
+            return sorted(name for name, state in self._states.items() if state.alive)
 
     def state(self, payload_id: str) -> PayloadState | None:
         """A snapshot of one payload; None when nothing was heard of it."""
@@ -198,6 +215,8 @@ def _keep(state: PayloadState, message: messages.Message) -> None:
         state.battery = message
     elif isinstance(message, messages.Autopilot):
         state.autopilot = message
+    elif isinstance(message, messages.Health):
+        state.health = message
     elif isinstance(message, messages.Gate):
         state.gate = message
         state.decisions[message.sequence] = message
@@ -205,6 +224,6 @@ def _keep(state: PayloadState, message: messages.Message) -> None:
             del state.decisions[next(iter(state.decisions))]
     elif isinstance(message, messages.Event):
         if message.name == messages.EVENT_STARTED:  # a new flight counts from zero
-            state.gate, state.decisions, state.events = None, {}, []
+            state.gate, state.health, state.decisions, state.events = None, None, {}, []
         state.events.append(message)
         del state.events[:-_KEPT_EVENTS]

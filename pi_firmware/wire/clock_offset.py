@@ -17,7 +17,7 @@ from typing import Any
 WINDOW = 32
 # Crystals of small boards stay within 50 ppm of the truth, two of them within 100 of each other.
 DRIFT_PPM = 100
-_TIMEOUT_S = 1.0
+ASK_TIMEOUT_S = 1.0
 
 Clock = Callable[[], int]
 
@@ -104,7 +104,7 @@ def serve(session: Any, key: str, clock: Clock = time.time_ns) -> Any:
 def ask(session: Any, key: str, clock: Clock = time.time_ns) -> RoundTrip | None:
     """One round trip to whoever serves the key; None without an answer that is as agreed."""
     sent_ns = clock()
-    for reply in session.get(key, timeout=_TIMEOUT_S):
+    for reply in session.get(key, timeout=ASK_TIMEOUT_S):
         returned_ns = clock()
         if reply.ok is None:
             continue

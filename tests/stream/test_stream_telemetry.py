@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ground_station.stream.telemetry import FrameCounts, TelemetryListener
+from ground_station.stream.telemetry import FrameCounts, PayloadState, TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import keys, messages
@@ -60,6 +60,31 @@ def test_an_autopilots_state_is_kept(listener: TelemetryListener) -> None:
     state = listener.wait("blimp-1", lambda s: s.autopilot is not None, LIMIT_S)
     assert state is not None and state.autopilot == sent
     telemetry.close()
+
+
+def test_health_is_kept_until_a_new_start(listener: TelemetryListener) -> None:
+    session = open_session(connect=listener.endpoints)
+    told = messages.Health(time_ns=4, uptime_s=2.5, sent=50, wifi_signal_dBm=-61.0, late=["camera"])
+    publisher = session.zenoh.declare_publisher(keys.key("blimp-1", keys.HEALTH))
+    publisher.put(messages.encode(told))
+    state = listener.wait("blimp-1", lambda s: s.health is not None, LIMIT_S)
+    assert state is not None and state.health == told
+    started = messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again")
+    session.zenoh.put(keys.key("blimp-1", keys.EVENT), messages.encode(started))
+    assert listener.wait("blimp-1", lambda s: s.events != [], LIMIT_S)
+    state = listener.state("blimp-1")
+    assert state is not None and state.health is None
+    session.close()
+
+
+def test_discarded_frames_are_counted_and_none_of_an_older_payload() -> None:
+    state = PayloadState("blimp-1", gate=gate(5, captured=10, gated=2, sent=5, discarded=3))
+    assert state.frames == FrameCounts(10, 2, 0, 5, discarded=3)
+    values = {"captured": 11, "gated": 2, "heartbeats": 1, "sent": 5, "discarded": 4}
+    state.events = [messages.Event(time_ns=6, name="stopped", text="", values=values)]
+    assert state.frames == FrameCounts(11, 2, 1, 5, discarded=4)
+    del values["discarded"]
+    assert state.frames == FrameCounts(11, 2, 1, 5, discarded=0)
 
 
 def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryListener) -> None:

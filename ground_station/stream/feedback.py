@@ -1,0 +1,184 @@
+"""What the ground station says back of the video: once a second, to each payload that lives."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from ground_station.stream.counters import Counters
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware.wire import keys, messages
+
+PERIOD_S = 1.0
+WINDOW_S = 2.0
+
+
+class Video(Protocol):
+    """What is asked of a receiver."""
+
+    @property
+    def port(self) -> int:
+        """The UDP port it takes the video at."""
+        ...
+
+    @property
+    def ssrc(self) -> int | None:
+        """The stream it takes; None while there is none."""
+        ...
+
+    @property
+    def counters(self) -> Counters:
+        """What came so far."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Packets of one stream: those in time, each once, and those the decoder went on without.
+
+    A packet that comes late was given up before and stays lost; a duplicate counts once. So both
+    together are the packets that were sent. `frames` is how many the payload says it sent.
+    """
+
+    packets: int = 0
+    lost: int = 0
+    frames: int = 0
+
+    def __sub__(self, other: Tally) -> Tally:
+        return Tally(
+            max(0, self.packets - other.packets),
+            max(0, self.lost - other.lost),
+            max(0, self.frames - other.frames),
+        )
+
+    @property
+    def share_lost(self) -> float:
+        """0 to 1; 1 when frames were sent and nothing at all came, 0 when nothing was sent."""
+        if self.packets + self.lost:
+            return self.lost / (self.packets + self.lost)
+        # Of a single frame the word may be here before its packets.
+        return 1.0 if self.frames > 1 else 0.0
+
+
+class StreamAccount:
+    """Turns a receiver's counters, which go on from stream to stream, into those of one stream."""
+
+    def __init__(self) -> None:
+        self._ssrc: int | None = None
+        self._before = Counters()
+        self._last = Counters()
+        self._window: deque[tuple[float, Tally]] = deque()
+
+    def add(self, ssrc: int, counters: Counters, frames: int, now_s: float) -> tuple[Tally, float]:
+        """The stream's tally so far, and the share lost over the last 2 s or what is known of them.
+
+        `now_s` is of a clock that never steps.
+        """
+        if counters.packets < self._last.packets:  # another receiver
+            self._before, self._last = Counters(), Counters()
+            self._window.clear()
+        if ssrc != self._ssrc:
+            # What came before this stream is none of its own.
+            self._before, self._ssrc = self._last, ssrc
+            self._window.clear()
+        self._last = counters
+        tally = _tally(counters, frames) - _tally(self._before, 0)
+        while len(self._window) > 1 and now_s - self._window[1][0] >= WINDOW_S:
+            self._window.popleft()
+        since = self._window[0][1] if self._window else Tally(frames=frames)
+        if frames < since.frames:  # the payload counts anew
+            self._window.clear()
+        self._window.append((now_s, tally))
+        return tally, (tally - since).share_lost
+
+
+def _tally(counters: Counters, frames: int) -> Tally:
+    return Tally(counters.packets - counters.packets_late, counters.packets_lost, frames)
+
+
+class Feedback:
+    """Publishes a `messages.LinkReport` a second to each living payload; a context manager.
+
+    `video_of` gives the receiver of a payload's video, or None for a payload whose video is not
+    taken here: it gets no report. To be closed before its listener.
+    """
+
+    def __init__(
+        self,
+        listener: TelemetryListener,
+        video_of: Callable[[str], Video | None],
+        *,
+        period_s: float = PERIOD_S,
+    ) -> None:
+        self._listener = listener
+        self._video_of = video_of
+        self._period_s = period_s
+        self._accounts: dict[str, StreamAccount] = {}
+        self._publishers: dict[str, Any] = {}
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Feedback:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stops reporting; a second call does nothing."""
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        import zenoh
+
+        while not self._closing.wait(self._period_s):
+            for payload_id in self._listener.living():
+                video = self._video_of(payload_id)
+                if video is not None:
+                    # A link that just went takes no report; the next one may be back.
+                    with contextlib.suppress(zenoh.ZError):
+                        self._publish(payload_id, self._report(payload_id, video))
+
+    def _report(self, payload_id: str, video: Video) -> messages.LinkReport:
+        state = self._listener.state(payload_id)
+        ssrc, counters = video.ssrc, video.counters
+        if ssrc is not None and _is_anothers(ssrc, state):
+            ssrc = None
+        tally, lost = Tally(), 0.0
+        if ssrc is not None:
+            frames = state.frames if state is not None else None
+            account = self._accounts.setdefault(payload_id, StreamAccount())
+            sent = frames.sent if frames is not None else 0
+            tally, lost = account.add(ssrc, counters, sent, time.monotonic())
+        return messages.LinkReport(
+            time_ns=time.time_ns(),
+            ground=self._listener.name,
+            video_port=video.port,
+            ssrc=ssrc,
+            packets=tally.packets,
+            packets_lost=tally.lost,
+            lost=lost,
+            round_trip_s=self._listener.round_trip_s(payload_id),
+        )
+
+    def _publish(self, payload_id: str, report: messages.LinkReport) -> None:
+        import zenoh
+
+        if payload_id not in self._publishers:
+            self._publishers[payload_id] = self._listener.session.zenoh.declare_publisher(
+                keys.key(payload_id, keys.LINK), congestion_control=zenoh.CongestionControl.DROP
+            )
+        self._publishers[payload_id].put(messages.encode(report))
+
+
+def _is_anothers(ssrc: int, state: PayloadState | None) -> bool:
+    """Whether the payload announced another stream than this one."""
+    announced = state.ssrc if state is not None else None
+    return announced is not None and announced != ssrc

@@ -1,0 +1,204 @@
+"""A payload hears once a second how its own video arrives, and nobody else's."""
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from ground_station.stream.counters import Counters
+from ground_station.stream.feedback import Feedback, StreamAccount
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.settings import TelemetrySettings
+from pi_firmware.telemetry import Telemetry
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.telemetry import Session, open_session
+
+LIMIT_S = 20.0
+
+
+@dataclass
+class Video:
+    """A receiver that says what it is told."""
+
+    port: int = 5600
+    ssrc: int | None = None
+    counters: Counters = field(default_factory=Counters)
+
+
+def test_a_late_packet_stays_lost_and_a_duplicate_counts_once() -> None:
+    account = StreamAccount()
+    account.add(7, Counters(), 0, 0.0)
+    # Of 100 sent 10 were given up; 4 of these came late, and 5 came twice.
+    came = Counters(packets=90 + 4 + 5, packets_late=4 + 5, packets_lost=10)
+    tally, lost = account.add(7, came, 20, 1.0)
+    assert (tally.packets, tally.lost) == (90, 10)
+    assert lost == pytest.approx(0.1)
+
+
+def test_the_share_is_of_the_last_two_seconds() -> None:
+    account = StreamAccount()
+    shares = []
+    for second in range(9):
+        bad = min(second, 4)  # 50 of each second's 100 are lost, for four seconds
+        counters = Counters(packets=100 * second - 50 * bad, packets_lost=50 * bad)
+        tally, lost = account.add(7, counters, 30 * second, float(second))
+        shares.append(lost)
+        assert tally.packets + tally.lost == 100 * second
+    assert shares == pytest.approx([0, 0.5, 0.5, 0.5, 0.5, 0.25, 0, 0, 0])
+
+
+def test_nothing_received_is_all_lost_only_if_something_was_sent() -> None:
+    account = StreamAccount()
+    came = Counters(packets=500, packets_lost=3)
+    account.add(7, came, 100, 0.0)
+    for second in (1.0, 2.0, 3.0):
+        assert account.add(7, came, 100, second)[1] == 0.0  # all of it gated
+    assert account.add(7, came, 101, 4.0)[1] == 0.0  # one: its packets may be on their way
+    assert account.add(7, came, 131, 5.0)[1] == 1.0
+    assert account.add(7, came, 5, 6.0)[1] == 0.0  # the payload counts anew
+
+
+def test_a_new_stream_and_a_new_receiver_count_from_zero() -> None:
+    account = StreamAccount()
+    account.add(7, Counters(packets=80, packets_lost=20), 10, 0.0)
+    tally, lost = account.add(8, Counters(packets=180, packets_lost=20), 10, 1.0)
+    assert (tally.packets, tally.lost, lost) == (100, 0, 0.0)
+    tally, lost = account.add(8, Counters(packets=9, packets_lost=1), 10, 2.0)
+    assert (tally.packets, tally.lost) == (9, 1) and lost == pytest.approx(0.1)
+
+
+@pytest.fixture
+def listener() -> Iterator[TelemetryListener]:
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as opened:
+        yield opened
+
+
+class Ear:
+    """A payload with its telemetry, and what it is told of its link."""
+
+    def __init__(self, listener: TelemetryListener, payload_id: str) -> None:
+        self.telemetry = Telemetry(payload_id, TelemetrySettings(connect=list(listener.endpoints)))
+        self.session: Session = open_session(connect=listener.endpoints)
+        self.reports: list[messages.LinkReport] = []
+        self._heard = threading.Condition()
+        self._subscriber = self.session.zenoh.declare_subscriber(
+            keys.key(payload_id, keys.LINK), self._take
+        )
+
+    def _take(self, sample: Any) -> None:
+        with self._heard:
+            report = messages.decode(messages.LinkReport, sample.payload.to_bytes())
+            self.reports.append(report)
+            self._heard.notify_all()
+
+    def wait(self, condition: Any) -> messages.LinkReport | None:
+        with self._heard:
+            self._heard.wait_for(lambda: any(map(condition, self.reports)), LIMIT_S)
+            return next(filter(condition, self.reports), None)
+
+    def close(self) -> None:
+        self.telemetry.close()
+        self.session.close()
+
+
+def gate(sent: int, ssrc: int) -> messages.Gate:
+    return messages.Gate(
+        time_ns=sent, capture_ns=sent, sequence=sent, passed=True, heartbeat=False,
+        entropy_bits=7.0, sharpness=1.0, captured=sent, gated=0, heartbeats=0, sent=sent, ssrc=ssrc,
+    )  # fmt: skip
+
+
+def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener) -> None:
+    ears = {name: Ear(listener, name) for name in ("one", "two", "elsewhere")}
+    videos = {
+        "one": Video(5601, 11, Counters(packets=97, packets_lost=3)),
+        "two": Video(5602, 99, Counters(packets=50)),  # a stream that is not the one of `two`
+    }
+    for name, ssrc in (("one", 11), ("two", 22), ("elsewhere", 33)):
+        ears[name].telemetry.gate(gate(10, ssrc))
+        assert listener.wait(name, lambda s: s.alive and s.ssrc is not None, LIMIT_S)
+    with Feedback(listener, videos.get, period_s=0.05):
+        one = ears["one"].wait(lambda r: r.round_trip_s is not None)
+        two = ears["two"].wait(lambda r: True)
+        assert one is not None and two is not None
+        assert (one.ground, one.video_port, one.ssrc) == (listener.name, 5601, 11)
+        assert (one.packets, one.packets_lost) == (97, 3)
+        assert ears["one"].reports[0].lost in (0.0, pytest.approx(0.03))
+        assert one.round_trip_s is not None and 0 <= one.round_trip_s < LIMIT_S
+        assert abs(one.time_ns - time.time_ns()) < 60 * 10**9
+        assert (two.video_port, two.ssrc, two.packets, two.lost) == (5602, None, 0, 0.0)
+        ears["two"].telemetry.gate(gate(11, 99))
+        assert ears["two"].wait(lambda r: r.ssrc == 99 and r.packets == 50)
+    assert ears["elsewhere"].reports == []
+    for ear in ears.values():
+        ear.close()
+
+
+def test_a_payload_that_has_ended_hears_no_more(listener: TelemetryListener) -> None:
+    ear = Ear(listener, "one")
+    with Feedback(listener, lambda _: Video(), period_s=0.05):
+        assert ear.wait(lambda r: r.ssrc is None)
+        ear.telemetry.close()
+        assert listener.wait("one", lambda s: not s.alive, LIMIT_S)
+        time.sleep(0.2)  # one that is on its way may still come
+        told = len(ear.reports)
+        time.sleep(0.3)
+        assert len(ear.reports) == told
+    ear.close()
+
+
+def test_the_newest_round_trip_is_told_and_not_the_shortest(
+    listener: TelemetryListener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link that gets slow is told slow although the clock's offset stays the tight one."""
+    from ground_station.stream import clock
+    from pi_firmware.wire.clock_offset import RoundTrip
+
+    delays_ns = [2_000_000, 700_000_000, 300_000_000]
+    now_ns = [10**18]
+    told: list[float | None] = []
+    asked_enough = threading.Event()
+
+    def ask(session: Any, key: str, now: Any) -> RoundTrip | None:
+        if told or follower_made.wait(LIMIT_S):
+            told.append(follower.round_trip_s("one"))
+        if len(told) > len(delays_ns) + 1:
+            asked_enough.set()
+        if len(told) > len(delays_ns):
+            return None  # and at once: nobody serves it
+        sent_ns, delay_ns = now_ns[0], delays_ns[len(told) - 1]
+        now_ns[0] += delay_ns
+        return RoundTrip(sent_ns, sent_ns + delay_ns // 2, sent_ns + delay_ns // 2, now_ns[0])
+
+    monkeypatch.setattr(clock, "ask", ask)
+    monkeypatch.setattr(clock, "_PERIOD_S", 0.01)
+    follower_made = threading.Event()
+    follower = clock.ClockFollower(listener.session.zenoh, lambda: ["one"], lambda: now_ns[0])
+    follower_made.set()
+    assert asked_enough.wait(LIMIT_S)
+    follower.close()
+    assert told[:5] == [None, 0.002, 0.7, 0.3, None]
+    offset = follower.offset("one")
+    assert offset is not None and offset.uncertainty_ns < 10_000_000
+
+
+def test_a_question_without_an_answer_took_at_least_so_long(
+    listener: TelemetryListener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ground_station.stream import clock
+
+    def ask(session: Any, key: str, now: Any) -> None:
+        time.sleep(clock.ASK_TIMEOUT_S)
+
+    monkeypatch.setattr(clock, "ASK_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(clock, "ask", ask)
+    follower = clock.ClockFollower(listener.session.zenoh, lambda: ["one"], time.time_ns)
+    deadline = time.monotonic() + LIMIT_S
+    while follower.round_trip_s("one") is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    follower.close()
+    told = follower.round_trip_s("one")
+    assert told is not None and told >= 0.05
