@@ -1,5 +1,6 @@
-"""A small map of random landmarks, for programs that must refuse it."""
+"""What faults befall: a numbered flight, and a small map for programs that must refuse it."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,17 @@ import pytest
 from ground_station.features import extractors
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping import store
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "stream"))  # for numbered_flight
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A numbered flight to fly in a loop."""
+    from flight import ROUND
+    from numbered_flight import write_flight
+
+    return write_flight(tmp_path_factory.mktemp("flight") / "flight.mcap", ROUND)
 
 
 @pytest.fixture

@@ -1,9 +1,12 @@
 """Recorded flights for the tests of the stream."""
 
+import sys
 from pathlib import Path
 
 import pytest
 from numbered_flight import write_flight
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))  # for impaired_link
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from pathlib import Path
 import av
 import pytest
 from av.video.frame import PictureType
-from lossy_link import LossyLink
+from impaired_link import ImpairedLink, Impairment
 from numbered_flight import (
     START_NS,
     capture_ns,
@@ -141,7 +141,7 @@ def test_a_slower_camera_takes_its_frames_at_their_own_times(flight: Path) -> No
 def test_at_five_percent_loss_every_frame_is_right_and_accounted_for(flight: Path) -> None:
     with (
         Receiver(0, queue_frames=100) as receiver,
-        LossyLink(receiver.port, loss=0.05, seed=2) as link,
+        ImpairedLink(receiver.port, Impairment(loss=0.05), seed=2) as link,
     ):
         flown = fly(
             receiver,
@@ -152,10 +152,10 @@ def test_at_five_percent_loss_every_frame_is_right_and_accounted_for(flight: Pat
         )
         counters = receiver.counters
     assert flown.status == 0, flown.err
-    assert link.lost > 0
+    assert link.counts.lost > 0
     assert_true(flown.frames)
     assert all(number_in(frame.image) == frame.sequence for frame in flown.frames)
-    assert counters.packets == link.passed
+    assert counters.packets == link.counts.passed
     assert counters.access_units == counters.decoded + counters.withheld + counters.failed
     assert counters.decoded == len(flown.frames) < 60
     counts = flown.state.frames

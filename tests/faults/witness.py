@@ -1,0 +1,98 @@
+"""Follows a stream where it enters a link: what left the payload, and what can be seen of it.
+
+It reads the packets themselves and believes no counter of either side, so that both can be held
+against it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ground_station.stream import rtp
+from ground_station.stream.counters import Counters
+from pi_firmware.wire import annexb, sei
+
+
+@dataclass(frozen=True)
+class Left:
+    """One frame that left the payload; `damaged` when the link lost any part of it.
+
+    An access unit delimiter before parameter sets is no part: these only ever come first, too.
+    """
+
+    sequence: int
+    idr: bool
+    damaged: bool
+
+
+class _Stream:
+    def __init__(self) -> None:
+        self.depacketizer = rtp.Depacketizer(Counters())
+        self.next_sequence: int | None = None
+        self.damaged = self.undelimited = False
+        self.frames: list[Left] = []
+
+
+class Witness:
+    """The tap of an `ImpairedLink`; streams are told apart by SSRC."""
+
+    def __init__(self) -> None:
+        self.gaps = 0
+        """Packets that were missing before the link: the sender's or this machine's doing."""
+        self.strangers = 0
+        """Datagrams that are no video of ours, or frames without their numbers."""
+        self._streams: dict[int, _Stream] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, datagram: bytes, lost: bool) -> None:
+        packet = rtp.parse(datagram, 0)
+        with self._lock:
+            if packet is None:
+                self.strangers += 1
+            else:
+                self._follow(packet, lost)
+
+    def ssrcs(self) -> list[int]:
+        """The streams seen, in order of their first packets."""
+        with self._lock:
+            return list(self._streams)
+
+    def left(self, ssrc: int | None = None) -> list[Left]:
+        """The frames of a stream (of all without an SSRC) that have left the payload whole."""
+        with self._lock:
+            streams = self._streams.values() if ssrc is None else [self._streams[ssrc]]
+            return [frame for stream in streams for frame in stream.frames]
+
+    def visible(self, ssrc: int | None = None) -> list[int]:
+        """Sequence numbers of the frames that a receiver can show: undamaged, as are all since the
+        last IDR, an undamaged one itself."""
+        return list(_visible(self.left(ssrc)))
+
+    def _follow(self, packet: rtp.Packet, lost: bool) -> None:
+        stream = self._streams.setdefault(packet.ssrc, _Stream())
+        if stream.next_sequence is not None:
+            self.gaps += (packet.sequence - stream.next_sequence) & 0xFFFF
+        stream.next_sequence = (packet.sequence + 1) & 0xFFFF
+        if packet.payload[0] & 0x1F == annexb.NAL_AUD:
+            stream.undelimited = lost
+        else:
+            stream.damaged |= lost
+        for unit in stream.depacketizer.push(packet, False):
+            info = sei.find(unit.data)
+            if info is None:
+                self.strangers += 1
+            else:
+                idr = annexb.is_idr(unit.data)
+                damaged = stream.damaged or (stream.undelimited and not idr)
+                stream.frames.append(Left(info.sequence, idr, damaged))
+            stream.damaged = stream.undelimited = False
+
+
+def _visible(frames: list[Left]) -> Iterator[int]:
+    trusted = False
+    for frame in frames:
+        trusted = not frame.damaged and (frame.idr or trusted)
+        if trusted:
+            yield frame.sequence
