@@ -91,7 +91,8 @@ class RecordingWriter:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from None
         # H.264 does not compress further; JSON and poses are small beside it.
         self._writer = Writer(self._file, chunk_size=chunk_bytes, compression=CompressionType.NONE)
-        self._writer.start(profile=profile, library="blimp")
+        with self._disk():
+            self._writer.start(profile=profile, library="blimp")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -109,6 +110,14 @@ class RecordingWriter:
             self._closed = True
             with self._disk(), self._file:
                 self._writer.finish()
+
+    def flush(self) -> None:
+        """Ends the chunk in progress and hands it to the file: a cut from here on costs none of it.
+
+        It does not wait for the disk.
+        """
+        with self._disk():
+            self._writer.flush()
 
     def write_video(
         self, time_ns: int, data: bytes, *, topic: str = VIDEO_TOPIC, frame_id: str = "camera"
@@ -180,11 +189,26 @@ class RecordingWriter:
             raise RecordingError(
                 f"{self.path}: a message on {topic} is not JSON: {error}"
             ) from None
+        self.write_json_text(topic, time_ns, payload, schema_name=schema_name, schema=schema)
+
+    def write_json_text(
+        self,
+        topic: str,
+        time_ns: int,
+        text: bytes,
+        *,
+        schema_name: str,
+        schema: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Adds a JSON object that is text already, as telemetry's messages are; it is not parsed.
+
+        `schema` is its JSON schema (any object when not given).
+        """
         if topic not in self._channels:
-            text = json.dumps(schema or {"type": "object"}).encode()
-            schema_id = self._schema(schema_name, "jsonschema", text)
+            description = json.dumps(schema or {"type": "object"}).encode()
+            schema_id = self._schema(schema_name, "jsonschema", description)
             self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
-        self._add(topic, time_ns, payload)
+        self._add(topic, time_ns, text)
 
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Adds a named table of strings about the recording: seed, scene, program version."""

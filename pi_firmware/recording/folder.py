@@ -1,0 +1,105 @@
+"""The folder of all recordings: numbered names, what fits, and what has to go for it."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from pi_firmware.settings import RecordingSettings
+from pi_firmware.wire.errors import RecordingError
+
+MB = 1_000_000
+_NAME = re.compile(r"flight-([0-9]{6,9})\.mcap")
+_HIGHEST = 999_999_999
+
+
+class Folder:
+    """Our files `flight-000001.mcap` and on, and nothing else that lies there.
+
+    Numbers rise from the highest present, whatever the clock believes. Ours is a regular file of
+    such a name; a folder or a link of that name takes a number and is neither counted nor deleted.
+    Methods raise `RecordingError` with one line.
+    """
+
+    def __init__(self, settings: RecordingSettings) -> None:
+        self.path = Path(settings.folder)
+        self._total_bytes = settings.max_total_MB * MB
+        self._min_free_bytes = settings.min_free_MB * MB
+        # Half of the total at most: beside the file being written there is always one to delete.
+        self.file_limit_bytes = min(settings.max_file_MB * MB, self._total_bytes // 2)
+        self._earlier: list[tuple[int, Path, int]] = []
+        self._earlier_bytes = 0
+
+    def next_path(self) -> Path:
+        """Looks through the folder, made if missing; the path of the file to write next."""
+        try:
+            self.path.mkdir(exist_ok=True)
+            highest = self._scan()
+        except OSError as error:
+            raise self._fail(error) from None
+        if highest >= _HIGHEST:
+            raise RecordingError(f"recording.folder '{self.path}': no number above {highest}")
+        return self.path / f"flight-{highest + 1:06d}.mcap"
+
+    def make_room(self, file_bytes: int, more_bytes: int) -> None:
+        """For a file being written that will have `file_bytes` after `more_bytes` more.
+
+        Deletes the oldest files beyond `max_total_MB`. Raises when they cannot be deleted, and when
+        less than `min_free_MB` would be left.
+        """
+        while self._earlier and self._earlier_bytes + file_bytes > self._total_bytes:
+            _, path, size = self._earlier[0]
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise RecordingError(
+                    f"{path}: the oldest recording cannot be deleted: {error.strerror or error}"
+                ) from None
+            del self._earlier[0]
+            self._earlier_bytes -= size
+        try:
+            disk = os.statvfs(self.path)
+        except OSError as error:
+            raise self._fail(error) from None
+        free_bytes = disk.f_bavail * disk.f_frsize
+        if free_bytes - more_bytes < self._min_free_bytes:
+            raise RecordingError(
+                f"recording.folder '{self.path}': {free_bytes // MB} MB are free, "
+                f"recording.min_free_MB is {self._min_free_bytes // MB}"
+            )
+
+    def sync(self) -> None:
+        """Makes names durable: of files that were begun, ended or deleted."""
+        try:
+            handle = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            raise self._fail(error) from None
+
+    def _scan(self) -> int:
+        """Notes our files, oldest first; the highest number taken."""
+        highest = 0
+        self._earlier = []
+        with os.scandir(self.path) as entries:
+            for entry in entries:
+                match = _NAME.fullmatch(entry.name)
+                if match is None:
+                    continue
+                number = int(match[1])
+                highest = max(highest, number)
+                try:
+                    if entry.is_file(follow_symlinks=False):
+                        size = entry.stat(follow_symlinks=False).st_size
+                        self._earlier.append((number, Path(entry.path), size))
+                except FileNotFoundError:  # deleted while we look
+                    continue
+        self._earlier.sort()
+        self._earlier_bytes = sum(size for _, _, size in self._earlier)
+        return highest
+
+    def _fail(self, error: OSError) -> RecordingError:
+        return RecordingError(f"recording.folder '{self.path}': {error.strerror or error}")

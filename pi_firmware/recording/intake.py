@@ -1,0 +1,109 @@
+"""What waits for the disk: handed over without waiting, bounded in bytes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+from pi_firmware.wire import annexb, messages, sei
+
+_ITEM_BYTES = 512
+"""What an item takes beside a unit's bytes, about; a message as a whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """An access unit, and when it came, by the monotonic clock."""
+
+    info: sei.FrameInfo
+    data: bytes
+    arrived_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """A message of one kind, and when it came, by the monotonic clock."""
+
+    kind: str
+    message: messages.Message
+    arrived_s: float
+
+
+class Intake:
+    """A queue from many threads to one.
+
+    When a unit does not fit, it and all that follow are left out up to an IDR that finds the queue
+    half empty: what is recorded of a group of pictures is always its beginning, so it decodes.
+    """
+
+    def __init__(self, limit_bytes: int, wake_bytes: int) -> None:
+        self.left_out = 0
+        """Units that were not taken."""
+        self._limit_bytes, self._wake_bytes = limit_bytes, wake_bytes
+        self._items: deque[Unit | Telemetry] = deque()
+        self._bytes = 0
+        self._skipping = False
+        self._closed = False
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+
+    def unit(self, info: sei.FrameInfo, access_unit: bytes) -> None:
+        """Queues an access unit, or counts it as left out."""
+        size = len(access_unit) + _ITEM_BYTES
+        with self._lock:
+            if self._closed:
+                return
+            fits = self._bytes + size <= self._limit_bytes
+            if self._skipping:
+                # Only now does anyone look into the unit: the encoder's thread has little time.
+                calm = self._bytes <= self._limit_bytes // 2
+                self._skipping = not (fits and calm and annexb.is_idr(access_unit))
+            else:
+                self._skipping = not fits
+            if self._skipping:
+                self.left_out += 1
+            else:
+                self._add(Unit(info, access_unit, time.monotonic()), size)
+
+    def message(self, kind: str, message: messages.Message) -> None:
+        """Queues a message; a full queue does not take it."""
+        with self._lock:
+            if not self._closed and self._bytes + _ITEM_BYTES <= self._limit_bytes:
+                self._add(Telemetry(kind, message, time.monotonic()), _ITEM_BYTES)
+
+    def wait(self, until_s: float) -> bool:
+        """Until this monotonic time, or until much waits; whether the end has come."""
+        self._wake.wait(max(0.0, until_s - time.monotonic()))
+        if not self._closed:
+            self._wake.clear()
+        return self._closed
+
+    def take(self) -> Unit | Telemetry | None:
+        """The oldest item, None when there is none."""
+        with self._lock:
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._bytes -= _ITEM_BYTES + (len(item.data) if isinstance(item, Unit) else 0)
+            return item
+
+    def close(self) -> None:
+        """From now on nothing is taken; what waits can still be."""
+        with self._lock:
+            self._closed = True
+        self._wake.set()
+
+    def clear(self) -> None:
+        """Leaves out what still waits."""
+        with self._lock:
+            self.left_out += sum(isinstance(item, Unit) for item in self._items)
+            self._items.clear()
+            self._bytes = 0
+
+    def _add(self, item: Unit | Telemetry, size: int) -> None:
+        self._items.append(item)
+        self._bytes += size
+        if self._bytes >= self._wake_bytes:
+            self._wake.set()
