@@ -87,7 +87,8 @@ class TelemetryListener:
 
     An endpoint `tcp/127.0.0.1:0` takes a free port, which `endpoints` then tells. Raises
     `TelemetryError` with one line when an endpoint is in use. `certificates` is the folder that
-    `blimp keys ground` wrote, without which only loopback is spoken to. `on_event` is called with
+    `blimp keys ground` wrote, without which only loopback is spoken to; payloads that look for a
+    ground station on the interface `discoverable` find this one. `on_event` is called with
     the payload's id for each event, on a thread of the session. `session` is there for what else
     the ground station says to its payloads; `name` is the ground station's own.
     """
@@ -98,13 +99,16 @@ class TelemetryListener:
         *,
         connect: Sequence[str] = (),
         certificates: str | Path = "",
+        discoverable: str = "",
         on_event: Callable[[str, messages.Event], None] | None = None,
     ) -> None:
         self._states: dict[str, PayloadState] = {}
         self._changed = threading.Condition()
         self._on_event = on_event
         self.name = credentials.load(certificates).member if str(certificates) else LOCAL_NAME
-        self.session = open_session(listen=listen, connect=connect, certificates=certificates)
+        self.session = open_session(
+            listen=listen, connect=connect, certificates=certificates, discoverable=discoverable
+        )
         self.endpoints = self.session.listening
         session = self.session.zenoh
         # One subscriber for all kinds keeps the order in which a payload said things.

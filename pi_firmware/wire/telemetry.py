@@ -1,14 +1,23 @@
-"""Zenoh sessions as both sides open them: explicit endpoints, no scouting, no shared memory."""
+"""Zenoh sessions as both sides open them: explicit endpoints, scouting only where it is asked for.
+
+Scouting is Zenoh's: a payload asks a multicast group (224.0.0.224, UDP port 7446) on one interface
+who is there, a ground station answers with the endpoints it listens on. That says nothing secret
+and proves nothing: whom a payload then speaks to is for the certificates to decide.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import ipaddress
 import json
 import re
 import socket
-from collections.abc import Sequence
+import struct
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pi_firmware.wire import credentials
@@ -18,14 +27,23 @@ PORT = 7447
 LOCAL_ENDPOINT = f"tcp/127.0.0.1:{PORT}"
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^\[\]:/#?]+):(\d{1,5})")
 _ATTEMPTS = 5
+_SIOCGIFADDR = 0x8915  # Linux, not in Python's modules
+LOOPBACK_INTERFACE = "lo"
+INTERFACE_WAIT_S = 10.0
+"""A radio that was just switched on gets its address within this."""
+_INTERFACE_POLL_S = 0.2
 
 
 @dataclass(frozen=True)
 class Session:
-    """An open Zenoh session and the endpoints it listens on, ephemeral ports filled in."""
+    """An open Zenoh session and the endpoints it listens on, ephemeral ports filled in.
+
+    `scouting` is whether it looks for others or can be found; see `open_session`.
+    """
 
     zenoh: Any
     listening: tuple[str, ...]
+    scouting: bool = False
 
     def close(self) -> None:
         """Sends what is queued and closes; a second call does nothing."""
@@ -65,12 +83,23 @@ def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]
 
 
 def open_session(
-    *, listen: Sequence[str] = (), connect: Sequence[str] = (), certificates: str | Path = ""
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    certificates: str | Path = "",
+    scout: str = "",
+    discoverable: str = "",
 ) -> Session:
     """Opens a session that listens and connects at these endpoints, and nowhere else.
 
     With a folder of `certificates` all is mutual TLS and whatever its access rules do not name is
     refused; without, only loopback is spoken to.
+
+    `scout` names an interface to look on for others, again and again at most 8 s apart, and to
+    connect to whoever answers; `discoverable` one to answer on, with the endpoints of `listen`.
+    Without certificates it can only be `lo`. An interface that has no address yet is waited for;
+    if it gets none the session is opened all the same and `scouting` is false: it will not look
+    until it is opened anew.
 
     A listening port 0 stands for any free one. A peer that is not there yet is tried again in the
     background. Raises `TelemetryError` with one line, for one when an endpoint is in use.
@@ -80,10 +109,12 @@ def open_session(
     held = credentials.load(certificates) if str(certificates) else None
     for endpoint in connect:
         check_endpoint(endpoint, certified=held is not None)
+    found = _scouting(scout, discoverable, listen, certified=held is not None)
     for attempt in range(_ATTEMPTS):
         endpoints = [_with_port(endpoint, held is not None) for endpoint in listen]
         try:
-            return Session(zenoh.open(session_config(endpoints, connect, held)), tuple(endpoints))
+            config = session_config(endpoints, connect, held, found)
+            return Session(zenoh.open(config), tuple(endpoints), bool(found))
         except zenoh.ZError as error:
             in_use = "in use" in str(error)
             # Another program may take the free port between choosing and opening it.
@@ -93,6 +124,57 @@ def open_session(
             where = ", ".join([*endpoints, *connect]) or "no endpoint"
             raise TelemetryError(f"telemetry at {where}: {reason}") from None
     raise AssertionError("unreachable")
+
+
+def interface_address(interface: str) -> str | None:
+    """The interface's IPv4 address; None while it has none, or is not there."""
+    name = interface.encode(errors="replace")
+    if not 0 < len(name) < 16:  # Linux has no longer names
+        return None
+    request = struct.pack("256s", name)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        try:
+            reply = fcntl.ioctl(any_socket.fileno(), _SIOCGIFADDR, request)
+        except OSError:
+            return None
+    return socket.inet_ntoa(reply[20:24])
+
+
+def _scouting(
+    scout: str, discoverable: str, listen: Sequence[str], *, certified: bool
+) -> dict[str, Any]:
+    """Zenoh's settings of `scouting/multicast`; none when nobody is to look or be found."""
+    interface = scout or discoverable
+    if not interface:
+        return {}
+    if scout and discoverable and scout != discoverable:
+        raise TelemetryError(f"discovery on {scout!r} and {discoverable!r}: only one is possible")
+    if not certified and interface != LOOPBACK_INTERFACE:
+        raise TelemetryError(
+            f"discovery on {interface!r}: without certificates only"
+            f" {LOOPBACK_INTERFACE!r} is allowed"
+        )
+    if discoverable and not listen:
+        raise TelemetryError(f"discovery on {interface!r}: an endpoint to listen on is needed")
+    until_s = time.monotonic() + INTERFACE_WAIT_S
+    while interface_address(interface) is None:
+        if time.monotonic() > until_s:
+            known = [name for _, name in socket.if_nameindex()]
+            if interface not in known:
+                raise TelemetryError(
+                    f"discovery on {interface!r}: no such interface"
+                    f" (there are: {', '.join(known) or 'none'})"
+                )
+            return {}
+        time.sleep(_INTERFACE_POLL_S)
+    settings = {
+        "enabled": True,
+        "interface": interface,
+        "ttl": 1,  # this network and no further
+        "listen": bool(discoverable),
+        "autoconnect": {"peer": ["peer"] if scout else []},
+    }
+    return {f"scouting/multicast/{name}": value for name, value in settings.items()}
 
 
 def _with_port(endpoint: str, certified: bool) -> str:
@@ -110,8 +192,12 @@ def session_config(
     listen: Sequence[str],
     connect: Sequence[str],
     held: credentials.Credentials | None = None,
+    scouting: Mapping[str, Any] = MappingProxyType({}),
 ) -> Any:
-    """The `zenoh.Config` of a session that listens and connects at these endpoints only."""
+    """The `zenoh.Config` of a session that listens and connects at these endpoints only.
+
+    Unless `scouting` has Zenoh's settings for it, it neither looks for others nor can be found.
+    """
     import zenoh
 
     config = zenoh.Config()
@@ -125,6 +211,7 @@ def session_config(
         # On one host large payloads would silently go through /dev/shm, which may be small.
         "transport/shared_memory/enabled": False,
     }
+    settings |= scouting
     if held is not None:
         settings |= credentials.tls_settings(held)
     for name, value in settings.items():

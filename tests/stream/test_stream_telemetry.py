@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ from pi_firmware.wire.telemetry import open_session, session_config
 LIMIT_S = 20.0
 
 
-def gate(sequence: int, **fields: int) -> messages.Gate:
+def gate(sequence: int, **fields: Any) -> messages.Gate:
     values = {"captured": sequence + 1, "gated": 0, "heartbeats": 0, "sent": sequence, "ssrc": 9}
     return messages.Gate(
         time_ns=sequence, capture_ns=sequence, sequence=sequence, passed=True, heartbeat=False,
