@@ -9,10 +9,11 @@ from dataclasses import dataclass
 class Counters:
     """What came in and what became of it.
 
-    Datagrams are `packets` of the stream, of `other_streams`, or `garbage`. Every access unit of
-    which anything arrived is one of `decoded`, `withheld` (damaged, or after a loss and before the
-    next IDR), `failed` (the decoder refused it) or `unstamped` (without capture time). Of the
-    decoded ones `dropped` left the full queue before anyone took them.
+    Datagrams are `packets` of the stream, of `other_streams`, or `garbage`; where keys are asked
+    for, also `refused` (not authentic) or `replayed` (authentic, but not for the first time).
+    Every access unit of which anything arrived is one of `decoded`, `withheld` (damaged, or after
+    a loss and before the next IDR), `failed` (the decoder refused it) or `unstamped` (without
+    capture time). Of the decoded ones `dropped` left the full queue before anyone took them.
     """
 
     packets: int = 0
@@ -20,6 +21,8 @@ class Counters:
     packets_late: int = 0
     garbage: int = 0
     other_streams: int = 0
+    refused: int = 0
+    replayed: int = 0
     malformed: int = 0
     access_units: int = 0
     decoded: int = 0

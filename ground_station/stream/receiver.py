@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
+from ground_station.stream.srtp import Unprotector
 from pi_firmware.wire import sei
 from pi_firmware.wire.annexb import NO_PARAMETER_SETS
 from pi_firmware.wire.errors import StreamError
@@ -58,8 +60,9 @@ class ReceivedFrame:
 class _Stream:
     """What belongs to one SSRC from its first packet to its last."""
 
-    def __init__(self, ssrc: int, counters: Counters, color: bool) -> None:
+    def __init__(self, ssrc: int, payload_id: str | None, counters: Counters, color: bool) -> None:
         self.ssrc = ssrc
+        self.payload_id = payload_id
         self.reorderer = rtp.Reorderer(counters)
         self.depacketizer = rtp.Depacketizer(counters)
         self.decoder = Decoder(counters, color=color)
@@ -73,6 +76,10 @@ class Receiver:
     It takes the stream with `ssrc`, or locks onto the first one that sends two packets in a row; a
     stream that has been silent for 2 s gives way to the next. Raises `StreamError` with one line
     when the port is in use. `port` 0 takes a free one, which `.port` then tells.
+
+    With `srtp_keys`, master keys with salt (30 bytes) by payload id, it takes SRTP of these
+    payloads and nothing else. Give `ssrc`, too, as telemetry announces it: the video of an earlier
+    flight, played back, is authentic as well.
     """
 
     def __init__(
@@ -84,6 +91,7 @@ class Receiver:
         ssrc: int | None = None,
         color: bool = False,
         parameter_sets_timeout_s: float = 3.0,
+        srtp_keys: Mapping[str, bytes] | None = None,
     ) -> None:
         self._wanted_ssrc = ssrc
         self._color = color
@@ -92,6 +100,9 @@ class Receiver:
         self._queue_frames = queue_frames
         self._ready = threading.Condition()
         self._counters = Counters()
+        self._unprotector: Unprotector | None = None
+        if srtp_keys is not None:
+            self._unprotector = Unprotector(srtp_keys, self._counters, ssrc=ssrc)
         self._stream: _Stream | None = None
         self._candidates: dict[int, rtp.Packet] = {}
         self._problem: str | None = None
@@ -143,6 +154,12 @@ class Receiver:
         return stream.ssrc if stream else None
 
     @property
+    def payload_id(self) -> str | None:
+        """Whose stream it is, by its key; None before there is one, or without keys."""
+        stream = self._stream
+        return stream.payload_id if stream else None
+
+    @property
     def problem(self) -> str | None:
         """Why the stream cannot be shown, in words; None while it can."""
         return self._problem
@@ -169,13 +186,23 @@ class Receiver:
                 continue  # an ICMP error of someone else's datagram
             now_ns = time.monotonic_ns()
             if datagram is not None:
-                packet = rtp.parse(datagram, now_ns)
-                if packet is None:
-                    self._counters.garbage += 1
-                else:
+                packet = self._parse(datagram, now_ns)
+                if packet is not None:
                     for own in self._select(packet):
                         self._take(own)
             self._expire(now_ns)
+
+    def _parse(self, datagram: bytes, arrival_ns: int) -> rtp.Packet | None:
+        """The packet in a datagram, authentic where that is asked for; if none, it is counted."""
+        if self._unprotector is not None:
+            plain = self._unprotector.unprotect(datagram)
+            if plain is None:
+                return None
+            datagram = plain
+        packet = rtp.parse(datagram, arrival_ns)
+        if packet is None:
+            self._counters.garbage += 1
+        return packet
 
     def _select(self, packet: rtp.Packet) -> list[rtp.Packet]:
         """The packets to take now that this one is here; locks onto a stream when there is none."""
@@ -187,7 +214,7 @@ class Receiver:
             if packet.ssrc != self._wanted_ssrc:
                 self._counters.other_streams += 1
                 return []
-            self._stream = _Stream(packet.ssrc, self._counters, self._color)
+            self._stream = self._begin(packet.ssrc)
             return [packet]
         if not silent:
             self._counters.other_streams += 1
@@ -197,13 +224,17 @@ class Receiver:
         if before is not None and packet.sequence == (before.sequence + 1) & 0xFFFF:
             self._counters.other_streams += len(self._candidates)
             self._candidates.clear()
-            self._stream = _Stream(packet.ssrc, self._counters, self._color)
+            self._stream = self._begin(packet.ssrc)
             return [before, packet]
         self._candidates[packet.ssrc] = packet
         if len(self._candidates) > _CANDIDATES:
             del self._candidates[next(iter(self._candidates))]
             self._counters.other_streams += 1
         return []
+
+    def _begin(self, ssrc: int) -> _Stream:
+        owner = self._unprotector.payload_id(ssrc) if self._unprotector else None
+        return _Stream(ssrc, owner, self._counters, self._color)
 
     def _take(self, packet: rtp.Packet) -> None:
         stream = self._stream

@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 from numbered_flight import capture_ns, encoded, number_in, packets, stamped
+from srtp_sender import SrtpSender
 
 from ground_station.stream import receiver as receiver_module
 from ground_station.stream.receiver import ReceivedFrame, Receiver
@@ -42,7 +43,7 @@ def send(datagrams: Iterable[bytes], receiver: Receiver) -> None:
 
     def taken() -> int:
         c = receiver.counters
-        return c.packets + c.garbage + c.other_streams
+        return c.packets + c.garbage + c.other_streams + c.refused + c.replayed
 
     before = taken()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -206,6 +207,49 @@ def test_after_a_silence_the_next_stream_is_taken(monkeypatch: pytest.MonkeyPatc
         frames = all_frames(receiver)
         assert len(frames) == FRAMES and {frame.ssrc for frame in frames} == {2}
         assert receiver.ssrc == 2
+
+
+def test_with_keys_a_known_payloads_stream_is_taken_and_no_other() -> None:
+    rng = random.Random(6)
+    keys = {"blimp-1": rng.randbytes(30), "blimp-2": rng.randbytes(30)}
+    plain = packets(flight_units(), ssrc=1)
+    with SrtpSender(keys["blimp-2"]) as own, SrtpSender(rng.randbytes(30)) as stranger:
+        protected, strange = own.protect(plain), stranger.protect(plain)
+    with Receiver(0, queue_frames=2 * FRAMES, srtp_keys=keys) as receiver:
+        send([plain[0], strange[0], plain[1], strange[1]], receiver)
+        assert until(lambda: receiver.counters.refused == 4)
+        assert receiver.ssrc is None and receiver.payload_id is None
+        mixed = zip(protected, protected, plain, strange, strict=True)
+        send([datagram for four in mixed for datagram in four], receiver)
+        frames = all_frames(receiver)
+        assert [frame.sequence for frame in frames] == list(range(FRAMES))
+        assert [number_in(frame.image) for frame in frames] == list(range(FRAMES))
+        assert receiver.ssrc == 1 and receiver.payload_id == "blimp-2"
+        counters = receiver.counters
+        assert counters.packets == counters.replayed == len(protected)
+        assert counters.refused == 4 + 2 * len(plain)
+        assert counters.packets_lost == counters.garbage == counters.other_streams == 0
+
+
+def test_with_keys_the_stream_asked_for_is_taken_and_others_counted() -> None:
+    keys = {"blimp-1": bytes(30)}
+    with SrtpSender(keys["blimp-1"]) as sender:
+        own = sender.protect(packets(flight_units(), ssrc=5))
+        other = sender.protect(packets(flight_units(), ssrc=6))
+    with Receiver(0, queue_frames=FRAMES, ssrc=5, srtp_keys=keys) as receiver:
+        send([*other[:40], *own], receiver)
+        frames = all_frames(receiver)
+        assert len(frames) == FRAMES and {frame.ssrc for frame in frames} == {5}
+        assert receiver.counters.other_streams == 40
+
+
+def test_without_keys_an_encrypted_stream_gives_no_frame() -> None:
+    with SrtpSender(bytes(30)) as sender:
+        protected = sender.protect(packets(flight_units()))
+    with Receiver(0, queue_frames=FRAMES) as receiver:
+        send(protected, receiver)
+        assert receiver.get(0.2) is None and receiver.payload_id is None
+        assert receiver.counters.decoded == receiver.counters.refused == 0
 
 
 def test_a_real_cameras_stream_gives_a_picture_for_each_access_unit() -> None:

@@ -1,0 +1,286 @@
+"""The receiving side of SRTP (RFC 3711): only what a known payload sent, decrypted.
+
+The profile is AES_CM_128_HMAC_SHA1_80 with key derivation rate 0 and without MKI. A packet's index
+has 48 bits, of which it carries the lower 16. The rest, the rollover counter (ROC), is known only
+to who has heard the stream from its start; a receiver that joins later finds it by trying which one
+the authentication tag was made with.
+"""
+
+from __future__ import annotations
+
+import hmac
+import struct
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+
+from ground_station.stream.counters import Counters
+from pi_firmware.wire import keys as names
+from pi_firmware.wire import video
+from pi_firmware.wire.errors import StreamError, TelemetryError
+from pi_firmware.wire.srtp import KEY_BYTES, MASTER_BYTES, SALT_BYTES, TAG_BYTES, read_key
+
+FOLDER = "srtp"
+"""Where the payloads' keys are in a ground station's certificate folder."""
+REPLAY_WINDOW = 4096
+"""Packets of which it is known whether they came: more than the reorderer ever waits for."""
+STREAMS = 64
+"""Streams kept; each of them has authenticated itself, so that no flood fills them."""
+SEARCH_RATE_HZ = 30_000
+"""Tags computed a second, at most, to find ROCs: about a twentieth of a core."""
+
+_CIPHER_KEY, _AUTHENTICATION_KEY, _CIPHER_SALT = 0, 1, 2  # labels (RFC 3711, 4.3.2)
+_AUTHENTICATION_KEY_BYTES = 20
+_HEADER_BYTES = 12
+_WINDOW_MASK = (1 << REPLAY_WINDOW) - 1
+_ROCS = 1024  # tried at once; 1024 rollovers are three days of 240 packets a second
+_ROC_LIMIT = 1 << 16
+
+
+def load_keys(folder: str | Path) -> dict[str, bytes]:
+    """The payloads' master keys with salt, by payload id, of a ground station's folder.
+
+    It reads `FOLDER/srtp/ID.key` as `blimp keys` wrote them; raises `StreamError` with one line.
+    """
+    folder = Path(folder) / FOLDER
+    try:
+        paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
+    except OSError as error:
+        raise StreamError(f"{folder}: {error.strerror or error}") from None
+    loaded = {}
+    for path in paths:
+        try:
+            names.check_payload_id(path.stem)
+        except TelemetryError:
+            raise StreamError(f"{path}: not the name of a payload") from None
+        loaded[path.stem] = read_key(path)
+    return loaded
+
+
+def aes_cm(key: bytes, counter: int, data: bytes) -> bytes:
+    """AES in counter mode (RFC 3711, 4.1.1) from a 128-bit counter on: data to or from cipher."""
+    return _aes_cm(algorithms.AES(key), counter, data)
+
+
+def _aes_cm(key: algorithms.AES, counter: int, data: bytes) -> bytes:
+    return Cipher(key, modes.CTR(counter.to_bytes(16, "big"))).encryptor().update(data)
+
+
+def derive(master: bytes, label: int, size: int) -> bytes:
+    """A session key of `size` bytes (RFC 3711, 4.3.1, rate 0) from the master key with its salt."""
+    salt = int.from_bytes(master[KEY_BYTES:], "big")
+    return aes_cm(master[:KEY_BYTES], (salt ^ label << 48) << 16, bytes(size))
+
+
+class _Packet(NamedTuple):
+    """An SRTP packet, taken apart."""
+
+    sequence: int
+    ssrc: int
+    header_bytes: int
+    authenticated: bytes
+    tag: bytes
+
+
+def _parse(datagram: bytes) -> _Packet | None:
+    """The packet in a datagram; None when it cannot be one of the video's."""
+    if len(datagram) < _HEADER_BYTES + TAG_BYTES:
+        return None
+    first, second, sequence, ssrc = struct.unpack_from(">BBH4xI", datagram)
+    if first >> 6 != 2 or second & 0x7F != video.PAYLOAD_TYPE:
+        return None
+    authenticated = datagram[:-TAG_BYTES]
+    size = _HEADER_BYTES + 4 * (first & 0x0F)
+    if first & 0x10:  # the header extension is not encrypted
+        if len(authenticated) < size + 4:
+            return None
+        size += 4 + 4 * int(struct.unpack_from(">H", datagram, size + 2)[0])
+    if len(authenticated) < size:
+        return None
+    return _Packet(sequence, ssrc, size, authenticated, datagram[-TAG_BYTES:])
+
+
+class _Keys:
+    """One payload's session keys."""
+
+    def __init__(self, payload_id: str, master: bytes) -> None:
+        if len(master) != MASTER_BYTES:
+            raise StreamError(
+                f"SRTP key of '{payload_id}': {len(master)} bytes; it has {MASTER_BYTES}"
+            )
+        self.payload_id = payload_id
+        self._cipher = algorithms.AES(derive(master, _CIPHER_KEY, KEY_BYTES))
+        self._salt = int.from_bytes(derive(master, _CIPHER_SALT, SALT_BYTES), "big") << 16
+        self._mac = hmac.new(
+            derive(master, _AUTHENTICATION_KEY, _AUTHENTICATION_KEY_BYTES), digestmod="sha1"
+        )
+
+    def begin_tag(self, packet: _Packet) -> hmac.HMAC:
+        """The packet's tag but for the ROC, which is authenticated last (RFC 3711, 4.2)."""
+        mac = self._mac.copy()
+        mac.update(packet.authenticated)
+        return mac
+
+    def decrypt(self, packet: _Packet, index: int) -> bytes:
+        """The RTP packet in an SRTP packet of this index."""
+        counter = self._salt ^ packet.ssrc << 64 ^ index << 16
+        header, size = packet.authenticated[: packet.header_bytes], packet.header_bytes
+        return header + _aes_cm(self._cipher, counter, packet.authenticated[size:])
+
+
+def _made_with(begun: hmac.HMAC, roc: int, tag: bytes) -> bool:
+    if not 0 <= roc < 1 << 32:
+        return False
+    mac = begun.copy()
+    mac.update(roc.to_bytes(4, "big"))
+    return hmac.compare_digest(mac.digest()[:TAG_BYTES], tag)
+
+
+@dataclass
+class _Stream:
+    """What belongs to one SSRC: whose it is, its highest index, and which ones below it came."""
+
+    keys: _Keys
+    highest: int
+    came: int = 0  # bit n: the packet of index `highest` - n
+
+    def estimate(self, sequence: int) -> int:
+        """The index nearest to the highest one (RFC 3711, 3.3.1); it can come out below 0."""
+        ahead = (sequence - self.highest + 0x8000) % 0x10000 - 0x8000
+        return self.highest + ahead
+
+    def accept(self, index: int) -> bool:
+        """Marks an authenticated index; False when it came before or is too old to tell."""
+        ahead = index - self.highest
+        if ahead > 0:
+            self.highest = index
+            self.came = (self.came << min(ahead, REPLAY_WINDOW) | 1) & _WINDOW_MASK
+            return True
+        bit = 1 << -ahead
+        if -ahead >= REPLAY_WINDOW or self.came & bit:
+            return False
+        self.came |= bit
+        return True
+
+
+class _Budget:
+    """How much may be searched: a second's worth at once, and then as much a second."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._left, self._at_s = float(SEARCH_RATE_HZ), clock()
+
+    def is_left(self) -> bool:
+        now_s = self._clock()
+        gained = (now_s - self._at_s) * SEARCH_RATE_HZ
+        self._left, self._at_s = min(SEARCH_RATE_HZ, self._left + gained), now_s
+        return self._left > 0
+
+    def spend(self, tags: int) -> None:
+        self._left -= tags  # a search that was begun goes to its end, on credit
+
+
+class Unprotector:
+    """Takes SRTP packets apart; `keys` are master keys with salt (30 bytes) by payload id.
+
+    Unauthenticated packets go to `counters.refused`, repeated or very old ones to
+    `counters.replayed`. With `ssrc`, only that stream is looked at, and others go to
+    `counters.other_streams`. Raises `StreamError` for a key of another length.
+
+    An SSRC belongs to the payload that first sends with it. What a payload sent in an earlier
+    flight is authentic, too: only `ssrc`, from telemetry, tells today's stream from one played
+    back to a receiver that has just started.
+    """
+
+    def __init__(
+        self,
+        keys: Mapping[str, bytes],
+        counters: Counters | None = None,
+        *,
+        ssrc: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.counters = counters or Counters()
+        self.tags_searched = 0
+        """Tags computed so far to find ROCs."""
+        self._keys = [_Keys(payload_id, master) for payload_id, master in keys.items()]
+        self._ssrc = ssrc
+        self._streams: dict[int, _Stream] = {}
+        # Apart, so that a flood of unknown streams does not keep a known one from coming back.
+        self._to_join, self._to_follow = _Budget(clock), _Budget(clock)
+        self._next_roc = _ROCS
+
+    def payload_id(self, ssrc: int) -> str | None:
+        """Which payload a stream has authenticated as; None for one that has not."""
+        stream = self._streams.get(ssrc)
+        return stream.keys.payload_id if stream else None
+
+    def unprotect(self, datagram: bytes) -> bytes | None:
+        """The RTP packet in a datagram; None, and counted, when it is not authentic and new."""
+        packet = _parse(datagram)
+        if packet is None:
+            self.counters.refused += 1
+            return None
+        if self._ssrc is not None and packet.ssrc != self._ssrc:
+            self.counters.other_streams += 1
+            return None
+        found = self._find(packet)
+        if found is None:
+            self.counters.refused += 1
+            return None
+        stream, index = found
+        self._streams.pop(packet.ssrc, None)
+        self._streams[packet.ssrc] = stream  # behind those that were heard less lately
+        if len(self._streams) > STREAMS:
+            del self._streams[next(iter(self._streams))]
+        if not stream.accept(index):
+            self.counters.replayed += 1
+            return None
+        return stream.keys.decrypt(packet, index)
+
+    def _find(self, packet: _Packet) -> tuple[_Stream, int] | None:
+        """The packet's stream and index, authenticated; None when it is not authentic."""
+        stream = self._streams.get(packet.ssrc)
+        if stream is None:
+            return self._join(packet)
+        index = stream.estimate(packet.sequence)
+        if _made_with(stream.keys.begin_tag(packet), index >> 16, packet.tag):
+            return stream, index
+        if not self._to_follow.is_left():
+            return None
+        # Forged, or the link was gone for more than half a round of the sequence numbers.
+        first = (stream.highest - packet.sequence >> 16) + 1  # the least that is beyond the highest
+        found = self._search(packet, [stream.keys], range(first, first + _ROCS), self._to_follow)
+        return (stream, found[1]) if found else None
+
+    def _join(self, packet: _Packet) -> tuple[_Stream, int] | None:
+        """A stream not heard before: mostly young; if not, older ones are tried by and by."""
+        if not self._to_join.is_left():
+            return None
+        older = range(self._next_roc, self._next_roc + _ROCS)
+        found = self._search(packet, self._keys, chain(range(_ROCS), older), self._to_join)
+        if found is None:
+            self._next_roc = older.stop if older.stop < _ROC_LIMIT else _ROCS
+            return None
+        return _Stream(*found), found[1]
+
+    def _search(
+        self, packet: _Packet, keys: Sequence[_Keys], rocs: Iterable[int], budget: _Budget
+    ) -> tuple[_Keys, int] | None:
+        """Whose the packet is and its index, if the tag was made with one of these ROCs."""
+        begun = [(own, own.begin_tag(packet)) for own in keys]
+        before = self.tags_searched
+        try:
+            for roc in rocs:
+                for own, mac in begun:
+                    self.tags_searched += 1
+                    if _made_with(mac, roc, packet.tag):
+                        return own, roc << 16 | packet.sequence
+            return None
+        finally:
+            budget.spend(self.tags_searched - before)
