@@ -2,7 +2,7 @@
 
 A pipeline of its own, which lives as long as the program: cameras and encoders are restarted in
 front of it while sequence numbers and timestamps go on, so that a receiver sees a pause and no
-other stream.
+other stream, and SRTP's rollover counter keeps step.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import ipaddress
 import secrets
 import socket
 import threading
+from pathlib import Path
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import LinkSettings
-from pi_firmware.wire import video
+from pi_firmware.wire import srtp, video
 from pi_firmware.wire.errors import StreamError
 
 DISCOVERED = "auto"
@@ -29,16 +30,31 @@ def draw_ssrc(link: LinkSettings) -> int:
     return link.ssrc or 1 + secrets.randbelow(0xFFFFFFFF)
 
 
-def description(link: LinkSettings, ssrc: int) -> str:
-    """The pipeline, from whole access units to datagrams.
+def load_key(certificates: str) -> bytes | None:
+    """The payload's SRTP master key with salt (30 bytes) from the folder of its certificates.
 
-    The address is not in it: `Link` sets that, whatever characters it has.
+    None without a folder; raises `StreamError` with one line when it holds no key that can be used.
     """
+    return srtp.read_key(Path(certificates) / srtp.KEY_FILE) if certificates else None
+
+
+def description(link: LinkSettings, ssrc: int, *, encrypted: bool = False) -> str:
+    """The pipeline, from whole access units to datagrams of at most `link.mtu_bytes`.
+
+    The address and the key are not in it: `Link` sets those, whatever characters they have.
+    """
+    mtu_bytes, protect = link.mtu_bytes, ""
+    if encrypted:
+        mtu_bytes -= srtp.TAG_BYTES
+        protect = (
+            f"! srtpenc name=srtp rtp-cipher={srtp.CIPHER} rtp-auth={srtp.AUTHENTICATION} "
+            f"rtcp-cipher={srtp.CIPHER} rtcp-auth={srtp.AUTHENTICATION} "
+        )
     return (
         "appsrc name=link is-live=true format=time max-bytes=0 "
         "caps=video/x-h264,stream-format=byte-stream,alignment=au "
-        f"! rtph264pay pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={link.mtu_bytes} "
-        "config-interval=0 aggregate-mode=none "
+        f"! rtph264pay pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={mtu_bytes} "
+        f"config-interval=0 aggregate-mode=none {protect}"
         "! udpsink name=out sync=false async=false"
     )
 
@@ -48,11 +64,27 @@ class Link:
 
     A name that has no address yet is tried again in the background: Wi-Fi may come later than the
     camera. A network that takes nothing costs whole stretches up to the next IDR, never memory.
+
+    With a `key` (master key with salt, 30 bytes) and `link.encrypted` it sends SRTP. Encrypted
+    without a key it speaks to loopback only, and raises `StreamError` with one line for any other
+    host. An SSRC must not serve two links with one key: both would encrypt with the same keystream
+    (RFC 3711, 9.1), so that a fixed `link.ssrc` is refused, too.
     """
 
-    def __init__(self, link: LinkSettings, ssrc: int) -> None:
+    def __init__(self, link: LinkSettings, ssrc: int, key: bytes | None = None) -> None:
         self._gst = gstreamer.load()
-        self._pipeline = gstreamer.launch(description(link, ssrc))
+        encrypted = link.encrypted and key is not None
+        self._loopback_only = link.encrypted and key is None
+        if encrypted:
+            gstreamer.require(("srtpenc",), "link.encrypted")
+            if link.ssrc:
+                raise StreamError(
+                    f"link.ssrc is {link.ssrc}; with SRTP it must be 0, as each start needs another"
+                )
+        self._pipeline = gstreamer.launch(description(link, ssrc, encrypted=encrypted))
+        if encrypted:
+            element = self._pipeline.get_by_name("srtp")
+            element.set_property("key", self._gst.Buffer.new_wrapped(key))
         self._source = self._pipeline.get_by_name("link")
         self._sink = self._pipeline.get_by_name("out")
         self._first_ns: int | None = None
@@ -65,6 +97,8 @@ class Link:
         if link.host == DISCOVERED:
             self.problem = f"link.host '{DISCOVERED}': no ground station was found yet"
         elif not self._resolve(link):
+            if self._loopback_only:
+                raise StreamError(_without_key(link.host))
             self._resolver = threading.Thread(
                 target=self._resolve_later, args=(link,), name="link-host", daemon=True
             )
@@ -82,13 +116,18 @@ class Link:
             reason = message.parse_error()[0].message if message else "it does not start"
             raise StreamError(f"video link: {reason}")
 
-    def redirect(self, host: str, port: int) -> None:
-        """Sends to another numeric address from the next packet on."""
+    def redirect(self, host: str, port: int) -> bool:
+        """Sends to another numeric address from the next packet on; False if it must not."""
+        if self._loopback_only and not is_loopback(host):
+            self._to = None
+            self.problem = _without_key(host)
+            return False
         if (host, port) != self._to:
             self._sink.set_property("host", host)
             self._sink.set_property("port", port)
             self._to = (host, port)
             self.problem = ""
+        return True
 
     def send(self, access_unit: bytes, clock_ns: int, *, idr: bool) -> bool:
         """Queues one access unit of an instant on a clock that only rises; whether it will leave.
@@ -143,8 +182,14 @@ class Link:
             reason = getattr(error, "strerror", None) or error
             self.problem = f"link.host '{link.host}': {reason}; it is tried again"
             return False
-        self.redirect(str(found[0][4][0]), link.port)
-        return True
+        return self.redirect(str(found[0][4][0]), link.port)
+
+
+def _without_key(host: str) -> str:
+    return (
+        f"video to '{host}': no SRTP key; set telemetry.certificates to the folder that"
+        " 'blimp keys payload' wrote, or link.encrypted = false to send it for all to see"
+    )
 
 
 def is_loopback(host: str) -> bool:
