@@ -87,6 +87,11 @@ def notes(result: ReplayResult) -> list[str]:
     lines = []
     if result.settings.init == "truth":
         lines.append("The first frame's pose was given, as the thesis needs it: the true one.")
+    clock = result.live.clock_offset()
+    if clock is None:
+        lines.append("The payload's clock never answered: latencies take both clocks for one.")
+    else:
+        lines.append(f"Latencies are exact to {clock['uncertainty_ns'] / 1e6:.2f} ms.")
     if not result.live.complete:
         lines.append("The payload's final counts did not arrive: frames sent is what was received.")
     return lines

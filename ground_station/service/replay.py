@@ -100,6 +100,7 @@ class ReplayResult:
             "ate": self.evaluation.ate() if self.evaluation else None,
             "shares": within,
             "latency_ms": results.percentiles(latency.tolist()),
+            "clock_offset": self.live.clock_offset(),
             "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,
             "stream": asdict(self.live.stream),
         }
@@ -206,7 +207,8 @@ def _payload_config(
             "height_px": camera.height_px,
         },
         "gate": gate,
-        "encoder": {"bitrate_kbps": settings.bitrate_kbps},
+        # Loopback loses nothing, and the round trips of a busy machine are no radio's.
+        "encoder": {"bitrate_kbps": settings.bitrate_kbps, "adapt": False},
         "link": {"port": port},
         "telemetry": {"connect": list(endpoints)},
     }

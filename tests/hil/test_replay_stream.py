@@ -47,7 +47,7 @@ def test_every_frame_is_accounted_for(flown: ReplayResult) -> None:
     accounts = flown.live.accounts()
     assert flown.live.complete
     assert accounts["captured"] == 20
-    assert accounts["captured"] == accounts["gated"] + accounts["sent"]
+    assert accounts["captured"] == accounts["gated"] + accounts["sent"] + accounts["discarded"]
     assert accounts["sent"] == accounts["received"] + accounts["lost"]
     assert accounts["lost"] == accounts["dropped"] == 0
     assert accounts["received"] == len(flown.live.frames)
@@ -74,6 +74,16 @@ def test_latency_is_between_capture_and_now(flown: ReplayResult) -> None:
     for frame in flown.live.frames:
         assert frame.clock_ns < frame.arrival_ns < frame.done_ns
         assert frame.done_ns - frame.clock_ns < 60e9
+
+
+def test_the_payloads_clock_is_measured_and_its_uncertainty_told(flown: ReplayResult) -> None:
+    """Here it is our own, so that its offset is within the bound, and latencies are, too."""
+    clock = flown.live.clock_offset()
+    assert clock is not None and clock == flown.document()["clock_offset"]
+    assert abs(clock["offset_ns"]) <= clock["uncertainty_ns"] < 10**9
+    for frame, latency_ms in zip(flown.live.frames, flown.live.latency_ms(), strict=True):
+        assert abs(latency_ms - (frame.done_ns - frame.clock_ns) / 1e6) < 1000
+    assert any("Latencies are exact to" in note for note in flight_report.notes(flown))
 
 
 def test_a_missed_bound_is_judged_so(flown: ReplayResult) -> None:
