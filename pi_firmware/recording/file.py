@@ -17,11 +17,14 @@ if TYPE_CHECKING:
     from pi_firmware.wire.recording import RecordingWriter
 
 CHUNK_BYTES = 256 * 1024
+"""A chunk ends, and is written, when it has so much or is synced, and only if there is room."""
+
+_NEVER_BY_ITSELF = 1 << 40
 TELEMETRY_ROOT = "/blimp"
 FRAME_SCHEMA = "blimp.Frame"
 _RECORD_BYTES = 96
 """What a message takes in the file beside its content, at most: record, protobuf, index."""
-_HEAD_BYTES = 32 * 1024
+HEAD_BYTES = 32 * 1024
 """Schemas and channels, at the file's head and again in its index."""
 _CHUNK_INDEX_BYTES = 512
 _MAX_CHUNKS = 8192
@@ -134,7 +137,7 @@ class FlightFile:
     def _opened(self, head: Mapping[str, Mapping[str, str]]) -> RecordingWriter:
         """The writer, with the file's head on the card."""
         writer = self._kinds.RecordingWriter(
-            self.path, chunk_bytes=CHUNK_BYTES, open_file=lambda _: cast(IO[bytes], self._file)
+            self.path, chunk_bytes=_NEVER_BY_ITSELF, open_file=lambda _: cast(IO[bytes], self._file)
         )
         for name, values in head.items():
             writer.write_metadata(name, values)
@@ -145,7 +148,7 @@ class FlightFile:
     @property
     def size_bytes(self) -> int:
         """What the file would have if it ended now, at most."""
-        index_bytes = _HEAD_BYTES + _CHUNK_INDEX_BYTES * (self._chunks + 1)
+        index_bytes = HEAD_BYTES + _CHUNK_INDEX_BYTES * (self._chunks + 1)
         return self._file.tell() + self._pending_bytes + index_bytes
 
     @property

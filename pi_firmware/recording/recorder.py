@@ -126,7 +126,7 @@ class Recorder:
     def message(self, kind: str, message: messages.Message) -> None:
         """Records a message on `/blimp/<kind>`, likewise; from any thread."""
         run = self._run
-        if run is not None:
+        if run is not None and isinstance(message, messages.Message):
             with contextlib.suppress(Exception):
                 run.intake.message(kind, message)
 

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from pi_firmware.recording.file import CHUNK_BYTES, FlightFile, OpenFile
+from pi_firmware.recording.file import CHUNK_BYTES, HEAD_BYTES, FlightFile, OpenFile
 from pi_firmware.recording.folder import Folder
 from pi_firmware.recording.intake import Intake, Telemetry, Unit
 from pi_firmware.settings import RecordingSettings
@@ -255,7 +255,7 @@ class Run:
 
     def _next_file(self) -> FlightFile:
         path = self._folder.next_path()
-        self._folder.make_room(0, 0)
+        self._folder.make_room(HEAD_BYTES, HEAD_BYTES)
         self._first = self._first or path.name
         self._part += 1
         head = {"recording": {"first_file": self._first, "part": str(self._part)}}
@@ -272,6 +272,8 @@ class Run:
 
     def _end_file(self, reason: str) -> None:
         file = self._current
+        with contextlib.suppress(RecordingError):  # its index may lie in what is to be left free
+            self._folder.make_room(file.size_bytes, 0)
         end = {"frames": str(file.frames), "left_out": str(self.left_out)}
         file.close({**end, "reason": reason} if reason else end)
         self.size_bytes = file.written_bytes
