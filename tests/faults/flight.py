@@ -192,10 +192,11 @@ class Flight:
         if not isinstance(self.ground, Ground):
             return {}
         ends = (messages.EVENT_STOPPED, messages.EVENT_END_OF_STREAM)
-        state = self.ground.listener.wait(
-            self.payload_id, lambda s: bool(s.events) and s.events[-1].name in ends, FRESH_S
-        )
-        assert state is not None, f"{self.payload_id} did not say that it ended"
-        values = state.events[-1].values
+        listener = self.ground.listener
+        listener.wait(self.payload_id, lambda s: any(e.name in ends for e in s.events), FRESH_S)
+        state = listener.state(self.payload_id)
+        events = state.events if state else []
+        last = next((event for event in reversed(events) if event.name in ends), None)
+        assert last is not None, f"{self.payload_id} did not say that it ended: {events}"
         wanted = ("captured", "gated", "sent", "discarded")
-        return {name: values[name] for name in wanted if name in values}
+        return {name: last.values[name] for name in wanted if name in last.values}

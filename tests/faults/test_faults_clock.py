@@ -1,0 +1,91 @@
+"""The payload's clock stepped by an hour: its frames go on, and their ages stay exact."""
+
+from __future__ import annotations
+
+import mmap
+import shutil
+import struct
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from flight import FRESH_S, SMALL_FRAMES, Flight
+from ground import Ground
+
+from pi_firmware.wire import messages
+
+HOUR_NS = 3_600_000_000_000
+EXACT_NS = 1_000_000  # what capture times promise
+SHIM = Path(__file__).with_name("stepped_clock.c")
+
+
+class SteppedClock:
+    """The wall clock of the programs started with `env`; `step_ns` moves it now."""
+
+    def __init__(self, folder: Path) -> None:
+        compiler = shutil.which("cc")
+        if compiler is None:
+            pytest.skip("no C compiler for the clock's shim")
+        library, step = folder / "stepped_clock.so", folder / "step"
+        subprocess.run(
+            [compiler, "-shared", "-fPIC", "-O1", "-o", library, SHIM, "-ldl"], check=True
+        )
+        step.write_bytes(bytes(8))
+        with step.open("r+b") as file:
+            self._step = mmap.mmap(file.fileno(), 8)
+        self.env = {"LD_PRELOAD": str(library), "STEPPED_CLOCK": str(step)}
+
+    def step_to(self, offset_ns: int) -> None:
+        """From now on the clock is this far from the true one."""
+        self._step[:] = struct.pack("=q", offset_ns)
+
+
+@pytest.mark.parametrize("step_ns", [-HOUR_NS, HOUR_NS], ids=["back", "forward"])
+def test_a_clock_that_is_stepped(recording: Path, tmp_path: Path, step_ns: int) -> None:
+    clock = SteppedClock(tmp_path)
+    with (
+        Ground() as ground,
+        Flight(tmp_path, ground, recording, *SMALL_FRAMES, env=clock.env) as flight,
+    ):
+
+        def offset_error_ns(true_ns: int, within_s: float) -> int | None:
+            """Waits for an offset that holds the truth within its own bound, and is exact."""
+            until_s = time.monotonic() + within_s
+            while time.monotonic() < until_s:
+                found = ground.listener.clock("blimp-1")
+                error_ns = abs(found.offset_ns - true_ns) if found else HOUR_NS
+                if found and error_ns <= min(found.uncertainty_ns, EXACT_NS):
+                    return error_ns
+                time.sleep(0.05)
+            return None
+
+        flight.wait_streaming(30)
+        assert offset_error_ns(0, 10) is not None
+        time.sleep(0.5)
+        clock.step_to(step_ns)
+        stepped_ns = time.time_ns()
+        flight.wait_streaming()
+        left_s = FRESH_S - (time.time_ns() - stepped_ns) / 1e9
+        assert offset_error_ns(step_ns, left_s) is not None
+        found = ground.listener.clock("blimp-1")
+        assert found is not None and found.steps == 1
+        known_ns = time.time_ns()
+        flight.wait_streaming()
+        time.sleep(1)
+        account = flight.finish()
+    account.assert_exact()
+    state = ground.listener.state("blimp-1")
+    assert state is not None  # nothing was started anew for a clock
+    assert {event.name for event in state.events} == {
+        messages.EVENT_STARTED,
+        messages.EVENT_STOPPED,
+    }
+    # Latencies: before the step by the true clock, after it by the offset that was found.
+    before = [s.arrival_ns - s.clock_ns for s in account.seen if s.arrival_ns < stepped_ns]
+    after = [
+        s.arrival_ns - found.to_ours(s.clock_ns) for s in account.seen if s.arrival_ns > known_ns
+    ]
+    assert len(before) > 3 and len(after) > 15
+    for latencies_ns in (before, after):
+        assert min(latencies_ns) > -EXACT_NS and max(latencies_ns) < 2_000_000_000

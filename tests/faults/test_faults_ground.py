@@ -1,0 +1,126 @@
+"""The link gone, the ground killed, absent or shared: the payload goes on, and is seen again."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from pathlib import Path
+
+from flight import FRESH_S, ROUND, SMALL_FRAMES, Flight
+from ground import Ground, GroundProcess
+from payload_process import PayloadProcess
+
+GONE_S = 10.0
+TELEMETRY_S = 20.0  # it is tried again ever more seldom
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    """A port on which nobody listens now."""
+    with socket.socket(socket.AF_INET, kind) as tried:
+        tried.bind(("127.0.0.1", 0))
+        return int(tried.getsockname()[1])
+
+
+def test_a_link_that_was_gone_for_ten_seconds(recording: Path, tmp_path: Path) -> None:
+    with Ground() as ground, Flight(tmp_path, ground, recording, *SMALL_FRAMES) as flight:
+        flight.wait_streaming(30)
+        flight.link.gone(GONE_S)
+        time.sleep(GONE_S)
+        during = len(flight.witness.left())
+        flight.wait_streaming()
+        account = flight.finish()
+    account.assert_exact()
+    assert account.link.lost > 100 and during > 9 * GONE_S  # the payload never stopped
+    longest_ns = max(
+        b.arrival_ns - a.arrival_ns for a, b in zip(account.seen, account.seen[1:], strict=False)
+    )
+    assert longest_ns > 0.9 * GONE_S * 1e9
+
+
+def test_a_ground_that_is_killed_and_comes_back(recording: Path, tmp_path: Path) -> None:
+    """The payload sends straight to its port, so that ICMP says that nobody listens."""
+    with GroundProcess() as killed:
+        settings = (
+            f"camera.uri=replay:{recording}?loop=1",
+            f"link.port={killed.port}",
+            f"telemetry.connect={json.dumps(killed.endpoints)}",
+            *SMALL_FRAMES,
+        )
+        with PayloadProcess(tmp_path, *settings) as payload:
+            assert killed.wait_for(lambda seen: seen.sequence >= 15, 30)
+            killed.kill()
+            last = killed.frames[-1].sequence
+            time.sleep(2)
+            with Ground(killed.port, killed.endpoints[0]) as ground:
+                fresh = ground.wait_for(lambda _: True, FRESH_S)
+                assert fresh is not None and fresh.sequence > last
+                again = ground.listener.wait(
+                    "blimp-1", lambda s: s.alive and s.battery is not None, TELEMETRY_S
+                )
+                assert again is not None and ground.listener.clock("blimp-1") is not None
+                ended = payload.end()
+                seen = killed.frames + ground.frames
+    ended.assert_in_order()
+    counts = ended.counts
+    assert counts["captured"] == counts["sent"] > len(seen)
+    sequences = [frame.sequence for frame in seen]
+    assert sequences == sorted(set(sequences))
+    assert [frame.number for frame in seen] == [sequence % ROUND for sequence in sequences]
+
+
+def test_a_ground_that_comes_late(recording: Path, tmp_path: Path) -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    settings = (
+        f"camera.uri=replay:{recording}?loop=1",
+        f"link.port={port}",
+        f'telemetry.connect=["{endpoint}"]',
+        *SMALL_FRAMES,
+    )
+    with PayloadProcess(tmp_path, *settings) as payload:
+        time.sleep(3)
+        assert payload.running
+        with Ground(port, endpoint) as ground:
+            fresh = ground.wait_for(lambda _: True, FRESH_S)
+            assert fresh is not None and fresh.sequence > 15
+            assert ground.listener.wait("blimp-1", lambda s: bool(s.decisions), TELEMETRY_S)
+            ended = payload.end()
+    ended.assert_in_order()
+    assert [frame.number for frame in ground.frames] == [
+        frame.sequence % ROUND for frame in ground.frames
+    ]
+
+
+def test_two_payloads_on_one_port(recording: Path, tmp_path: Path) -> None:
+    """Each ground takes one of them, by the SSRC that telemetry announces."""
+    with (
+        Ground(ssrc=1001) as one,
+        Ground(ssrc=1002) as two,
+        Flight(
+            tmp_path / "1", one, recording, "link.ssrc=1001", *SMALL_FRAMES, payload_id="one"
+        ) as first,
+        Flight(
+            tmp_path / "2", two, recording, "link.ssrc=1002", *SMALL_FRAMES, payload_id="two"
+        ) as second,
+    ):
+        second.link.retarget(one.port)
+        first.wait_streaming(30)
+        time.sleep(1)
+        first.link.retarget(two.port)
+        second.link.retarget(two.port)
+        second.wait_streaming(30)
+        time.sleep(1)
+        for ground, name, ssrc in ((one, "one", 1001), (two, "two", 1002)):
+            state = ground.listener.wait(name, lambda s: s.ssrc is not None, TELEMETRY_S)
+            assert state is not None and state.ssrc == ssrc
+        accounts = [first.finish(), second.finish()]
+        counters = [one.receiver.counters, two.receiver.counters]
+    for account, ssrc in zip(accounts, (1001, 1002), strict=True):
+        account.assert_in_order()
+        account.assert_sent()
+        assert {frame.ssrc for frame in account.seen} == {ssrc}
+        assert len(account.seen) > 20
+    taken = sum(c.packets + c.other_streams for c in counters)
+    assert taken == sum(account.link.passed for account in accounts)
+    assert min(c.other_streams for c in counters) > 20
