@@ -41,9 +41,9 @@ class Measure:
 
 def gradient_energy(luma: NDArray[np.uint8]) -> float:
     """Mean of dx^2 + dy^2 between neighbouring pixels of `luma` (H, W), grey levels squared."""
-    grey = luma.astype(np.int16)
-    dx = (grey[:, 1:] - grey[:, :-1]).ravel().astype(np.float32)
-    dy = (grey[1:] - grey[:-1]).ravel().astype(np.float32)
+    grey = luma.astype(np.float32)
+    dx = (grey[:, 1:] - grey[:, :-1]).ravel()
+    dy = (grey[1:] - grey[:-1]).ravel()
     return float(dx.dot(dx) / max(1, dx.size) + dy.dot(dy) / max(1, dy.size))
 
 
@@ -51,9 +51,14 @@ def block_means(luma: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Means of the 4x4 blocks of `luma` (H, W), both at least 4; what is left over is left out."""
     rows, columns = (size // _BLOCK_PX for size in luma.shape)
     whole = luma[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
-    blocks = whole.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX)
-    sums = blocks.sum(axis=1, dtype=np.uint16).sum(axis=2, dtype=np.uint16)
-    return sums.astype(np.float32) / np.float32(_BLOCK_PX**2)
+    # Whole rows are added, then whole columns: numpy's sum over an axis of four works four by four.
+    lines = whole[::_BLOCK_PX].astype(np.uint16)
+    for row in range(1, _BLOCK_PX):
+        lines += whole[row::_BLOCK_PX]
+    sums = lines[:, ::_BLOCK_PX].astype(np.float32)
+    for column in range(1, _BLOCK_PX):
+        sums += lines[:, column::_BLOCK_PX]
+    return sums / np.float32(_BLOCK_PX**2)
 
 
 def measure(luma: NDArray[np.uint8]) -> Measure:
@@ -132,7 +137,9 @@ class Gate:
     def _difference(self, blocks: NDArray[np.float32]) -> float | None:
         if self._sent is None or self._sent.shape != blocks.shape:
             return None
-        return float(np.abs(blocks - self._sent).mean())
+        apart = blocks - self._sent
+        np.abs(apart, out=apart)
+        return float(np.add.reduce(apart, axis=None) / apart.size)  # mean() without its wrapping
 
     def _silent_ns(self, now_ns: int) -> int:
         if self._last_passed_ns is None:  # nothing sent yet: count from the first frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 START_CODE = b"\x00\x00\x00\x01"
@@ -11,6 +12,8 @@ NAL_SEI = 6
 NAL_SPS = 7
 NAL_PPS = 8
 NAL_AUD = 9
+
+_NEEDS_PREVENTION = re.compile(rb"\x00\x00(?=[\x00-\x03])")
 
 NO_PARAMETER_SETS = "the stream carries no parameter sets (SPS and PPS), so nothing decodes it"
 
@@ -50,8 +53,12 @@ def has_parameter_sets(data: bytes) -> bool:
 
 
 def is_idr(data: bytes) -> bool:
-    """Whether an access unit is an IDR picture, from which decoding can start."""
-    return any(nal_type(unit) == NAL_IDR for unit in nal_units(data))
+    """Whether an access unit is an IDR picture, from which decoding can start.
+
+    Its first slice tells, since all of an IDR picture are of that type (H.264, 7.4.1.2.4).
+    """
+    start = _first_slice(data)
+    return start >= 0 and data[start + 3] & 0x1F == NAL_IDR
 
 
 def insert_before_slice(access_unit: bytes, unit: bytes) -> bytes:
@@ -59,27 +66,30 @@ def insert_before_slice(access_unit: bytes, unit: bytes) -> bytes:
 
     Raises `ValueError` when it has no slice.
     """
+    start = _first_slice(access_unit)
+    if start < 0:
+        raise ValueError("the access unit has no slice")
+    if start > 0 and access_unit[start - 1] == 0:
+        start -= 1
+    return access_unit[:start] + START_CODE + unit + access_unit[start:]
+
+
+def _first_slice(access_unit: bytes) -> int:
+    """Where the three bytes of the first slice's start code are; -1 without a slice.
+
+    A slice is most of an access unit, and nothing behind its first byte is looked at.
+    """
     start = access_unit.find(b"\x00\x00\x01")
     while start >= 0 and start + 3 < len(access_unit):
         if NAL_SLICE <= access_unit[start + 3] & 0x1F <= NAL_IDR:
-            if start > 0 and access_unit[start - 1] == 0:
-                start -= 1
-            return access_unit[:start] + START_CODE + unit + access_unit[start:]
+            return start
         start = access_unit.find(b"\x00\x00\x01", start + 3)
-    raise ValueError("the access unit has no slice")
+    return -1
 
 
 def escape(rbsp: bytes) -> bytes:
     """Adds emulation prevention bytes (H.264, 7.4.1.1): 00 00 0x becomes 00 00 03 0x for x <= 3."""
-    result = bytearray()
-    zeros = 0
-    for byte in rbsp:
-        if zeros >= 2 and byte <= 3:
-            result.append(3)
-            zeros = 0
-        result.append(byte)
-        zeros = zeros + 1 if byte == 0 else 0
-    return bytes(result)
+    return _NEEDS_PREVENTION.sub(b"\x00\x00\x03", rbsp)
 
 
 def unescape(payload: bytes) -> bytes:

@@ -13,4 +13,4 @@ def entropy_bits(luma: NDArray[np.uint8]) -> float:
     """
     counts = np.bincount(luma.ravel(), minlength=256)
     p = counts[counts > 0] / luma.size
-    return float(max(0.0, -(p * np.log2(p)).sum()))
+    return max(0.0, -float(p.dot(np.log2(p))))
