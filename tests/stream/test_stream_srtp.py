@@ -103,7 +103,7 @@ def test_headers_with_sources_extension_and_padding_come_out_too(sender: SrtpSen
     assert [unprotector.unprotect(packet) for packet in sender.protect(plain)] == plain
 
 
-@pytest.mark.parametrize("rollovers", [1, 2, 40, 1100])
+@pytest.mark.parametrize("rollovers", [1, 2, 40, 1000])
 def test_a_receiver_that_joins_after_rollovers_finds_their_number(
     sender: SrtpSender, rollovers: int
 ) -> None:
@@ -118,7 +118,7 @@ def test_a_receiver_that_joins_after_rollovers_finds_their_number(
 def test_a_stream_of_any_age_is_joined_by_and_by(
     sender: SrtpSender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(srtp, "_ROCS", 4)
+    monkeypatch.setattr(srtp, "SEARCH_TAGS", 8)
     roll(sender, 21)
     plain = [rtp(21 * 0x10000 + number) for number in range(1, 10)]
     unprotector = Unprotector({ID: KEY})
@@ -220,17 +220,16 @@ def test_a_flood_of_streams_is_searched_within_bounds_and_kept_out(sender: SrtpS
     unprotector = Unprotector({ID: KEY, "blimp-2": OTHER_KEY}, clock=clock)
     plain = [rtp(number) for number in range(4000)]
     protected = sender.protect(plain)
-    one_search = 2 * 2 * 1024
     for number, hostile in enumerate(junk(4000)):
         assert unprotector.unprotect(hostile) is None
         assert number % 2 or unprotector.unprotect(protected[number]) == plain[number]
-    assert unprotector.tags_searched <= srtp.SEARCH_RATE_HZ + one_search
+    assert unprotector.tags_searched <= srtp.SEARCH_RATE_HZ + srtp.SEARCH_TAGS
     for _ in range(10):
         clock.now_s += 1.0
         before = unprotector.tags_searched
         for hostile in junk(1000):
             unprotector.unprotect(hostile)
-        assert unprotector.tags_searched - before <= srtp.SEARCH_RATE_HZ + one_search
+        assert unprotector.tags_searched - before <= srtp.SEARCH_RATE_HZ + srtp.SEARCH_TAGS
     assert len(unprotector._streams) == 1
     # A new stream is found as soon as there is something left to search with.
     late = sender.protect([rtp(number, ssrc=78) for number in range(2)])
@@ -247,7 +246,7 @@ def test_a_flood_in_a_known_streams_name_does_not_stop_it(sender: SrtpSender) ->
     for hostile, packet, own in zip(junk(2000, ssrc=77), protected, plain, strict=True):
         assert unprotector.unprotect(hostile) is None
         assert unprotector.unprotect(packet) == own
-    assert unprotector.tags_searched <= 2 * (srtp.SEARCH_RATE_HZ + 2 * 1024)
+    assert unprotector.tags_searched <= 2 * (srtp.SEARCH_RATE_HZ + srtp.SEARCH_TAGS)
     assert unprotector.counters.refused == 2000
 
 
