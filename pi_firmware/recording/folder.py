@@ -58,6 +58,8 @@ class Folder:
                 ) from None
             del self._earlier[0]
             self._earlier_bytes -= size
+        if not self._min_free_bytes:
+            return  # until the disk itself is full
         try:
             disk = os.statvfs(self.path)
         except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections import deque
@@ -142,23 +143,27 @@ class Run:
 
     def _write(self) -> None:
         period_s = _SYNC_SHARE * self._settings.sync_s
-        due_s = time.monotonic() + period_s
-        last_s = float("inf")
+        due_s = wake_s = time.monotonic() + period_s
+        last_s = math.inf
         while True:
-            if self.intake.wait(due_s):
-                last_s = min(last_s, time.monotonic() + _DRAIN_LIMIT_S)
+            ending = self.intake.wait(wake_s)
+            now_s = time.monotonic()
+            if ending:
+                last_s = min(last_s, now_s + _DRAIN_LIMIT_S)
+            pause_s = min(now_s + period_s, last_s)  # however much waits, it is synced between
             while (item := self.intake.take()) is not None:
                 self._put(item)
-                if time.monotonic() >= min(due_s, last_s):
+                if time.monotonic() >= pause_s:
                     break
             now_s = time.monotonic()
-            if now_s >= last_s or (item is None and last_s < float("inf")):
+            if ending and (item is None or now_s >= last_s):
                 self._say_what_waited()
                 return
             if now_s >= due_s:
                 due_s = now_s + period_s
                 self._flush()
                 self._current.sync()
+            wake_s = due_s if item is None else now_s
 
     def _put(self, item: Unit | Telemetry) -> None:
         if isinstance(item, Telemetry):

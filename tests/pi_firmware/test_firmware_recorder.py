@@ -116,7 +116,8 @@ def test_a_full_file_goes_on_in_the_next_without_a_gap(tmp_path: Path) -> None:
         assert annexb.is_idr(video(path)[0])
         assert 500_000 < path.stat().st_size <= 1_000_000 or number == 5
         reader = RecordingReader(path)
-        assert reader.metadata_table("recording")["part"] == str(number) and not reader.cut
+        assert reader.topics().keys() == {VIDEO_TOPIC, "/camera/frame"} and not reader.cut
+        assert reader.metadata["recording"]["part"] == str(number)
     assert events.names() == [EVENT_RECORDING_STARTED] * 5 + [EVENT_RECORDING_ENDED]
     assert events.told[1][1] == "flight-000002.mcap, after flight-000001.mcap"
     assert events.told[-1][1] == "flight-000001.mcap to flight-000005.mcap: 300 frames"
