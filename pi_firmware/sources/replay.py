@@ -1,4 +1,4 @@
-"""`replay:FLIGHT.mcap`, a recorded flight in real time, as if the camera saw it now."""
+"""`replay:FLIGHT.mcap`, a recorded flight as if the camera saw it now, at its pace or stepped."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Stamp
 from pi_firmware.sources.decoding import Picture, RecordingDecoder
+from pi_firmware.sources.pacing import MAX_STEPS_HZ, PACES, Pace, RealTime, Stepped
 from pi_firmware.uri import Uri
 from pi_firmware.wire.errors import BlimpError, RecordingError
 
-_OPTIONS = ("rate_hz", "start_s", "duration_s", "speed", "loop")
+_OPTIONS = ("rate_hz", "start_s", "duration_s", "loop", "pace", "speed", "max_hz")
+_OF_PACE = {"realtime": "speed", "stepped": "max_hz"}
 
 
 class RateGrid:
@@ -47,11 +49,12 @@ class RateGrid:
 
 
 class ReplaySource:
-    """Decodes ahead, waits for each frame's recorded instant, then hands it to the pipeline.
+    """Decodes ahead, waits for each frame's turn, then hands it to the pipeline.
 
     `time_ns` of a frame is the recording's own, so that it meets the recorded ground truth exactly;
     `clock_ns` is the payload's clock when the frame was handed over. In a loop, recorded times go
-    on rising by the length of a round.
+    on rising by the length of a round. No frame is lost up to the encoder, at either pace: appsrc
+    blocks while its queue is full.
     """
 
     def __init__(self, uri: Uri, camera: CameraSettings) -> None:
@@ -65,11 +68,11 @@ class ReplaySource:
         self._path = Path(uri.path)
         self._start_ns = int(1e9 * uri.number("start_s", 0.0, 0.0, 1e6))
         self._duration_ns = int(1e9 * uri.number("duration_s", 1e6, 0.01, 1e6))
-        self._speed = uri.number("speed", 1.0, 0.1, 10.0)
         self._loop = uri.choice("loop", "0", ("0", "1")) == "1"
+        self._stopping = threading.Event()
+        self._pace = self._chosen_pace(uri)
         self._decoder: RecordingDecoder | None = None
         self._stamps: dict[int, Stamp] = {}
-        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
         self._pictures = self._taken_pictures()
         try:
@@ -86,8 +89,8 @@ class ReplaySource:
 
     def elements(self) -> str:
         return (
-            "appsrc name=source is-live=true format=time block=true max-bytes=0 max-buffers=4 "
-            f'caps="{self._caps}"'
+            "appsrc name=source is-live=true format=time block=true max-bytes=0 "
+            f'max-buffers={self._pace.ahead_frames} caps="{self._caps}"'
         )
 
     def attach(self, pipeline: Any) -> None:
@@ -116,24 +119,31 @@ class ReplaySource:
         source = self._pipeline.get_by_name("source")
         gst = gstreamer.load()
         try:
-            assert self._first is not None
-            start_ns = self._running_ns()
-            first_ns = self._first.time_ns
             for picture in self._with_first():
-                due_ns = start_ns + int((picture.time_ns - first_ns) / self._speed)
-                if self._stopping.wait(max(0, due_ns - self._running_ns()) / 1e9):
+                running_ns = self._pace.turn(picture.time_ns)
+                if running_ns is None:
                     break
-                self._stamps[due_ns] = Stamp(
+                self._stamps[running_ns] = Stamp(
                     picture.time_ns, time.time_ns(), picture.exposure_s, picture.gain
                 )
                 buffer = picture.buffer.copy()
-                buffer.pts, buffer.dts = due_ns, gst.CLOCK_TIME_NONE
+                buffer.pts, buffer.dts = running_ns, gst.CLOCK_TIME_NONE
                 if source.emit("push-buffer", buffer) != gst.FlowReturn.OK:
                     break
         except BlimpError as error:
             self.error = error
         finally:
             source.emit("end-of-stream")
+
+    def _chosen_pace(self, uri: Uri) -> Pace:
+        name = uri.choice("pace", "realtime", PACES)
+        for pace, option in _OF_PACE.items():
+            if option in uri.options and pace != name:
+                raise uri.fail(f"{option} is for pace={pace} only")
+        if name == "stepped":
+            max_hz = uri.number("max_hz", MAX_STEPS_HZ, 0.1, 1000.0)
+            return Stepped(max_hz, self._stopping)
+        return RealTime(uri.number("speed", 1.0, 0.1, 10.0), self._running_ns, self._stopping)
 
     def _running_ns(self) -> int:
         return int(self._pipeline.get_clock().get_time() - self._pipeline.get_base_time())

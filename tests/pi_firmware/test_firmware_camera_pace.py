@@ -1,0 +1,99 @@
+"""`replay:` with pace=stepped: no waiting, no frame lost, the recording's own time throughout."""
+
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ground_station.stream.receiver import ReceivedFrame, Receiver
+from pi_firmware.sources.pacing import RealTime, Stepped
+from pi_firmware.wire.recording import RecordingReader
+
+FLIGHT = Path(__file__).parents[2] / "maps" / "atrium" / "flight.mcap"
+HOUR_NS = 3600 * 10**9
+
+
+def test_a_step_waits_for_no_recorded_time() -> None:
+    pace = Stepped(1000.0, threading.Event())
+    began_s = time.monotonic()
+    turns = [pace.turn(10**18 + hour * HOUR_NS) for hour in range(5)]
+    assert turns == [hour * HOUR_NS for hour in range(5)]
+    assert time.monotonic() - began_s < 600
+
+
+def test_steps_are_no_more_than_asked_for() -> None:
+    pace = Stepped(50.0, threading.Event())
+    began_s = time.monotonic()
+    for frame in range(6):
+        pace.turn(frame)
+    assert time.monotonic() - began_s >= 5 / 50.0
+
+
+def test_a_stop_ends_either_pace_at_once() -> None:
+    stopping = threading.Event()
+    stopping.set()
+    assert Stepped(0.1, stopping).turn(0) is None
+    assert RealTime(1.0, lambda: 0, stopping).turn(0) is None
+    waiting = Stepped(0.1, later := threading.Event())
+    assert waiting.turn(0) == 0
+    threading.Timer(0.05, later.set).start()
+    assert waiting.turn(HOUR_NS) is None
+
+
+def test_in_real_time_each_frame_has_its_instant_and_a_faster_one_a_shorter() -> None:
+    now = iter([1000, 1000, 10**12, 10**12])
+    pace = RealTime(2.0, lambda: next(now), threading.Event())
+    assert pace.turn(10**18) == 1000
+    assert pace.turn(10**18 + 10**9) == 1000 + 5 * 10**8
+    assert pace.turn(10**18 + 2 * 10**9) == 1000 + 10**9
+
+
+def fly(*settings: str, options: str = "") -> list[ReceivedFrame]:
+    """The sample flight's first ten seconds, stepped through the real program to a receiver."""
+    with Receiver(0, queue_frames=1000) as receiver:
+        command = [sys.executable, "-m", "pi_firmware"]
+        for setting in (
+            f"camera.uri=replay:{FLIGHT}?pace=stepped&duration_s=10{options}",
+            f"link.port={receiver.port}",
+            "telemetry.enabled=false",
+            *settings,
+        ):
+            command += ["--set", setting]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        frames = []
+        while (frame := receiver.get(0.5)) or process.poll() is None:
+            if frame:
+                frames.append(frame)
+        out, err = process.communicate(timeout=30)
+        assert process.returncode == 0, err
+        assert f"{len(frames)} sent" in out
+        assert receiver.counters.packets_lost == receiver.counters.dropped == 0
+    return frames
+
+
+def recorded_ns() -> list[int]:
+    times = [sample.time_ns for sample in RecordingReader(FLIGHT).video()]
+    return [time_ns for time_ns in times if time_ns - times[0] < 10 * 10**9]
+
+
+def test_a_stepped_flight_loses_no_frame_and_keeps_the_recorded_times() -> None:
+    frames = fly("gate.enabled=false")
+    assert [frame.time_ns for frame in frames] == recorded_ns()
+    assert [frame.sequence for frame in frames] == list(range(len(frames)))
+
+
+def test_heartbeats_are_a_second_of_the_recording_apart() -> None:
+    gated = ("gate.min_entropy_bits=8", "gate.heartbeat_s=1")
+    frames = fly(*gated)
+    assert len(frames) == 9 and all(frame.heartbeat for frame in frames)
+    apart_s = np.diff([frame.time_ns for frame in frames]) / 1e9
+    assert np.all(np.abs(apart_s - 1) < 1 / 30)
+    # Another speed, the same flight: the encoder's pictures are equal, too.
+    again = fly(*gated, options="&max_hz=60")
+    assert [frame.sequence for frame in again] == [frame.sequence for frame in frames]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(again, frames, strict=True))
