@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
+from pi_firmware.sources.faults import OPTIONS, Faults
 from pi_firmware.sources.live import LiveSource, caps
 from pi_firmware.sources.pattern import PATTERNS
 from pi_firmware.uri import Uri
@@ -54,10 +56,11 @@ class ClockSource(LiveSource):
     """
 
     def __init__(self, uri: Uri, camera: CameraSettings) -> None:
-        uri.only("pattern", "duration_s")
+        uri.only("pattern", "duration_s", *OPTIONS)
         uri.choice("pattern", "clock", PATTERNS)
         duration_s = uri.number("duration_s", 0.0, 0.0, 86_400.0)
-        self._frames = round(duration_s * camera.rate_hz) or None
+        self._faults = Faults(uri)
+        self._frames = self._faults.frames(duration_s, camera.rate_hz)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
         super().__init__(
@@ -65,6 +68,10 @@ class ClockSource(LiveSource):
             "appsrc name=source is-live=true format=time block=true max-bytes=0 max-buffers=2 "
             f'caps="{caps(camera, "I420")}"',
         )
+
+    def attach(self, pipeline: Any) -> None:
+        super().attach(pipeline)
+        self._faults.attach(pipeline)
 
     def start(self) -> None:
         self._thread.start()

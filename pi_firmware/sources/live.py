@@ -8,6 +8,8 @@ from typing import Any
 from pi_firmware import clocks, gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Stamp
+from pi_firmware.sources.shutter import Mark, to_middle_ns
+from pi_firmware.uri import Uri
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -20,18 +22,43 @@ def caps(camera: CameraSettings, formats: str = "{I420,NV12}") -> str:
     )
 
 
-class LiveSource:
-    """A GStreamer source named `source` that stamps each frame with its time of capture."""
+def readout_s(uri: Uri) -> float:
+    """The URI's `readout_s`: the rolling shutter's time from the first row to the last."""
+    return uri.number("readout_s", 0.0, 0.0, 1.0)
 
-    def __init__(self, camera: CameraSettings, elements: str) -> None:
+
+def post_error(element: Any, text: str) -> None:
+    """Ends the pipeline with an error of this element, as GStreamer's own would."""
+    gst = gstreamer.load()
+    from gi.repository import GLib
+
+    error = GLib.Error.new_literal(gst.resource_error_quark(), text, gst.ResourceError.READ)
+    element.post_message(gst.Message.new_error(element, error, text))
+
+
+class LiveSource:
+    """A GStreamer source named `source` that stamps each frame; `mark` tells which instant of it.
+
+    A source that knows more than this one of a frame's exposure says so in `told`.
+    """
+
+    def __init__(
+        self,
+        camera: CameraSettings,
+        elements: str,
+        *,
+        mark: Mark = Mark.MIDDLE,
+        readout_s: float = 0.0,
+    ) -> None:
         self.rate_hz = camera.rate_hz
         self.dmabuf = False
         self.cut_reason = ""
         self.error: BlimpError | None = None
-        self.exposure_s: float | None = None
-        self.gain: float | None = None
         self._camera = camera
         self._elements = elements
+        self._mark = mark
+        self._readout_s = readout_s
+        self._stamped = 0
         self._pipeline: Any = None
 
     def elements(self) -> str:
@@ -44,9 +71,15 @@ class LiveSource:
         """Nothing to do: it delivers from the moment the pipeline plays."""
 
     def stamp(self, running_ns: int) -> Stamp:
-        """Exposure and gain are told where the device confirmed fixed ones."""
-        captured_ns = clocks.wall_at(self._pipeline, running_ns)
-        return Stamp(captured_ns, captured_ns, self.exposure_s, self.gain)
+        self._stamped += 1
+        exposure_s, gain = self.told()
+        marked_ns = clocks.wall_at(self._pipeline, running_ns)
+        captured_ns = marked_ns + to_middle_ns(self._mark, exposure_s, self._readout_s)
+        return Stamp(captured_ns, captured_ns, exposure_s, gain)
+
+    def told(self) -> tuple[float | None, float | None]:
+        """Exposure, s, and gain of the frame at hand; None where the device does not tell."""
+        return None, None
 
     def explain(self, message: str) -> str:
         return message
@@ -59,10 +92,13 @@ class LiveSource:
     def close(self) -> None:
         self._pipeline = None
 
-    def _unavailable(self, name: str, message: str) -> str:
-        """The camera's refusal, which GStreamer words as an error of its data flow."""
+    def _unavailable(self, uri: Uri, message: str) -> str:
+        """What GStreamer words as an error of its data flow: a refusal, before the first frame."""
+        if self._stamped:
+            return f"camera.uri '{uri.text}': {message}"
         camera = self._camera
-        return (
-            f"{name} does not deliver {camera.width_px}x{camera.height_px} at"
+        self.error = self.error or uri.fail(
+            f"the camera does not deliver {camera.width_px}x{camera.height_px} at"
             f" {camera.rate_hz:g} Hz (camera.width_px, height_px, rate_hz): {message}"
         )
+        return str(self.error)

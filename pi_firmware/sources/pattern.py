@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
+from pi_firmware.sources.faults import OPTIONS, Faults
 from pi_firmware.sources.live import LiveSource, caps
 from pi_firmware.uri import Uri
 
@@ -11,18 +14,26 @@ PATTERNS = ("zone-plate", "smpte", "ball", "black", "snow", "clock")
 
 
 class PatternSource(LiveSource):
-    """GStreamer's test picture in real time; capture time is the payload's clock."""
+    """GStreamer's test picture in real time; capture time is the payload's clock.
+
+    With faults, `duration_s` counts from the first opening, as they do.
+    """
 
     def __init__(self, uri: Uri, camera: CameraSettings) -> None:
-        uri.only("pattern", "duration_s")
+        uri.only("pattern", "duration_s", *OPTIONS)
         if uri.path:
             raise uri.fail(f"takes no path, but options, not {uri.path!r}")
         pattern = uri.choice("pattern", "zone-plate", PATTERNS)
         duration_s = uri.number("duration_s", 0.0, 0.0, 86_400.0)
         gstreamer.require(("videotestsrc",), f"camera.uri '{uri.text}'")
-        frames = round(duration_s * camera.rate_hz) or -1
+        self._faults = Faults(uri)
+        frames = self._faults.frames(duration_s, camera.rate_hz) or -1
         super().__init__(
             camera,
             f"videotestsrc name=source is-live=true pattern={pattern} num-buffers={frames} "
             f"kx2=20 ky2=20 kt=1 ! {caps(camera, 'I420')}",
         )
+
+    def attach(self, pipeline: Any) -> None:
+        super().attach(pipeline)
+        self._faults.attach(pipeline)
