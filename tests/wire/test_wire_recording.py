@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import struct
 import tracemalloc
@@ -336,6 +338,35 @@ def test_a_recording_whose_writer_was_killed_is_read(tmp_path: Path) -> None:
     assert reader.cut and reader.cut_reason == "the file ends before its footer"
 
 
+def test_what_was_flushed_is_read_although_its_writer_was_killed(tmp_path: Path) -> None:
+    path, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    with RecordingWriter(path, chunk_bytes=1 << 20) as writer:
+        for k in range(10):
+            writer.write_json("/a", k, {"k": k}, schema_name="t")
+            if k % 3 == 0:
+                writer.flush()
+                writer.flush()  # nothing new: no empty chunk
+            copy.write_bytes(path.read_bytes())
+            assert [value["k"] for _, value in RecordingReader(copy).json("/a")] == list(
+                range(k - k % 3 + 1)
+            )
+    reader = RecordingReader(path)
+    assert reader.topics() == {"/a": 10} and not reader.cut
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None and len(summary.chunk_indexes) == 4
+
+
+def test_text_that_is_json_already_is_kept_as_it_is(tmp_path: Path) -> None:
+    path, said = tmp_path / "a.mcap", b'{"schema":"blimp.event/1.0", "x":1e3}'
+    with RecordingWriter(path) as writer:
+        writer.write_json_text("/a", 5, said, schema_name="blimp.event")
+        writer.write_json("/a", 6, {"x": 2}, schema_name="blimp.event")
+    reader = RecordingReader(path)
+    assert [message.data for _, message in reader.messages()] == [said, b'{"x":2}']
+    assert [value["x"] for _, value in reader.json("/a")] == [1000.0, 2]
+
+
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, flight: Path) -> None:
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "short.mcap").write_bytes(MAGIC[:5])
@@ -404,6 +435,15 @@ def test_a_full_disk_is_told_in_one_line() -> None:
     with pytest.raises(RecordingError):
         writer.close()
     writer.close()  # a second time: nothing
+
+
+def test_a_disk_that_is_full_from_the_start_is_told_in_one_line(tmp_path: Path) -> None:
+    class Full(io.BytesIO):
+        def write(self, data: Any) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(RecordingError, match=r"a\.mcap: No space left on device"):
+        RecordingWriter(tmp_path / "a.mcap", open_file=lambda path: Full())
 
 
 def test_long_recordings_are_written_and_read_in_constant_memory(tmp_path: Path) -> None:
