@@ -89,6 +89,7 @@ def open_session(
     certificates: str | Path = "",
     scout: str = "",
     discoverable: str = "",
+    client_timeout_s: float | None = None,
 ) -> Session:
     """Opens a session that listens and connects at these endpoints, and nowhere else.
 
@@ -101,6 +102,10 @@ def open_session(
     if it gets none the session is opened all the same and `scouting` is false: it will not look
     until it is opened anew.
 
+    With `client_timeout_s` it is a client: it has one link, to the first of `connect` that takes it
+    within that time, and whoever that is hands on what it says to its own peers. Otherwise it is a
+    peer, which speaks to those it is linked with and hands on nothing between them.
+
     A listening port 0 stands for any free one. A peer that is not there yet is tried again in the
     background. Raises `TelemetryError` with one line, for one when an endpoint is in use.
     """
@@ -109,18 +114,23 @@ def open_session(
     held = credentials.load(certificates) if str(certificates) else None
     for endpoint in connect:
         check_endpoint(endpoint, certified=held is not None)
-    found = _scouting(scout, discoverable, listen, certified=held is not None)
+    more = _scouting(scout, discoverable, listen, certified=held is not None)
+    scouting = bool(more)
+    if client_timeout_s is not None:
+        more |= {"mode": "client", "connect/timeout_ms": round(1000 * client_timeout_s)}
     for attempt in range(_ATTEMPTS):
         endpoints = [_with_port(endpoint, held is not None) for endpoint in listen]
         try:
-            config = session_config(endpoints, connect, held, found)
-            return Session(zenoh.open(config), tuple(endpoints), bool(found))
+            config = session_config(endpoints, connect, held, more)
+            return Session(zenoh.open(config), tuple(endpoints), scouting)
         except zenoh.ZError as error:
             in_use = "in use" in str(error)
             # Another program may take the free port between choosing and opening it.
             if in_use and endpoints != list(listen) and attempt + 1 < _ATTEMPTS:
                 continue
             reason = "the port is in use" if in_use else str(error).splitlines()[0][:160]
+            if "Unable to connect" in reason:
+                reason = "nobody is there, or takes this certificate"
             where = ", ".join([*endpoints, *connect]) or "no endpoint"
             raise TelemetryError(f"telemetry at {where}: {reason}") from None
     raise AssertionError("unreachable")
@@ -192,11 +202,11 @@ def session_config(
     listen: Sequence[str],
     connect: Sequence[str],
     held: credentials.Credentials | None = None,
-    scouting: Mapping[str, Any] = MappingProxyType({}),
+    more: Mapping[str, Any] = MappingProxyType({}),
 ) -> Any:
     """The `zenoh.Config` of a session that listens and connects at these endpoints only.
 
-    Unless `scouting` has Zenoh's settings for it, it neither looks for others nor can be found.
+    It is a peer that neither looks for others nor can be found, unless `more` settings say so.
     """
     import zenoh
 
@@ -211,7 +221,7 @@ def session_config(
         # On one host large payloads would silently go through /dev/shm, which may be small.
         "transport/shared_memory/enabled": False,
     }
-    settings |= scouting
+    settings |= more
     if held is not None:
         settings |= credentials.tls_settings(held)
     for name, value in settings.items():
