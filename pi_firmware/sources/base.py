@@ -10,7 +10,15 @@ from pi_firmware.wire.errors import BlimpError
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a frame was captured: the camera's time, the payload's clock at it, and the exposure."""
+    """When a frame was captured, and with what exposure.
+
+    `time_ns`, since 1970, is the middle of the exposure of the picture's middle row: the instant
+    whose pose the ground station estimates, from which it counts the other rows of a rolling
+    shutter. A live camera's timestamp is brought there by the sensor's readout and exposure, as far
+    as these are known (`shutter.to_middle_ns`); a recording's capture times are this already.
+    `clock_ns` is the payload's clock at that instant; in a replay, when the frame was handed over.
+    `exposure_s`, of each row, and `gain` are None where the device does not tell.
+    """
 
     time_ns: int
     clock_ns: int
@@ -32,7 +40,10 @@ class Source(Protocol):
     """Why a recording ended early, in words; empty when it did not."""
 
     error: BlimpError | None
-    """What ended the source, when it was not its end."""
+    """What ended the source for good, when it was not its end: opening it anew would not help.
+
+    None where the pipeline's error is one of the moment, as of a camera that was unplugged.
+    """
 
     dmabuf: bool
     """Whether the pictures are dmabufs, which a hardware encoder reads without a copy."""

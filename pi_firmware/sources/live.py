@@ -27,6 +27,16 @@ def readout_s(uri: Uri) -> float:
     return uri.number("readout_s", 0.0, 0.0, 1.0)
 
 
+def check_exposure(uri: Uri, camera: CameraSettings) -> None:
+    """Raises `SourceError` for a fixed exposure longer than a frame: no camera can keep both."""
+    frame_s = 1 / camera.rate_hz
+    if camera.exposure_s > frame_s:
+        raise uri.fail(
+            f"camera.exposure_s is {camera.exposure_s:g}; a frame lasts {frame_s:.4g} s at"
+            f" camera.rate_hz {camera.rate_hz:g}"
+        )
+
+
 def post_error(element: Any, text: str) -> None:
     """Ends the pipeline with an error of this element, as GStreamer's own would."""
     gst = gstreamer.load()

@@ -7,14 +7,22 @@ import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.live import LiveSource, caps
+from pi_firmware.sources.live import LiveSource, caps, check_exposure, readout_s
+from pi_firmware.sources.shutter import Mark
 from pi_firmware.uri import Uri
 
+_CAPABILITY = struct.Struct("=16s88x")
+_REQUEST_BUFFERS = struct.Struct("=IIIIB3x")
+_BUFFER = struct.Struct("IIIIIlliiiiIILIIi0l")  # before 2038 on 32 bits; a kernel takes either
 _QUERYCTRL = struct.Struct("=II32siiiiI8x")
 _CONTROL = struct.Struct("=Ii")
+VIDIOC_QUERYCAP = 0x80685600
+VIDIOC_REQBUFS = 0xC0145608
+VIDIOC_QUERYBUF = 0xC0005609 | _BUFFER.size << 16
 VIDIOC_QUERYCTRL = 0xC0445624
 VIDIOC_G_CTRL = 0xC008561B
 VIDIOC_S_CTRL = 0xC008561C
@@ -29,6 +37,11 @@ _EXPOSURE_MAY_SLOW = 0x009A0903
 _FOCUS = 0x009A090A
 _FOCUS_AUTO = 0x009A090C
 _MANUAL_EXPOSURE = 1
+
+_VIDEO_CAPTURE = _MMAP = 1
+_TIMESTAMP_SOURCE = 0x00070000
+_START_OF_EXPOSURE = 0x00010000
+_UVC_TIMES = "/sys/module/uvcvideo/parameters/hwtimestamps"
 
 _LIGHT_K = {"incandescent": 2800, "fluorescent": 4200, "daylight": 5500, "cloudy": 6500}
 """Usual colour temperatures of the lights, as photographers' tables have them."""
@@ -88,40 +101,88 @@ def apply(wish: Wish, file: int, ioctl: Ioctl = fcntl.ioctl) -> str:
     return ""
 
 
+def timestamp_mark(file: int, ioctl: Ioctl = fcntl.ioctl, uvc_times: str = _UVC_TIMES) -> Mark:
+    """Which instant of a frame the driver's timestamps mark; `MIDDLE` when it does not tell.
+
+    A buffer's flags say so; one is asked for and given back. The driver of USB cameras claims the
+    start of exposure, but unless its parameter `hwtimestamps` is set it takes the time at which a
+    frame's first packet arrives.
+    """
+    capability = bytearray(_CAPABILITY.size)
+    request = bytearray(_REQUEST_BUFFERS.pack(1, _VIDEO_CAPTURE, _MMAP, 0, 0))
+    buffer = bytearray(_BUFFER.size)
+    struct.pack_into("=II", buffer, 0, 0, _VIDEO_CAPTURE)
+    try:
+        ioctl(file, VIDIOC_QUERYCAP, capability)
+        ioctl(file, VIDIOC_REQBUFS, request)
+        try:
+            ioctl(file, VIDIOC_QUERYBUF, buffer)
+        finally:
+            none = bytearray(_REQUEST_BUFFERS.pack(0, _VIDEO_CAPTURE, _MMAP, 0, 0))
+            ioctl(file, VIDIOC_REQBUFS, none)
+    except OSError:
+        return Mark.MIDDLE
+    flags = struct.unpack_from("=I", buffer, 12)[0]
+    if flags & _TIMESTAMP_SOURCE != _START_OF_EXPOSURE:
+        return Mark.READOUT_END
+    driver = _CAPABILITY.unpack(capability)[0].rstrip(b"\0")
+    if driver == b"uvcvideo" and not _is_set(uvc_times):
+        return Mark.READOUT_START
+    return Mark.EXPOSURE_START
+
+
+def _is_set(parameter: str) -> bool:
+    """Whether a kernel module's parameter is anything but off."""
+    try:
+        text = Path(parameter).read_text().strip()
+    except OSError:
+        return False
+    return text not in ("", "0", "N")
+
+
 class V4l2Source(LiveSource):
-    """A V4L2 device; frames carry the driver's timestamps. Raises `SourceError` when it refuses."""
+    """A V4L2 device; frames carry the driver's timestamps. Raises `SourceError` when it refuses.
+
+    Which exposure an automatic has taken V4L2 does not tell frame by frame: then none is claimed.
+    """
 
     def __init__(self, uri: Uri, camera: CameraSettings) -> None:
-        uri.only("focus")
+        uri.only("focus", "readout_s")
         if not uri.path.startswith("/dev/"):
             raise uri.fail("expected v4l2:/dev/videoN")
         if camera.focus_m > 0:
             raise uri.fail("camera.focus_m: V4L2 knows no metres; give focus=N in the URI")
+        check_exposure(uri, camera)
         gstreamer.require(("v4l2src",), f"camera.uri '{uri.text}'")
         focus = int(uri.number("focus", -1, 0, 65_535)) if "focus" in uri.options else None
+        rows_s = readout_s(uri)
         self._uri = uri
-        self._set_controls(camera, focus)
+        mark = self._set_up(camera, focus)
         # Many USB cameras have YUY2 only; where the formats agree, nothing is converted.
         sized = caps(camera, "{I420,NV12,YUY2,UYVY}")
         super().__init__(
             camera,
             f"v4l2src name=source ! {sized} ! videoconvert n-threads=1 "
             "! video/x-raw,format=(string){I420,NV12}",
+            mark=mark,
+            readout_s=rows_s,
         )
-        # What was set was read back.
-        self.exposure_s = camera.exposure_s or None
-        self.gain = camera.gain or None
 
     def attach(self, pipeline: object) -> None:
         super().attach(pipeline)
         self._pipeline.get_by_name("source").set_property("device", self._uri.path)
 
+    def told(self) -> tuple[float | None, float | None]:
+        """The fixed exposure and gain, which were read back when they were set."""
+        return self._camera.exposure_s or None, self._camera.gain or None
+
     def explain(self, message: str) -> str:
         if "negotiat" in message or "data stream error" in message:
-            return self._unavailable(f"camera.uri '{self._uri.text}'", message)
+            return self._unavailable(self._uri, message)
         return message
 
-    def _set_controls(self, camera: CameraSettings, focus: int | None) -> None:
+    def _set_up(self, camera: CameraSettings, focus: int | None) -> Mark:
+        """Sets the controls; returns what the device's timestamps mark."""
         try:
             file = os.open(self._uri.path, os.O_RDWR | os.O_NONBLOCK)
         except OSError as error:
@@ -131,5 +192,6 @@ class V4l2Source(LiveSource):
                 refusal = apply(wish, file)
                 if refusal:
                     raise self._uri.fail(refusal)
+            return timestamp_mark(file)
         finally:
             os.close(file)

@@ -1,21 +1,15 @@
 """Cameras: what is asked of a device is verified, and times of capture are true at the receiver."""
 
 import errno
-import os
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ground_station.stream.receiver import Receiver
 from pi_firmware.settings import CameraSettings, load
-from pi_firmware.sources import clock, libcamera, v4l2
-
-ROOT = Path(__file__).parents[2]
-VIRTUAL = ROOT / "out" / "virtual_camera"
+from pi_firmware.sources import clock, v4l2
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (64, 64)])
@@ -114,17 +108,6 @@ def test_a_refusal_names_the_key_and_the_devices_range() -> None:
     assert "camera.white_balance: the device has no such control" in refusals(bare, FIXED)
 
 
-def test_what_the_configuration_fixes_is_asked_of_libcamera() -> None:
-    asked = libcamera.controls(CameraSettings(exposure_s=0.008, gain=2.0, focus_m=4.0))
-    assert {name: value for name, (_, value) in asked.items()} == {
-        "exposure-time": 8000, "analogue-gain": 2.0, "ae-enable": False,
-        "af-mode": "manual", "lens-position": 0.25,
-    }  # fmt: skip
-    assert libcamera.controls(CameraSettings()) == {}
-    cloudy = libcamera.controls(CameraSettings(white_balance="cloudy"))
-    assert cloudy == {"awb-mode": ("camera.white_balance", "cloudy")}
-
-
 @pytest.mark.parametrize(
     ("key", "named"),
     [
@@ -139,52 +122,3 @@ def test_a_bad_camera_setting_is_named(key: str, named: str) -> None:
     with pytest.raises(Exception, match=named) as caught:
         load(None, [key])
     assert "\n" not in str(caught.value)
-
-
-def fly_virtual_camera(port: int, *settings: str) -> subprocess.Popen[str]:
-    """The payload in the Debian 13 whose libcamera has a virtual camera."""
-    if not (VIRTUAL / ".stamp").exists():
-        pytest.skip("out/virtual_camera is missing: run `make virtual-camera` (as root)")
-    if os.geteuid() != 0:
-        pytest.skip("the virtual camera runs in a root file system of its own: only as root")
-    program = VIRTUAL / "root" / "opt" / "blimp" / "pi_firmware"
-    shutil.rmtree(program, ignore_errors=True)
-    ignore = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "pi_firmware", program, ignore=ignore)
-    command = [
-        "chroot", str(VIRTUAL / "root"), "env", "-i", "PATH=/usr/bin:/bin", "PYTHONPATH=/opt/blimp",
-        "LD_PRELOAD=/usr/local/lib/dma_buffers.so", "LIBCAMERA_LOG_LEVELS=*:ERROR",
-        "/usr/bin/python3", "-m", "pi_firmware",
-    ]  # fmt: skip
-    for setting in (f"link.port={port}", "telemetry.enabled=false", *settings):
-        command += ["--set", setting]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def test_a_libcamera_flies_with_its_sensors_times() -> None:
-    with Receiver(0, queue_frames=200) as receiver:
-        process = fly_virtual_camera(receiver.port, "camera.uri=libcamera:", "gate.enabled=false")
-        frames = [frame for _ in range(60) if (frame := receiver.get(20.0))]
-        process.terminate()
-        out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    assert [frame.sequence for frame in frames] == list(range(60)), out
-    assert frames[0].image.shape == (480, 640) and frames[0].image.std() > 10
-    gaps_ms = np.diff([frame.time_ns for frame in frames]) / 1e6
-    assert gaps_ms.min() > 0 and np.median(gaps_ms) == pytest.approx(1000 / 30, abs=1)
-    assert all(frame.time_ns < frame.arrival_ns < frame.time_ns + 10**9 for frame in frames)
-    assert frames[0].exposure_s is None  # libcamerasrc does not tell
-
-
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        (["camera.uri=libcamera:none"], "libcamera has no such camera"),
-        (["camera.uri=libcamera:", "camera.width_px=320"], "does not deliver 320x480 at 30 Hz"),
-    ],
-)
-def test_what_a_libcamera_refuses_is_one_line(settings: list[str], named: str) -> None:
-    process = fly_virtual_camera(9, *settings)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 2
-    assert err.count("\n") == 1 and named in err

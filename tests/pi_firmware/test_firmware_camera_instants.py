@@ -1,0 +1,103 @@
+"""Which instant of a frame a camera stamps, and that ours is the middle row's middle."""
+
+import errno
+import struct
+from pathlib import Path
+
+import pytest
+
+from pi_firmware import clocks
+from pi_firmware.settings import CameraSettings
+from pi_firmware.sources import v4l2
+from pi_firmware.sources.live import LiveSource
+from pi_firmware.sources.shutter import Mark, to_middle_ns
+
+_SOE, _EOF = 0x00010000, 0
+_MONOTONIC = 0x00002000
+
+
+@pytest.mark.parametrize(
+    ("mark", "expected_ms"),
+    [
+        # Rows 20 ms from first to last, each exposed for 8 ms.
+        (Mark.EXPOSURE_START, 10 + 4),
+        (Mark.READOUT_START, 10 - 4),
+        (Mark.READOUT_END, -10 - 4),
+        (Mark.MIDDLE, 0),
+    ],
+)
+def test_every_mark_leads_to_the_middle_of_the_middle_row(mark: Mark, expected_ms: float) -> None:
+    assert to_middle_ns(mark, 0.008, 0.020) == expected_ms * 1_000_000
+
+
+def test_the_marks_of_one_frame_lead_to_one_instant() -> None:
+    exposure_s, readout_s, start_ns = 0.0113, 0.0187, 10**18
+    read_ns = start_ns + round(exposure_s * 1e9)
+    end_ns = read_ns + round(readout_s * 1e9)
+    middles = [
+        at_ns + to_middle_ns(mark, exposure_s, readout_s)
+        for mark, at_ns in (
+            (Mark.EXPOSURE_START, start_ns),
+            (Mark.READOUT_START, read_ns),
+            (Mark.READOUT_END, end_ns),
+        )
+    ]
+    assert max(middles) - min(middles) <= 1
+
+
+def test_an_unknown_exposure_counts_as_none_and_a_global_shutter_has_no_readout() -> None:
+    assert to_middle_ns(Mark.READOUT_START, None, 0.020) == 10_000_000
+    assert to_middle_ns(Mark.EXPOSURE_START, 0.008, 0.0) == 4_000_000
+
+
+def test_a_live_sources_stamp_is_brought_to_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clocks, "wall_at", lambda *_: 10**18)
+    source = LiveSource(CameraSettings(), "", mark=Mark.READOUT_END, readout_s=0.016)
+    stamp = source.stamp(0)
+    assert stamp.time_ns == stamp.clock_ns == 10**18 - 8_000_000
+    assert (stamp.exposure_s, stamp.gain) == (None, None)
+
+
+class Buffers:
+    """A V4L2 device's driver name and the flags of its buffers, behind its ioctls."""
+
+    def __init__(self, driver: bytes, flags: int, *, busy: bool = False) -> None:
+        self.driver, self.flags, self.busy, self.held = driver, flags, busy, 0
+
+    def ioctl(self, file: int, request: int, data: bytearray) -> None:
+        if request == v4l2.VIDIOC_QUERYCAP:
+            data[: len(self.driver)] = self.driver
+        elif request == v4l2.VIDIOC_REQBUFS:
+            if self.busy:
+                raise OSError(errno.EBUSY, "Device or resource busy")
+            self.held = struct.unpack_from("=I", data)[0]
+        else:
+            assert request == v4l2.VIDIOC_QUERYBUF and self.held == 1
+            struct.pack_into("=I", data, 12, self.flags)
+
+
+@pytest.mark.parametrize(
+    ("driver", "flags", "uvc_times", "expected"),
+    [
+        (b"vivid", _MONOTONIC | _SOE, None, Mark.EXPOSURE_START),
+        (b"unicam", _MONOTONIC | _EOF, None, Mark.READOUT_END),
+        # USB cameras' driver claims the start of exposure whatever it stamps.
+        (b"uvcvideo", _MONOTONIC | _SOE, "0", Mark.READOUT_START),
+        (b"uvcvideo", _MONOTONIC | _SOE, None, Mark.READOUT_START),
+        (b"uvcvideo", _MONOTONIC | _SOE, "1", Mark.EXPOSURE_START),
+    ],
+)
+def test_a_v4l2_device_is_asked_what_its_times_mark(
+    tmp_path: Path, driver: bytes, flags: int, uvc_times: str | None, expected: Mark
+) -> None:
+    parameter = tmp_path / "hwtimestamps"
+    if uvc_times is not None:
+        parameter.write_text(f"{uvc_times}\n")
+    device = Buffers(driver, flags)
+    assert v4l2.timestamp_mark(0, device.ioctl, str(parameter)) is expected
+    assert device.held == 0
+
+
+def test_a_v4l2_device_that_does_not_tell_is_not_corrected() -> None:
+    device = Buffers(b"vivid", _SOE, busy=True)
+    assert v4l2.timestamp_mark(0, device.ioctl) is Mark.MIDDLE
