@@ -1,0 +1,201 @@
+"""Off loopback nobody sees or forges the video: the payload's link with its key, and without."""
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from numbered_flight import GOP, capture_ns, encoded, number_in, stamped, start_payload
+
+from ground_station.stream import rtp
+from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.srtp import Unprotector
+from pi_firmware.link import Link, load_key
+from pi_firmware.settings import LinkSettings
+from pi_firmware.wire import annexb, sei
+from pi_firmware.wire.errors import StreamError
+
+KEY = bytes(range(30))
+FRAMES = 30
+LIMIT_S = 30.0
+
+
+class Eavesdropper:
+    """Relays datagrams to another port of this machine and keeps them; a context manager."""
+
+    def __init__(self, to_port: int) -> None:
+        self.heard: list[bytes] = []
+        self._to = ("127.0.0.1", to_port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self.port = self._socket.getsockname()[1]
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> "Eavesdropper":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                datagram = self._socket.recv(65535)
+            except TimeoutError:
+                continue
+            self.heard.append(datagram)
+            self._socket.sendto(datagram, self._to)
+
+
+def take(receiver: Receiver, count: int) -> list[ReceivedFrame]:
+    deadline = time.monotonic() + LIMIT_S
+    frames: list[ReceivedFrame] = []
+    while len(frames) < count and time.monotonic() < deadline:
+        if (frame := receiver.get(0.1)) is not None:
+            frames.append(frame)
+    return frames
+
+
+def assert_secret(heard: list[bytes], key: bytes) -> None:
+    """Nothing of what the packets carry can be read in them, though the key opens them all."""
+    unprotector = Unprotector({"blimp-1": key})
+    stamps = starts = 0
+    for datagram in heard:
+        plain = unprotector.unprotect(datagram)
+        assert plain is not None
+        packet = rtp.parse(plain, 0)
+        assert packet is not None
+        payload = packet.payload
+        stamps += sei.UUID in payload
+        starts += payload[0] & 0x1F in (annexb.NAL_SPS, annexb.NAL_IDR)
+        assert sei.UUID not in datagram
+        assert len(payload) < 8 or payload not in datagram
+        assert len(payload) < 64 or not any(
+            payload[at : at + 16] in datagram for at in range(0, len(payload) - 16, 16)
+        )
+    assert stamps > 0 and starts > 0
+
+
+@pytest.mark.parametrize("mtu_bytes", [200, 1400])
+def test_a_link_with_a_key_sends_srtp_within_its_mtu(mtu_bytes: int) -> None:
+    with (
+        Receiver(0, queue_frames=FRAMES, srtp_keys={"blimp-1": KEY}) as receiver,
+        Eavesdropper(receiver.port) as air,
+    ):
+        link = Link(LinkSettings(port=air.port, mtu_bytes=mtu_bytes), 77, KEY)
+        link.start()
+        for index, unit in enumerate(encoded(FRAMES)):
+            assert link.send(stamped(unit, index), capture_ns(index), idr=index % GOP == 0)
+            assert [number_in(frame.image) for frame in take(receiver, 1)] == [index]
+        assert link.flush()
+        link.stop()
+        assert (receiver.ssrc, receiver.payload_id) == (77, "blimp-1")
+        heard = list(air.heard)
+    assert mtu_bytes - 2 <= max(map(len, heard)) <= mtu_bytes
+    assert_secret(heard, KEY)
+
+
+def test_a_receiver_joins_a_link_whose_sequence_numbers_began_anew() -> None:
+    unit = stamped(encoded(FRAMES)[0], 0)
+    with Eavesdropper(9) as air:
+        link = Link(LinkSettings(port=air.port, mtu_bytes=200), 77, KEY)
+        link.start()
+        deadline = time.monotonic() + LIMIT_S
+        index = checked = 0
+        wrapped = False
+        while not (wrapped and len(air.heard) > checked + 20):
+            assert time.monotonic() < deadline
+            if not link.send(unit, capture_ns(index), idr=True):
+                time.sleep(0.001)  # the link's queue is full
+                continue
+            index += 1
+            while not wrapped and checked + 1 < len(air.heard):
+                before, after = (int.from_bytes(air.heard[checked + n][2:4]) for n in (0, 1))
+                wrapped = after < before
+                checked += 1
+        link.flush()
+        link.stop()
+        late = air.heard[checked + 1 :]
+    unprotector = Unprotector({"blimp-1": KEY})
+    assert all(unprotector.unprotect(datagram) is not None for datagram in late)
+    assert unprotector.tags_searched == 2  # it was the second counter
+
+
+@pytest.mark.parametrize(
+    ("host", "encrypted", "key", "allowed"),
+    [
+        ("127.0.0.1", True, None, True),
+        ("::1", True, None, True),
+        ("localhost", True, None, True),
+        ("192.0.2.1", True, None, False),
+        ("0.0.0.0", True, None, False),
+        ("255.255.255.255", True, None, False),
+        ("no.such.host.invalid", True, None, False),
+        ("192.0.2.1", True, KEY, True),
+        ("192.0.2.1", False, None, True),
+        ("192.0.2.1", False, KEY, True),
+        ("no.such.host.invalid", True, KEY, True),
+        ("auto", True, None, True),
+    ],
+)
+def test_without_a_key_video_goes_to_loopback_only(
+    host: str, encrypted: bool, key: bytes | None, allowed: bool
+) -> None:
+    settings = LinkSettings(host=host, encrypted=encrypted)
+    if allowed:
+        Link(settings, 77, key).stop()
+        return
+    with pytest.raises(StreamError) as caught:
+        Link(settings, 77, key)
+    text = str(caught.value)
+    assert "\n" not in text and f"'{host}'" in text
+    assert "'blimp keys payload'" in text and "link.encrypted = false" in text
+
+
+@pytest.mark.parametrize(("key", "followed"), [(None, False), (KEY, True)])
+def test_a_ground_station_that_was_found_is_not_sent_plain_video(
+    key: bytes | None, followed: bool
+) -> None:
+    link = Link(LinkSettings(host="auto"), 77, key)
+    assert link.redirect("127.0.0.1", 5600) and link.destination == ("127.0.0.1", 5600)
+    assert link.redirect("192.0.2.1", 5600) is followed
+    assert link.destination == (("192.0.2.1", 5600) if followed else None)
+    assert ("no SRTP key" in link.problem) is not followed
+    assert link.redirect("127.0.0.1", 5601) and not link.problem
+    link.stop()
+
+
+def test_a_stream_id_is_not_used_twice_with_one_key() -> None:
+    with pytest.raises(StreamError, match=r"link.ssrc is 5; with SRTP it must be 0"):
+        Link(LinkSettings(ssrc=5), 5, KEY)
+    Link(LinkSettings(ssrc=5, encrypted=False), 5, KEY).stop()
+
+
+def test_the_payloads_key_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    assert load_key("") is None
+    with pytest.raises(StreamError, match=r"srtp\.key: No such file or directory$"):
+        load_key(str(tmp_path))
+    path = tmp_path / "srtp.key"
+    for content, reason in (("zz" * 30, "not hexadecimal digits"), ("00" * 29, "29 bytes")):
+        path.write_text(content)
+        with pytest.raises(StreamError, match=reason) as caught:
+            load_key(str(tmp_path))
+        assert "\n" not in str(caught.value) and content not in str(caught.value)
+    path.write_text(KEY.hex().upper() + "\r\n")
+    assert load_key(str(tmp_path)) == KEY
+
+
+def test_a_program_without_a_key_refuses_the_open_air(flight: Path) -> None:
+    process = start_payload(
+        f"camera.uri=replay:{flight}", "telemetry.enabled=false", "link.host=192.0.2.1"
+    )
+    _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2
+    assert err.count("\n") == 1 and "'192.0.2.1': no SRTP key" in err
