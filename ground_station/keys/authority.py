@@ -120,15 +120,25 @@ class Authority:
         return self.folder.joinpath(*name.split(".", 1))
 
     def check(self, now: datetime.datetime, soon_days: int = 30) -> list[str]:
-        """What is wrong, one line each: missing or open files, wrong or ending certificates."""
+        """What is wrong, one line each: missing or open files, wrong or ending certificates.
+
+        Also a private key that is not its certificate's, the authorities' own among them.
+        """
         problems = []
+        for number in self.trusted:
+            try:
+                certificates.check_key(self._pair(number))
+            except KeysError as error:
+                problems.append(f"authority {number}: {error}")
         for name in self.live():
             try:
                 held = credentials.load(self.of(name))
+                certificate = (held.folder / credentials.CERTIFICATE).read_bytes()
                 common, until = certificates.inspect(
-                    (held.folder / credentials.CERTIFICATE).read_bytes(),
-                    (held.folder / credentials.AUTHORITIES).read_bytes(),
+                    certificate, (held.folder / credentials.AUTHORITIES).read_bytes()
                 )
+                key = (held.folder / credentials.KEY).read_bytes()
+                certificates.check_key(Pair(certificate, key))
             except (credentials.TelemetryError, KeysError, OSError) as error:
                 problems.append(f"{name}: {error}")
                 continue

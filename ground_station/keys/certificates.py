@@ -12,6 +12,7 @@ import secrets
 from dataclasses import dataclass
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -76,6 +77,18 @@ def inspect(certificate: bytes, authorities: bytes) -> tuple[str, datetime.datet
             continue
         return str(name), read.not_valid_after_utc
     raise KeysError("none of the trusted authorities signed it")
+
+
+def check_key(pair: Pair) -> None:
+    """Raises `KeysError` when the private key is not the one that the certificate was made for."""
+    spki = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+    try:
+        certified = x509.load_pem_x509_certificate(pair.certificate).public_key()
+        private = serialization.load_pem_private_key(pair.key, None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise KeysError("its key or certificate is not readable PEM") from None
+    if private.public_key().public_bytes(*spki) != certified.public_bytes(*spki):
+        raise KeysError("the private key is not the certificate's")
 
 
 def make_srtp_key() -> bytes:

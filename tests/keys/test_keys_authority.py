@@ -111,6 +111,24 @@ def test_check_finds_what_is_wrong(authority: Authority) -> None:
     assert "ends on" in "\n".join(authority.check(NOW + datetime.timedelta(days=720)))
 
 
+def test_check_finds_a_key_that_is_not_the_certificates(authority: Authority) -> None:
+    one, two = authority.of("payload.blimp-1"), authority.of("payload.blimp-2")
+    swapped = (one / "key.pem").read_bytes()
+    write_private(one / "key.pem", (two / "key.pem").read_bytes(), replace=True)
+    assert authority.check(NOW) == [
+        "payload.blimp-1: the private key is not the certificate's",
+    ]
+    for body in (b"", b"-----BEGIN PRIVATE KEY-----\n!\n-----END PRIVATE KEY-----\n", b"\xff"):
+        write_private(one / "key.pem", body, replace=True)
+        assert authority.check(NOW) == [
+            "payload.blimp-1: its key or certificate is not readable PEM"
+        ]
+    write_private(one / "key.pem", swapped, replace=True)
+    assert authority.check(NOW) == []
+    write_private(authority.folder / "authorities" / "1.key", swapped, replace=True)
+    assert authority.check(NOW) == ["authority 1: the private key is not the certificate's"]
+
+
 @pytest.mark.parametrize("body", [b"", b"\xff", b"[]", b"{}", b'{"schema": 3}', b"[" * 9999])
 def test_a_hostile_folder_is_one_line(authority: Authority, body: bytes) -> None:
     (authority.folder / "authority.json").write_bytes(body)
