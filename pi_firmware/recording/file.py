@@ -72,9 +72,11 @@ class DurableFile:
         """Nothing is held back."""
 
     def sync(self) -> None:
-        """Waits until the card has it."""
+        """Waits until the card has it; a file that somebody deleted is no place for more."""
         try:
             os.fdatasync(self._handle)
+            if os.fstat(self._handle).st_nlink == 0:
+                raise OSError(errno.ENOENT, "deleted while it was written")
         except OSError as error:  # the system forgets what it could not write: no second chance
             self._failure = error
             raise

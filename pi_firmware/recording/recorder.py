@@ -159,6 +159,7 @@ class Recorder:
         if self._latest is not None:
             self._left_out += self._latest.left_out
         self._latest = self._run = run
+        run.go()
         return run
 
     def _tell(self, name: str, text: str) -> None:

@@ -71,6 +71,7 @@ class Run:
         self._asked_s = float("-inf")
         self._refused: str | None = None
         self._opened, self._closed = threading.Event(), threading.Event()
+        self._go = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -91,6 +92,10 @@ class Run:
             self._thread.join()
             raise RecordingError(self._refused)
 
+    def go(self) -> None:
+        """Lets it write: whoever began it is ready for its end."""
+        self._go.set()
+
     def end(self, limit_s: float) -> bool:
         """Ends the file; whether that was done within the limit.
 
@@ -106,6 +111,7 @@ class Run:
         """Ends it without waiting, and tells nothing of it any more."""
         self._given_up = True
         self.intake.close()
+        self._go.set()
 
     def is_alive(self) -> bool:
         """Whether its thread still runs: it hangs on a disk when `end` was not done."""
@@ -116,6 +122,7 @@ class Run:
         try:
             self._file = self._next_file()
             self._opened.set()
+            self._go.wait()
             self._write()
         except RecordingError as error:
             reason = str(error)

@@ -409,3 +409,23 @@ def test_the_next_file_cannot_be_opened(tmp_path: Path) -> None:
         f"flight-000001.mcap: {len(kept)} frames; "
         f"{tmp_path / 'flight-000002.mcap'}: Permission denied"
     )
+
+
+def test_a_file_deleted_under_its_writer_ends_the_recording(tmp_path: Path) -> None:
+    """Its bytes would else fill the card, and nobody could see or read them."""
+    events = Events()
+    made = recorder(tmp_path, events, sync_s=0.1)
+    made.start()
+    feed(made, range(10))
+    (tmp_path / "flight-000001.mcap").unlink()
+    given = 10
+    while made.file:
+        feed(made, [given])
+        given += 1
+        time.sleep(0.005)
+    eventually(lambda: len(events.told) > 1)
+    assert events.told[-1][1].endswith("flight-000001.mcap: deleted while it was written")
+    shutil.rmtree(tmp_path)
+    assert made.start() == "flight-000001.mcap"  # a folder that vanished is made again
+    made.close()
+    assert not is_cut(tmp_path / "flight-000001.mcap")
