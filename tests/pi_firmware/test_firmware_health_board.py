@@ -128,6 +128,16 @@ def test_a_zone_that_fails_or_lies_is_left_out(zero_w: Path) -> None:
     assert board.read().temperature_C == 0.0, "cold, and told again after a time of silence"
 
 
+def test_a_zone_whose_driver_is_loaded_anew_is_found_again(zero_w: Path) -> None:
+    board = Board(zero_w)
+    assert board.read().temperature_C == 51.54
+    thermal = zero_w / "sys/class/thermal"
+    (thermal / "thermal_zone0/temp").unlink()
+    (thermal / "thermal_zone1").rename(thermal / "thermal_zone4")
+    assert board.read().temperature_C is None
+    assert board.read().temperature_C == 51.54
+
+
 def test_an_empty_tree_and_a_disk_that_is_not_there_are_none(tmp_path: Path) -> None:
     assert Board(tmp_path, disk=tmp_path / "absent").read() == BoardState()
     assert Board(tmp_path / "absent").read() == BoardState()

@@ -235,6 +235,21 @@ def test_a_radio_left_switched_off_is_switched_on_with_growing_pauses(root: Path
     assert rig.wifi.state.restarts == 0
 
 
+def test_a_ground_heard_within_a_restart_begins_the_pauses_anew(root: Path) -> None:
+    rig = Rig(root)
+    obey = rig.run
+
+    def hears(words: list[str]) -> str:
+        if words[-1] == "up":
+            rig.now_s += 2.0
+            rig.wifi.heard()
+        return obey(words)
+
+    rig.wifi._run = hears
+    rig.wifi.heard()
+    assert rig.restarts(60) == [20, 40, 60]
+
+
 def test_where_restarts_are_not_wanted_nothing_is_switched_on(root: Path) -> None:
     (root / "sys/class/net/wlan0/flags").write_text(DOWN)
     rig = Rig(root, restart_after_s=0.0)
