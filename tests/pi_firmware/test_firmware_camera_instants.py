@@ -80,7 +80,7 @@ class Buffers:
     ("driver", "flags", "uvc_times", "expected"),
     [
         (b"vivid", _MONOTONIC | _SOE, None, Mark.EXPOSURE_START),
-        (b"unicam", _MONOTONIC | _EOF, None, Mark.READOUT_END),
+        (b"capture", _MONOTONIC | _EOF, None, Mark.READOUT_END),
         # USB cameras' driver claims the start of exposure whatever it stamps.
         (b"uvcvideo", _MONOTONIC | _SOE, "0", Mark.READOUT_START),
         (b"uvcvideo", _MONOTONIC | _SOE, None, Mark.READOUT_START),
