@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,6 +16,13 @@ from pathlib import Path
 LIMIT_S = 30.0
 STOP_S = 5.0
 _COUNTS = re.compile(r"(\d+) (captured|gated|sent|discarded)")
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    """A port on which nobody listens now."""
+    with socket.socket(socket.AF_INET, kind) as tried:
+        tried.bind(("127.0.0.1", 0))
+        return int(tried.getsockname()[1])
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,10 @@ from pathlib import Path
 
 from flight import FRESH_S, ROUND, SMALL_FRAMES, Flight
 from ground import Ground, GroundProcess
-from payload_process import PayloadProcess
+from payload_process import PayloadProcess, free_port
 
 GONE_S = 10.0
 TELEMETRY_S = 20.0  # it is tried again ever more seldom
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    """A port on which nobody listens now."""
-    with socket.socket(socket.AF_INET, kind) as tried:
-        tried.bind(("127.0.0.1", 0))
-        return int(tried.getsockname()[1])
 
 
 def test_a_link_that_was_gone_for_ten_seconds(recording: Path, tmp_path: Path) -> None:
