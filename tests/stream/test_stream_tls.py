@@ -1,19 +1,24 @@
 """With certificates only those on the list are heard, each under its own keys only."""
 
+import datetime
+import json
+import shutil
 import threading
 import time
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from ground_station.keys.authority import Authority
+from ground_station.keys.certificates import Pair, make_certificate
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.clock_offset import ask
 from pi_firmware.wire.errors import TelemetryError
-from pi_firmware.wire.telemetry import Session, check_endpoint, open_session
+from pi_firmware.wire.telemetry import Session, check_endpoint, open_session, session_config
 
 LIMIT_S = 20.0
 PATIENCE_S = 1.5
@@ -120,6 +125,68 @@ def test_a_revoked_payload_is_refused(tmp_path: Path) -> None:
         session = open_session(connect=listener.endpoints, certificates=stolen)
         assert not heard(listener, session, "blimp-1", PATIENCE_S)
         assert listener.payloads() == []
+
+
+def certify(authority: Authority, name: str, to: Path, lasts: datetime.timedelta) -> Path:
+    """A copy of a member's folder whose certificate, of the same authority, ends then."""
+    shutil.copytree(authority.of(name), to)
+    signer = authority.folder / "authorities"
+    pair = make_certificate(
+        name,
+        Pair((signer / "1.pem").read_bytes(), (signer / "1.key").read_bytes()),
+        (datetime.datetime.now(datetime.UTC) + lasts).replace(microsecond=0),
+    )
+    (to / "certificate.pem").write_bytes(pair.certificate)
+    (to / "key.pem").write_bytes(pair.key)
+    return to
+
+
+@pytest.mark.parametrize("expired", ["payload.blimp-1", "ground.main"])
+def test_an_expired_certificate_is_refused(
+    authority: Authority, tmp_path: Path, expired: str
+) -> None:
+    for days, expected, wait_s in ((1, True, LIMIT_S), (-1, False, 2 * PATIENCE_S)):
+        lasts = datetime.timedelta(days=days)
+        folders = {name: authority.of(name) for name in ("payload.blimp-1", "ground.main")}
+        folders[expired] = certify(authority, expired, tmp_path / f"{expired}{days}", lasts)
+        with TelemetryListener([FREE], certificates=folders["ground.main"]) as listener:
+            session = open_session(
+                connect=listener.endpoints, certificates=folders["payload.blimp-1"]
+            )
+            assert heard(listener, session, "blimp-1", wait_s) is expected
+            assert bool(listener.payloads()) is expected
+
+
+def test_a_link_ends_with_its_certificate(authority: Authority, tmp_path: Path) -> None:
+    lasts = datetime.timedelta(seconds=10)
+    ending = certify(authority, "payload.blimp-1", tmp_path / "ending", lasts)
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        settings = TelemetrySettings(connect=list(listener.endpoints), certificates=str(ending))
+        telemetry = Telemetry("blimp-1", settings)
+        assert listener.wait("blimp-1", lambda s: s.alive, LIMIT_S)
+        assert listener.wait("blimp-1", lambda s: not s.alive, 2 * LIMIT_S)
+        telemetry.close()
+
+
+@pytest.mark.parametrize("certified", [True, False])
+def test_a_client_without_a_certificate_is_refused(authority: Authority, certified: bool) -> None:
+    """It trusts the right authority and speaks TLS, and that is not enough."""
+    own = authority.of("payload.blimp-1")
+    with TelemetryListener([FREE], certificates=folder(authority, "ground.main")) as listener:
+        config = session_config([], listener.endpoints)
+        tls = {"root_ca_certificate": str(own / "ca.pem"), "verify_name_on_connect": False}
+        if certified:
+            tls |= {
+                "enable_mtls": True,
+                "connect_certificate": str(own / "certificate.pem"),
+                "connect_private_key": str(own / "key.pem"),
+            }
+        for name, value in tls.items():
+            config.insert_json5(f"transport/link/tls/{name}", json.dumps(value))
+        session = Session(zenoh.open(config), ())
+        wait_s = LIMIT_S if certified else 2 * PATIENCE_S
+        assert heard(listener, session, "blimp-1", wait_s) is certified
+        assert bool(listener.payloads()) is certified
 
 
 @pytest.mark.parametrize(("name", "allowed"), [("ground.main", True), ("payload.blimp-2", False)])
