@@ -118,6 +118,8 @@ class LibcameraSource(LiveSource):
 
         After a while a fixed exposure or gain that the camera does not keep ends the source.
         """
+        if self._element.find_property("exposure-time") is None:
+            return None, None  # libcamerasrc before 0.4
         exposure_s = (self._element.get_property("exposure-time") or 0) / 1e6 or None
         gain = self._element.get_property("analogue-gain") or None
         if self._stamped == _SETTLED_FRAMES:

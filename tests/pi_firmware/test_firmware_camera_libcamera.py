@@ -60,6 +60,9 @@ class Element:
         self.properties = properties
         self.posted: list[str] = []
 
+    def find_property(self, name: str) -> object | None:
+        return self.properties.get(name.replace("-", "_"))
+
     def get_property(self, name: str) -> float:
         return self.properties[name.replace("-", "_")]
 
@@ -89,6 +92,7 @@ def test_a_frame_carries_the_exposure_and_gain_of_the_cameras_metadata(opened: A
     assert (stamp.exposure_s, stamp.gain) == (0.0125, 3.5)
     silent = opened(Element(exposure_time=0, analogue_gain=0.0)).stamp(0)
     assert (silent.exposure_s, silent.gain) == (None, None)
+    assert opened(Element()).stamp(0).exposure_s is None
     assert silent.time_ns == silent.clock_ns == CAPTURED_NS
 
 
