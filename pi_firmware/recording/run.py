@@ -178,7 +178,7 @@ class Run:
         else:
             try:
                 self._unit(item)
-            except RecordingError:
+            except Exception:
                 self._left_out += 1
                 raise
         self.size_bytes = self._current.size_bytes
