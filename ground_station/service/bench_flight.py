@@ -1,0 +1,197 @@
+"""The payload's program as a process of its own that is watched from the ground while it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ground_station.errors import GroundStationError
+from ground_station.stream import rtp
+from ground_station.stream.counters import Counters
+from pi_firmware.wire import keys, sei
+from pi_firmware.wire.telemetry import open_session
+
+RATE_HZ = 30.0
+_PAYLOAD_ID = "bench"
+_LIMIT_S = 600.0
+_COUNTERS = re.compile(r"frames: (\d+) captured, (\d+) gated, (\d+) sent")
+_BUFFER_BYTES = 4 << 20
+
+
+class FlightError(GroundStationError):
+    """The program could not be measured."""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """An access unit's last packet here: the monotonic and the wall clock, and its own numbers."""
+
+    monotonic_ns: int
+    wall_ns: int
+    info: sei.FrameInfo | None
+
+
+class Ground:
+    """A UDP port that takes the video and, with `telemetry`, an endpoint that takes the gate's.
+
+    A context manager; `arrivals` fill on a thread of its own.
+    """
+
+    def __init__(self, *, telemetry: bool = True) -> None:
+        self.arrivals: list[Arrival] = []
+        self.messages = 0
+        self._closing = threading.Event()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.1)
+        self._thread = threading.Thread(target=self._receive, name="bench-video", daemon=True)
+        self._session: Any = None
+        self._telemetry = telemetry
+
+    def settings(self) -> list[str]:
+        """What the payload has to be told to stream here, and nothing of this machine to touch."""
+        endpoints = [f'"{name}"' for name in self._session.listening] if self._session else []
+        return [
+            f"payload_id={_PAYLOAD_ID}",
+            "link.host=127.0.0.1",
+            f"link.port={self._socket.getsockname()[1]}",
+            f"telemetry.enabled={str(self._telemetry).lower()}",
+            f"telemetry.connect=[{','.join(endpoints)}]",
+            "battery.uri=fake:",
+            "wifi.interface=",
+            "supervision.frame_timeout_s=14",  # valgrind's start takes longer than a payload's
+        ]
+
+    def __enter__(self) -> Ground:
+        self._thread.start()
+        if self._telemetry:
+            self._session = open_session(listen=["tcp/127.0.0.1:0"])
+            self._subscriber = self._session.zenoh.declare_subscriber(
+                keys.key(_PAYLOAD_ID, keys.GATE), self._count
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+        if self._session is not None:
+            self._session.close()
+
+    def _count(self, _: Any) -> None:
+        self.messages += 1
+
+    def _receive(self) -> None:
+        counters = Counters()
+        reorderer, depacketizer = rtp.Reorderer(counters), rtp.Depacketizer(counters)
+        while not self._closing.is_set():
+            try:
+                datagram = self._socket.recv(65535)
+            except TimeoutError:
+                continue
+            packet = rtp.parse(datagram, time.monotonic_ns())
+            wall_ns = time.time_ns()
+            for ordered, gap in reorderer.push(packet) if packet else ():
+                for unit in depacketizer.push(ordered, gap):
+                    info = sei.find(unit.data)
+                    self.arrivals.append(Arrival(unit.arrival_ns, wall_ns, info))
+
+
+@dataclass
+class Flight:
+    """A running or ended program; `ready_ns` is when it had built everything, monotonic."""
+
+    process: subprocess.Popen[str]
+    begin_ns: int
+    ready_ns: int = 0
+    said: str = ""
+    errors: str = ""
+    _readers: list[threading.Thread] = field(default_factory=list)
+
+    def counters(self) -> tuple[int, int, int]:
+        """Frames captured, gated and sent, as the program printed them at its end."""
+        match = _COUNTERS.search(self.said)
+        if match is None:
+            raise FlightError("the firmware ended without its frames' counters")
+        return int(match[1]), int(match[2]), int(match[3])
+
+    def end(self, *, by_signal: bool = False) -> None:
+        """Waits for its end, which a signal may ask for; raises `FlightError` if it failed."""
+        if by_signal:
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            status = self.process.wait(_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            raise FlightError(f"the firmware did not end within {_LIMIT_S:g} s") from None
+        for reader in self._readers:
+            reader.join()
+        if status:
+            line = (self.errors.strip().splitlines() or ["nothing"])[-1]
+            raise FlightError(f"the firmware ended with status {status}: {line}")
+
+    def _read_said(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.ready_ns = self.ready_ns or time.monotonic_ns()
+            self.said += line
+
+    def _read_errors(self) -> None:
+        assert self.process.stderr is not None
+        self.errors = self.process.stderr.read()
+
+
+@contextlib.contextmanager
+def fly(
+    ground: Ground,
+    settings: Sequence[str],
+    *,
+    before: Sequence[str] = (),
+    python: Sequence[str] = (),
+) -> Iterator[Flight]:
+    """Starts the program with `KEY=VALUE` settings and kills it at the block's end if need be.
+
+    `before` is what runs it, as valgrind; `python` are options of the interpreter.
+    """
+    sets = [word for setting in (*ground.settings(), *settings) for word in ("--set", setting)]
+    with tempfile.TemporaryDirectory() as folder:
+        begin_ns = time.monotonic_ns()
+        process = subprocess.Popen(
+            [*before, sys.executable, *python, "-m", "pi_firmware", *sets],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            # Hashes are drawn at each start otherwise, and with them the cost of every dictionary.
+            env=os.environ | {"PYTHONHASHSEED": "0", "TMPDIR": folder},
+        )
+        flight = Flight(process, begin_ns)
+        for target in (flight._read_said, flight._read_errors):
+            thread = threading.Thread(target=target, daemon=True)
+            thread.start()
+            flight._readers.append(thread)
+        try:
+            yield flight
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            for reader in flight._readers:
+                reader.join()
+
+
+def picture(seconds: float, pattern: str = "zone-plate") -> str:
+    """The setting of a test picture that ends after `seconds` at `RATE_HZ`."""
+    return f"camera.uri=test:?pattern={pattern}&duration_s={seconds:.6f}"
