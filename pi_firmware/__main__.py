@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
     from pi_firmware import autopilot, battery, settings, sources
 
     loaded = settings.load(arguments.config, arguments.set)
@@ -47,9 +47,6 @@ def _run(arguments: argparse.Namespace) -> None:
         return
     from pi_firmware.payload import Payload
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
     payload = Payload(loaded)
     try:
         link = loaded.link
@@ -74,13 +71,20 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Runs the payload; 0 at the end of the stream or on a signal, 2 on what a person can mend."""
+    """Runs the payload.
+
+    Status 0 at the end of the stream or on a signal, 2 on what a person can mend, 3 when the
+    process must be started anew.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):  # first of all: it may come while modules load
+        signal.signal(number, lambda *_: stop.set())
     arguments = _parser().parse_args()
     try:
-        _run(arguments)
+        _run(arguments, stop)
     except BlimpError as error:
         print(f"pi_firmware: {error}", file=sys.stderr)
-        return 2
+        return 3 if error.restart else 2
     return 0
 
 

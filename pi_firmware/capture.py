@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ _STARTED_ANEW = {
 
 class Hopeless(StreamError):
     """Starting anew inside the process has not helped: the process must be."""
+
+    restart = True
 
 
 @dataclass
@@ -63,6 +66,7 @@ class Capture:
         self._before = 0
         self._started_s = 0.0
         self._due_s: float | None = None
+        self._trusted: Settings | None = None
         self._ending = False
         self._media: Media | None = None
         self._source: Source | None = None
@@ -123,11 +127,15 @@ class Capture:
         if media.error is not None:
             self._fail(_CAMERA, _as_blimp_error(media.error))
         elif message is not None and message.type == self._gst.MessageType.EOS:
-            if source.error is not None:
-                self._fail(_CAMERA, source.error)
-            return False
+            if source.error is None:
+                return False
+            self._give_up(source.error)
+            return True
         elif message is not None:
             text = source.explain(message.parse_error()[0].message)
+            if source.error is not None:
+                self._give_up(source.error)
+                return True
             what = _ENCODER if message.src.get_name() == "encoder" else _CAMERA
             self._fail(what, StreamError(f"video pipeline: {text}"))
         elif self.live and not self._ending:
@@ -138,7 +146,8 @@ class Capture:
         """Asks the camera to end; `step` returns False when the last frame has left."""
         self._ending = True
         if self._source is not None:
-            self._source.stop()
+            # Not on this thread: a source that hangs does not take the message.
+            threading.Thread(target=self._source.stop, name="end", daemon=True).start()
 
     def close(self) -> None:
         """Stops and releases everything."""
@@ -177,15 +186,28 @@ class Capture:
         """
         before = self._settings
         self._shut()
-        self._settings = dataclasses.replace(before, camera=camera)
+        self._settings, self._trusted = dataclasses.replace(before, camera=camera), before
         try:
             self._open()
             self.start()
         except BlimpError as error:
-            self._settings = before
             self._shut()
-            self._due_s = self._clock()
+            self._go_back(before)
             raise error
+
+    def _give_up(self, error: BlimpError) -> None:
+        """The source says that opening it anew would be no better: settings that were asked for on
+        the way are taken back, and with those of the start the flight ends.
+        """
+        if self._trusted is None:
+            raise error
+        self._shut()
+        self._go_back(self._trusted)
+        self._announce(messages.EVENT_CAMERA_RESTARTED, f"{error}; as it was before")
+
+    def _go_back(self, settings: Settings) -> None:
+        self._settings, self._trusted = settings, None
+        self._due_s = self._clock()
 
     def _open(self) -> None:
         source = open_source(self._settings.camera)
@@ -211,8 +233,6 @@ class Capture:
     def _shut(self) -> None:
         source, media = self._source, self._media
         self._source = self._media = None
-        if source is not None:
-            source.stop()
         stopped = True
         if media is not None:
             stopped = media.stop()

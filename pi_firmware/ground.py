@@ -31,7 +31,8 @@ class Ground:
     """Takes the ground stations' reports, and sends the video where one of them is.
 
     With `link.host` = "auto" it goes to the first that reports, and to another only when that one
-    has been silent for 5 s. Reports of other streams than ours change nothing else.
+    has been silent for 5 s. Reports of other streams than ours change nothing else. `on_heard` is
+    called with each report.
     """
 
     def __init__(
@@ -41,11 +42,13 @@ class Ground:
         link: Link,
         capture: Capture,
         telemetry: Telemetry,
+        on_heard: Callable[[], object] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._discovers = settings.host == DISCOVERED
         self._ssrc = ssrc
         self._link, self._capture, self._telemetry = link, capture, telemetry
+        self._on_heard = on_heard
         self._clock = clock
         self._lock = threading.Lock()
         self._followed = ""
@@ -62,6 +65,7 @@ class Ground:
         """Takes a report; on any thread. One that cannot be changes nothing."""
         if not (_LOWEST_PORT <= report.video_port <= _HIGHEST_PORT and 0 <= report.lost <= 1):
             return
+        self._on_heard()
         now_s = self._clock()
         with self._lock:
             if self._discovers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import subprocess
 import sys
@@ -13,12 +14,14 @@ from queue import Empty, SimpleQueue
 from pi_firmware import encoder, link
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
-from pi_firmware.capture import Capture
+from pi_firmware.capture import Capture, Hopeless
 from pi_firmware.commands import Action, Commands, Refusal, Values
 from pi_firmware.ground import Ground
 from pi_firmware.media import Counters, Unit
+from pi_firmware.recording import Recorder
 from pi_firmware.reporting import Reporter
 from pi_firmware.settings import CameraSettings, Settings
+from pi_firmware.supervision import AUTOPILOT, BATTERY, Supervision
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import messages
 from pi_firmware.wire.config import range_of
@@ -43,27 +46,44 @@ class Payload:
         self._stop = threading.Event()
         self._afterwards: list[str] = []
         self._requests: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
-        self._autopilot = open_autopilot(
-            settings.autopilot, lambda state: self._telemetry.autopilot(state)
-        )
+        self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
         self._link = link.Link(settings.link, self.ssrc)
-        self._telemetry = Telemetry(settings.payload_id, settings.telemetry)
+        self._recorder = Recorder(
+            settings.recording,
+            lambda name, text: self._reporter.announce(name, text),
+            force_idr=lambda: self._capture.force_idr(),
+            payload={"payload_id": settings.payload_id, "camera": settings.camera.uri},
+        )
+        self._telemetry = Telemetry(
+            settings.payload_id, settings.telemetry, tap=self._recorder.message
+        )
+        self._reporter = Reporter(settings, self.ssrc, self._telemetry)
+        announce = self._reporter.announce
+        self._supervision = Supervision(settings, announce)
+        if self._supervision.begin():
+            announce(messages.EVENT_FAILED, "no frames from several processes: rebooting the board")
+            self._close_telemetry()
+            _run_last(settings.supervision.reboot_command)
+            raise Hopeless("no frames from several processes in a row")
         try:
-            self._reporter = Reporter(settings, self.ssrc, self._telemetry)
-            self._capture = Capture(
-                settings, self._reporter.gate, self._leave, self._reporter.announce
-            )
+            self._capture = Capture(settings, self._reporter.gate, self._leave, announce)
         except BaseException:
-            self._telemetry.close()
-            self._link.stop()
+            self._close_telemetry()
             raise
         self._reporter.counters = self._capture.counters
-        self._ground = Ground(settings.link, self.ssrc, self._link, self._capture, self._telemetry)
+        self._ground = Ground(
+            settings.link,
+            self.ssrc,
+            self._link,
+            self._capture,
+            self._telemetry,
+            on_heard=self._supervision.wifi.heard,
+        )
         self._battery = Monitor(
             settings.battery,
             gauge,
-            publish=self._telemetry.battery,
-            announce=self._reporter.announce,
+            publish=self._tell_battery,
+            announce=announce,
             on_low=self._capture.limit_bitrate,
         )
         self._commands = Commands(
@@ -80,7 +100,10 @@ class Payload:
         announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
         try:
             self._link.start()
+            if self.settings.recording.at_start:
+                self._recorder.start()
             self._capture.start()
+            self._supervision.start(self._capture, self._ground, self._recorder, self._telemetry)
             self._battery.start(on_critical=self._on_critical)
             self._autopilot.start()
             self._telemetry.on_pose(self._autopilot.on_pose)
@@ -89,6 +112,8 @@ class Payload:
             self._fly(stop)
         except BlimpError as error:
             announce(messages.EVENT_FAILED, str(error))
+            if isinstance(error, Hopeless) and self._supervision.give_up():
+                self._afterwards = self.settings.supervision.reboot_command
             raise
         if self.cut_reason:
             announce(messages.EVENT_SOURCE_CUT, self.cut_reason)
@@ -117,18 +142,25 @@ class Payload:
 
     def close(self) -> None:
         """Stops everything and releases it; then runs what was asked for after the end."""
-        self._capture.close()
-        self._link.stop()
+        self._supervision.stop()
+        self._recorder.close()  # before all that might hang: what is recorded is on the card
+        with contextlib.suppress(Hopeless):  # what hangs ends with the process
+            self._capture.close()
         self._commands.close()
         self._autopilot.stop()
         self._battery.stop()
-        self._telemetry.close()
+        self._close_telemetry()
         _run_last(self._afterwards)
+
+    def _close_telemetry(self) -> None:
+        self._link.stop()
+        self._telemetry.close()
 
     def _fly(self, stop: threading.Event) -> None:
         flush_until: float | None = None
         while self._capture.step():
             self._serve()
+            self._supervision.tend(self._fresh_frames())
             if failure := self._link.failure():
                 raise StreamError(f"video link: {failure}")
             if stop.is_set() and flush_until is None:
@@ -140,10 +172,27 @@ class Payload:
 
     def _leave(self, unit: Unit) -> bool:
         """On the encoder's thread: a finished frame's way out."""
+        self._recorder.unit(unit.info, unit.data)
         return self._link.send(unit.data, unit.clock_ns, idr=unit.idr)
 
+    def _fresh_frames(self) -> int:
+        """Frames that left the encoder; without heartbeats those that the gate judged are fresh."""
+        if self.settings.gate.heartbeat_s == 0:
+            return self.counters.captured
+        return self._capture.encoded
+
+    def _tell_battery(self, message: messages.Battery) -> None:
+        self._supervision.table.beat(BATTERY)
+        self._telemetry.battery(message)
+
+    def _tell_autopilot(self, message: messages.Autopilot) -> None:
+        self._supervision.table.beat(AUTOPILOT)
+        self._telemetry.autopilot(message)
+
     def _on_critical(self) -> None:
+        """On the battery's thread: recordings end first, then the flight."""
         self._afterwards = self.settings.battery.shutdown_command
+        self._recorder.close()
         self._stop.set()
 
     def _actions(self) -> dict[str, Action]:
@@ -160,6 +209,8 @@ class Payload:
                 self._expose,
                 {name: range_of(camera, name) for name in ("exposure_s", "gain")},
             ),
+            "record-start": Action(self._record),
+            "record-stop": Action(self._end_recording),
             "shutdown": Action(
                 lambda: self._end("battery.shutdown_command", settings.battery.shutdown_command)
             ),
@@ -167,6 +218,13 @@ class Payload:
                 lambda: self._end("supervision.reboot_command", settings.supervision.reboot_command)
             ),
         }
+
+    def _record(self) -> None:
+        self._recorder.start()
+
+    def _end_recording(self) -> None:
+        if not self._recorder.stop():
+            raise Refusal("nothing was recorded")
 
     def _end(self, key: str, command: list[str]) -> None:
         if not command:

@@ -164,7 +164,7 @@ class RecordingSettings:
 class WifiSettings:
     """The radio."""
 
-    interface: str = key("auto", "as wlan0; auto: the first one; empty: left alone")
+    interface: str = key("", "as wlan0; auto: the first one; empty: left alone")
     restart_after_s: float = key(
         20.0, "restarted when the ground is silent so long; 0: never", unit="s", low=0, high=3600
     )

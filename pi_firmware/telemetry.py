@@ -59,6 +59,7 @@ class Telemetry:
             listen=settings.listen,
             connect=settings.connect,
             certificates=settings.certificates,
+            scout=settings.discover,
         )
         session = self._session.zenoh
         for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT, keys.HEALTH):

@@ -4,10 +4,9 @@ from pi_firmware.health.board import Board, BoardState
 from pi_firmware.health.restarts import Restarts
 from pi_firmware.health.systemd import Notifier
 from pi_firmware.health.tasks import PeriodicThread, Table, Task
-from pi_firmware.health.wifi import EVENT_RADIO_FAILED, Wifi, WifiState
+from pi_firmware.health.wifi import Wifi, WifiState
 
 __all__ = [
-    "EVENT_RADIO_FAILED",
     "Board",
     "BoardState",
     "Notifier",

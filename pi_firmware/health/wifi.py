@@ -14,8 +14,6 @@ from pi_firmware.health.programs import ProgramError
 from pi_firmware.settings import WifiSettings
 from pi_firmware.wire import messages
 
-EVENT_RADIO_FAILED = "radio-failed"
-
 _LONGEST_PAUSE_S = 600.0
 _OFF_S = 1.0
 _ON_ATTEMPTS = 3
@@ -221,7 +219,7 @@ class Wifi:
     def _failed(self, what: str, reason: str) -> None:
         if what not in self._failing:
             self._failing.add(what)
-            self._tell(EVENT_RADIO_FAILED, f"{what}: {reason}")
+            self._tell(messages.EVENT_RADIO_FAILED, f"{what}: {reason}")
 
     def _tell(self, name: str, text: str) -> None:
         with contextlib.suppress(Exception):  # a link that fails is why we are here

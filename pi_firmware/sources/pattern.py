@@ -31,7 +31,7 @@ class PatternSource(LiveSource):
         super().__init__(
             camera,
             f"videotestsrc name=source is-live=true pattern={pattern} num-buffers={frames} "
-            f"kx2=20 ky2=20 kt=1 ! {caps(camera, 'I420')}",
+            f"kx2=20 ky2=20 kt=4 ! {caps(camera, 'I420')}",
         )
 
     def attach(self, pipeline: Any) -> None:

@@ -5,8 +5,10 @@ class BlimpError(Exception):
     """Base of all errors of the payload and of what both sides share.
 
     The text is one line that names the value and the limit; programs print it on standard error
-    and exit with status 2.
+    and exit with status 2, or 3 where `restart` says that only a new process can mend it.
     """
+
+    restart = False
 
 
 class ConfigError(BlimpError):

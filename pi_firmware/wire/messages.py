@@ -171,6 +171,7 @@ class Health(Message):
     bitrate_kbps: int = 0  # asked of the encoder
     lost: float | None = None  # share of packets, as the ground reports it
     round_trip_s: float | None = None
+    ground_offset_s: float | None = None  # the ground's clock less ours
     temperature_C: float | None = None
     cpu: float | None = None  # share of all cores, 0 to 1
     memory_MB: float | None = None  # resident, of the program
@@ -244,6 +245,7 @@ EVENT_STREAMING_AGAIN = "streaming-again"
 EVENT_RECORDING_STARTED = "recording-started"
 EVENT_RECORDING_ENDED = "recording-ended"
 EVENT_RADIO_RESTARTED = "radio-restarted"
+EVENT_RADIO_FAILED = "radio-failed"
 EVENT_COMMAND = "command"
 
 

@@ -7,7 +7,8 @@ Layout (H.264, D.1.7): 16 bytes UUID, then in network byte order
     1       u8    flags: bit 0 heartbeat (the gate would have dropped this frame)
     2       u16   reserved, 0
     4       u32   sequence: captured frames counted from 0, gated ones included
-    8       i64   time_ns: capture time of the camera; a recording's own in a replay
+    8       i64   time_ns: capture time of the camera, the middle of the middle row's exposure; a
+                  recording's own in a replay
     16      i64   clock_ns: the payload's clock at that capture, to measure latency with
     24      f32   entropy_bits: Shannon entropy of the luma
     28      f32   sharpness: mean squared gradient of the luma, grey levels squared

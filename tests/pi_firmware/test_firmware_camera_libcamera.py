@@ -193,5 +193,5 @@ def test_a_libcamera_flies_with_its_sensors_times() -> None:
 def test_what_a_libcamera_refuses_is_one_line(settings: list[str], named: str) -> None:
     process = fly_virtual_camera(9, *settings)
     _, err = process.communicate(timeout=60)
-    assert process.returncode != 0
+    assert process.returncode == 2
     assert err.count("\n") == 1 and named in err

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pi_firmware.health import EVENT_RADIO_FAILED, Wifi, WifiState, programs, radio
+from pi_firmware.health import Wifi, WifiState, programs, radio
 from pi_firmware.health.programs import ProgramError
 from pi_firmware.settings import WifiSettings
 from pi_firmware.wire import messages
@@ -143,7 +143,7 @@ def test_an_iw_that_is_missing_or_refuses_is_told_once_and_tried_again(
     rig.refusing["iw"] = reason
     for _ in range(200):
         rig.look()
-    assert [name for name, _ in rig.events] == [EVENT_RADIO_FAILED]
+    assert [name for name, _ in rig.events] == [messages.EVENT_RADIO_FAILED]
     assert reason in rig.events[0][1]
     del rig.refusing["iw"]
     for _ in range(61):
@@ -155,7 +155,7 @@ def test_power_save_that_stays_on_although_iw_says_nothing_is_told(root: Path) -
     rig = Rig(root)
     rig.stubborn = True
     rig.look()
-    assert [name for name, _ in rig.events] == [EVENT_RADIO_FAILED]
+    assert [name for name, _ in rig.events] == [messages.EVENT_RADIO_FAILED]
     assert "still on" in rig.events[0][1]
 
 
@@ -206,7 +206,7 @@ def test_a_restart_that_is_refused_is_told_once_and_not_counted(root: Path) -> N
     rig.wifi.heard()
     rig.restarts(400)
     assert rig.wifi.state.restarts == 0
-    assert [name for name, _ in rig.events] == [EVENT_RADIO_FAILED]
+    assert [name for name, _ in rig.events] == [messages.EVENT_RADIO_FAILED]
     assert "Operation not permitted" in rig.events[0][1]
     rig.refusing.clear()
     rig.restarts(400)
@@ -227,7 +227,7 @@ def test_a_radio_left_switched_off_is_switched_on_with_growing_pauses(root: Path
     rig.refusing["up"] = "RTNETLINK answers: Operation not possible due to RF-kill"
     tried = [second for second in range(100) if "ip link set dev wlan0 up" in rig.look()]
     assert tried == [0, 5, 15, 35, 75]
-    assert [name for name, _ in rig.events] == [EVENT_RADIO_FAILED]
+    assert [name for name, _ in rig.events] == [messages.EVENT_RADIO_FAILED]
     rig.refusing.clear()
     for _ in range(100):
         rig.look()
@@ -281,7 +281,7 @@ def test_a_wired_interface_by_mistake_is_told_and_left_alone(root: Path) -> None
     for _ in range(100):
         rig.look()
     assert rig.calls == []
-    assert rig.events == [(EVENT_RADIO_FAILED, "interface: eth0 is no radio")]
+    assert rig.events == [(messages.EVENT_RADIO_FAILED, "interface: eth0 is no radio")]
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ def test_the_programs_get_their_words_one_by_one(root: Path, scripts: Programs) 
     events: list[str] = []
     clock = [0.0]
     wifi = Wifi(
-        WifiSettings(),
+        WifiSettings("auto"),
         lambda name, _: events.append(name),
         root=root,
         clock=lambda: clock[0],
@@ -471,7 +471,7 @@ def test_step_and_heard_never_wait_for_a_program_that_hangs(root: Path) -> None:
         release.wait(LIMIT_S)
         return "Power save: off\n"
 
-    wifi = Wifi(WifiSettings(), lambda *_: None, root=root, run=hanging)
+    wifi = Wifi(WifiSettings("auto"), lambda *_: None, root=root, run=hanging)
     wifi.step()
     assert began.wait(LIMIT_S)
     for _ in range(100):
@@ -497,7 +497,7 @@ def test_stopped_in_the_middle_of_a_restart_the_radio_is_switched_on(root: Path)
 
     now = [0.0]
     wifi = Wifi(
-        WifiSettings(),
+        WifiSettings("auto"),
         lambda *_: None,
         root=root,
         run=run,
@@ -525,12 +525,12 @@ def test_an_announcement_that_fails_does_not_end_the_watch(root: Path) -> None:
             raise ValueError("not foreseen")
         return ""
 
-    wifi = Wifi(WifiSettings(), announce, root=root, run=run)
+    wifi = Wifi(WifiSettings("auto"), announce, root=root, run=run)
     wifi.step()
     until(lambda: len(told) == 1)
     wifi.step()
     until(lambda: not wifi._wake.is_set())
-    assert told == [EVENT_RADIO_FAILED]
+    assert told == [messages.EVENT_RADIO_FAILED]
     assert wifi._thread is not None and wifi._thread.is_alive()
     wifi.stop()
 

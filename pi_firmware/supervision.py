@@ -1,0 +1,165 @@
+"""The payload watching itself: its tasks, its board and its radio, and what follows for systemd."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from pi_firmware.capture import Capture
+from pi_firmware.ground import Ground
+from pi_firmware.health import Board, Notifier, PeriodicThread, Restarts, Table, Task, Wifi
+from pi_firmware.recording import Recorder
+from pi_firmware.settings import Settings
+from pi_firmware.telemetry import Telemetry
+from pi_firmware.wire.clock_offset import OffsetFilter
+from pi_firmware.wire.messages import Health
+
+VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
+_FEED_S = 1.0
+_CLOCK_S = 10.0
+_GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
+
+
+def tasks(settings: Settings) -> tuple[Task, ...]:
+    """All that must happen again and again: how often, and when it is late.
+
+    `video` beats with each frame that leaves the encoder, `battery` with each believable reading,
+    `autopilot` with each of its states.
+    """
+    camera, battery = settings.camera, settings.battery
+    period_s, limit_s = settings.supervision.period_s, settings.supervision.frame_timeout_s
+    return (
+        Task(VIDEO, 1 / camera.rate_hz, limit_s + 1.5 / camera.rate_hz),
+        Task(BATTERY, battery.period_s, 3 * battery.period_s + _GAUGE_PAUSE_S),
+        Task(AUTOPILOT, settings.autopilot.period_s, 3 * settings.autopilot.period_s + 5),
+        Task(HEALTH, period_s, 3 * period_s + 5),
+        Task(CLOCK, _CLOCK_S, 3 * _CLOCK_S),
+    )
+
+
+class Supervision:
+    """Publishes health, watches over the tasks, and feeds systemd's watchdog with fresh frames.
+
+    `tend` is called by the main loop; all else runs on threads of its own. `announce` gets an
+    event's name and text.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        announce: Callable[[str, str], None],
+        notifier: Notifier | None = None,
+    ) -> None:
+        self.table = Table(tasks(settings))
+        self.notifier = notifier or Notifier()
+        self.wifi = Wifi(settings.wifi, announce)
+        self._settings = settings
+        self._restarts = Restarts(settings.supervision.state, settings.supervision.process_restarts)
+        folder = settings.recording.folder
+        self._board = Board(disk=Path(folder or "/"))
+        self._threads: list[PeriodicThread] = []
+        self._started_s = time.monotonic()
+        self._fed_s = 0.0
+        self._ready = False
+        self._fresh = self._measured = 0
+        self._measured_s = self._started_s
+        self._clock = OffsetFilter()
+        self._ground_offset_s: float | None = None
+
+    def begin(self) -> bool:
+        """Counts this process; whether the board is to be rebooted because the last ones failed."""
+        self._restarts.begin()
+        return self._may_reboot(ending=False)
+
+    def give_up(self) -> bool:
+        """This process ends because it has no frames; whether the board is to be rebooted."""
+        return self._may_reboot(ending=True)
+
+    def start(
+        self, capture: Capture, ground: Ground, recorder: Recorder, telemetry: Telemetry
+    ) -> None:
+        """Starts the threads that publish health and ask for the ground's time."""
+
+        def publish() -> None:
+            self.wifi.step()
+            telemetry.health(self.health(capture, ground, recorder))
+
+        def ask() -> None:
+            trip = telemetry.ask_time()
+            offset = self._clock.add(trip) if trip is not None else None
+            self._ground_offset_s = offset.offset_ns / 1e9 if offset else None
+
+        self._threads = [
+            PeriodicThread(self.table, HEALTH, publish, _complain),
+            PeriodicThread(self.table, CLOCK, ask, _complain),
+        ]
+        self.table.begin(VIDEO)
+        for thread in self._threads:
+            thread.start()
+
+    def tend(self, fresh: int) -> None:
+        """Takes how many frames left the encoder so far, and feeds the watchdog with new ones."""
+        if fresh == self._fresh:
+            return
+        if not self._ready:  # said again when it was not taken: only then does systemd watch
+            self._ready = self.notifier.ready()
+        self._restarts.fresh()
+        self._fresh = fresh
+        self.table.beat(VIDEO)
+        now_s = time.monotonic()
+        if now_s - self._fed_s >= min(_FEED_S, (self.notifier.watchdog_s or _FEED_S) / 4):
+            self._fed_s = now_s
+            self.notifier.alive()
+
+    def health(self, capture: Capture, ground: Ground, recorder: Recorder) -> Health:
+        """How payload and board are now."""
+        now_s, encoded = time.monotonic(), capture.encoded
+        span_s = now_s - self._measured_s
+        rate_hz = (encoded - self._measured) / span_s if span_s > 0 else 0.0
+        self._measured, self._measured_s = encoded, now_s
+        counters, seen, wifi = capture.counters, ground.seen, self.wifi.state
+        return Health(
+            time_ns=time.time_ns(),
+            uptime_s=now_s - self._started_s,
+            captured=counters.captured,
+            gated=counters.gated,
+            sent=counters.sent,
+            discarded=counters.discarded,
+            rate_hz=max(rate_hz, 0.0),
+            bitrate_kbps=capture.bitrate_kbps,
+            lost=seen.lost if seen else None,
+            round_trip_s=seen.round_trip_s if seen else None,
+            ground_offset_s=self._ground_offset_s,
+            wifi_interface=wifi.interface,
+            wifi_signal_dBm=wifi.signal_dBm,
+            wifi_quality=wifi.quality,
+            wifi_restarts=wifi.restarts,
+            camera_restarts=capture.restarts.camera,
+            encoder_restarts=capture.restarts.encoder,
+            process_restarts=self._restarts.process_restarts,
+            board_restarts=self._restarts.board_restarts,
+            late=self.table.late(),
+            recording=recorder.file,
+            recording_MB=recorder.size_MB,
+            recording_dropped=recorder.dropped,
+            **asdict(self._board.read()),
+        )
+
+    def stop(self) -> None:
+        """Ends the threads and tells systemd that the end is in order."""
+        self.notifier.stopping()
+        for thread in self._threads:
+            thread.stop()
+        self.wifi.stop()
+
+    def _may_reboot(self, *, ending: bool) -> bool:
+        if not self._settings.supervision.reboot_command:
+            return False
+        return self._restarts.claim_reboot(ending=ending)
+
+
+def _complain(line: str) -> None:
+    print(f"pi_firmware: {line}", file=sys.stderr, flush=True)

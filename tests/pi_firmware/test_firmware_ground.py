@@ -1,0 +1,102 @@
+"""The payload follows the ground station that takes its video, and believes no other report."""
+
+import math
+
+import pytest
+
+from pi_firmware.ground import Ground
+from pi_firmware.settings import LinkSettings
+from pi_firmware.wire.messages import LinkReport
+
+SSRC = 77
+
+
+class Link:
+    def __init__(self) -> None:
+        self.to: list[tuple[str, int]] = []
+
+    def redirect(self, host: str, port: int) -> None:
+        self.to.append((host, port))
+
+
+class Capture:
+    def __init__(self) -> None:
+        self.reports: list[tuple[float, float]] = []
+
+    def link_report(self, lost: float, round_trip_s: float) -> None:
+        self.reports.append((lost, round_trip_s))
+
+
+class Telemetry:
+    def ground_address(self, ground: str) -> str | None:
+        return {"main": "10.0.0.5", "spare": "10.0.0.6"}.get(ground)
+
+
+class Following:
+    """A `Ground` among stand-ins, and a clock that is set by hand."""
+
+    def __init__(self, host: str) -> None:
+        self.now_s = 100.0
+        self.heard = 0
+        self.link, self.capture = Link(), Capture()
+        self.ground = Ground(
+            LinkSettings(host=host),
+            SSRC,
+            self.link,  # type: ignore[arg-type]
+            self.capture,  # type: ignore[arg-type]
+            Telemetry(),  # type: ignore[arg-type]
+            on_heard=self._hear,
+            clock=lambda: self.now_s,
+        )
+
+    def _hear(self) -> None:
+        self.heard += 1
+
+    def report(self, ground: str = "main", **values: object) -> None:
+        report = {"video_port": 5600, "ssrc": SSRC, "lost": 0.0} | values
+        self.ground.heard(LinkReport(time_ns=1, ground=ground, **report))  # type: ignore[arg-type]
+
+
+def test_a_report_of_our_stream_adapts_the_encoder() -> None:
+    following = Following("127.0.0.1")
+    following.report(lost=0.25, round_trip_s=0.01)
+    following.report(lost=0.0)
+    assert following.capture.reports == [(0.25, 0.01), (0.0, 0.0)]
+    assert following.link.to == []  # a configured address stays
+    seen = following.ground.seen
+    assert seen is not None and (seen.ground, seen.lost) == ("main", 0.0)
+    following.now_s += 6
+    assert following.ground.seen is None
+
+
+@pytest.mark.parametrize(
+    "values", [{"video_port": 0}, {"video_port": 65_536}, {"lost": -0.1}, {"lost": math.nan}]
+)
+def test_a_report_that_cannot_be_changes_nothing(values: dict[str, object]) -> None:
+    following = Following("auto")
+    following.report(**values)
+    assert following.capture.reports == [] and following.link.to == [] and following.heard == 0
+
+
+def test_a_report_of_another_stream_is_heard_but_not_believed() -> None:
+    following = Following("127.0.0.1")
+    following.report(ssrc=SSRC + 1, lost=0.5)
+    assert following.capture.reports == [] and following.ground.seen is None
+    assert following.heard == 1
+
+
+def test_video_goes_to_the_first_ground_station_and_on_to_another_once_it_is_silent() -> None:
+    following = Following("auto")
+    following.report("unknown")
+    assert following.link.to == []
+    following.report("main", ssrc=None)
+    following.report("spare", video_port=5700)
+    assert following.link.to == [("10.0.0.5", 5600)]
+    following.now_s += 4
+    following.report("main", video_port=5601)
+    following.now_s += 4
+    following.report("spare", video_port=5700)
+    assert following.link.to == [("10.0.0.5", 5600), ("10.0.0.5", 5601)]
+    following.now_s += 2
+    following.report("spare", video_port=5700)
+    assert following.link.to[-1] == ("10.0.0.6", 5700)

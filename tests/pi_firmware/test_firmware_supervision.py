@@ -1,0 +1,195 @@
+"""The real program hangs in various places: frames come again, or the process says it cannot."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from ground_station.stream.receiver import Receiver
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware import settings, supervision
+from pi_firmware.wire import messages
+
+LIMIT_S = 30.0
+STALLING = Path(__file__).with_name("stalling_encoder.py")
+ALL_FRAMES = "gate.enabled=false"
+
+
+class Flying:
+    """The program as a process, with somebody who receives and somebody who is systemd."""
+
+    def __init__(self, stack: ExitStack, tmp_path: Path) -> None:
+        self.receiver = stack.enter_context(Receiver(port=0))
+        self.listener = stack.enter_context(TelemetryListener(["tcp/127.0.0.1:0"]))
+        self.notify = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        self.notify.bind(str(tmp_path / "notify"))
+        self.notify.setblocking(False)
+        self.process: subprocess.Popen[str] | None = None
+        self._environment = {
+            **os.environ,
+            "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            "WATCHDOG_USEC": "8000000",
+        }
+
+    def start(self, *settings: str, stall: tuple[int, int] | None = None) -> None:
+        program = ["-m", "pi_firmware"]
+        if stall is not None:
+            program = [str(STALLING), *map(str, stall)]
+        endpoints = json.dumps(self.listener.endpoints)
+        given = [f"link.port={self.receiver.port}", f"telemetry.connect={endpoints}", *settings]
+        self.process = subprocess.Popen(
+            [sys.executable, *program, *(part for one in given for part in ("--set", one))],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=self._environment,
+        )
+
+    def state(self, condition: Callable[[PayloadState], bool]) -> PayloadState:
+        found = self.listener.wait("blimp-1", condition, LIMIT_S)
+        assert found is not None
+        return found
+
+    def has(self, name: str) -> PayloadState:
+        return self.state(lambda state: any(e.name == name for e in state.events))
+
+    def said(self) -> list[str]:
+        """What systemd was told since the last call."""
+        lines = []
+        while True:
+            try:
+                lines.append(self.notify.recv(4096).decode())
+            except BlockingIOError:
+                return lines
+
+    def end(self, status: int = 0) -> str:
+        """Ends the program; the counters in its last line."""
+        assert self.process is not None
+        if status == 0 and self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        out, err = self.process.communicate(timeout=LIMIT_S)
+        assert self.process.returncode == status, err
+        assert "Traceback" not in err
+        return err if status else out.splitlines()[-1]
+
+
+@pytest.fixture
+def flying(tmp_path: Path) -> Iterator[Flying]:
+    with ExitStack() as stack:
+        made = Flying(stack, tmp_path)
+        yield made
+        if made.process is not None and made.process.poll() is None:
+            made.process.kill()
+            made.process.wait()
+
+
+def numbers(counters: str) -> dict[str, int]:
+    return {name: int(n) for n, name in re.findall(r"(\d+) (captured|gated|sent|disc)", counters)}
+
+
+def test_systemd_is_fed_with_fresh_frames_and_told_of_start_and_end(flying: Flying) -> None:
+    flying.start("camera.uri=test:")
+    flying.state(lambda s: s.gate is not None and s.gate.sent > 60)
+    said = flying.said()
+    assert said[0] == "READY=1" and said.count("READY=1") == 1
+    assert said.count("WATCHDOG=1") >= 1
+    flying.end()
+    assert flying.said()[-1] == "STOPPING=1"
+
+
+def test_systemd_is_fed_no_more_when_frames_no_longer_leave_the_encoder(flying: Flying) -> None:
+    flying.start("camera.uri=test:", ALL_FRAMES, "supervision.frame_timeout_s=14", stall=(10, 1))
+    flying.state(lambda s: s.gate is not None and s.gate.sent >= 10)
+    time.sleep(1.0)
+    flying.said()
+    time.sleep(3.0)
+    assert flying.said() == []  # although camera, gate and telemetry work on
+    assert flying.process is not None and flying.process.poll() is None
+    flying.process.kill()
+
+
+def test_an_encoder_that_stalls_is_started_anew_and_no_frame_is_lost_count_of(
+    flying: Flying,
+) -> None:
+    flying.start("camera.uri=test:", ALL_FRAMES, "supervision.frame_timeout_s=1", stall=(20, 1))
+    state = flying.has(messages.EVENT_STREAMING_AGAIN)
+    names = [event.name for event in state.events]
+    assert names.count(messages.EVENT_ENCODER_RESTARTED) == 1
+    assert messages.EVENT_CAMERA_RESTARTED not in names
+    sent = state.frames.sent if state.frames else 0
+    flying.state(lambda s: s.frames is not None and s.frames.sent > sent + 30)
+    health = flying.state(lambda s: s.health is not None and s.health.encoder_restarts == 1)
+    assert health.health is not None and health.health.late == []
+    counted = numbers(flying.end())
+    assert counted["captured"] == counted["gated"] + counted["sent"] + counted["disc"]
+    assert counted["disc"] >= 1
+    last = flying.receiver.counters
+    assert last.packets_lost == 0  # RTP goes on where it was
+    assert last.decoded == counted["sent"]
+
+
+@pytest.mark.parametrize("fault", ["gone", "hang"])
+def test_a_camera_that_goes_and_comes_back_streams_again(flying: Flying, fault: str) -> None:
+    flying.start(
+        f"camera.uri=test:?{fault}_at_s=1&{fault}_for_s=3",
+        ALL_FRAMES,
+        "supervision.frame_timeout_s=1",
+        "supervision.restarts=20",
+    )
+    state = flying.has(messages.EVENT_STREAMING_AGAIN)
+    restarted = [e for e in state.events if e.name == messages.EVENT_CAMERA_RESTARTED]
+    again = next(e for e in state.events if e.name == messages.EVENT_STREAMING_AGAIN)
+    assert restarted and "camera" in restarted[0].text
+    assert again.time_ns - restarted[0].time_ns < 15e9
+    sent = again.values["sent"]
+    flying.state(lambda s: s.frames is not None and s.frames.sent > sent + 30)
+    counted = numbers(flying.end())
+    assert counted["captured"] == counted["gated"] + counted["sent"] + counted.get("disc", 0)
+    assert flying.receiver.counters.packets_lost == 0
+
+
+def test_a_process_that_cannot_help_itself_ends_with_status_3_and_then_reboots_the_board(
+    flying: Flying, tmp_path: Path
+) -> None:
+    mark = tmp_path / "rebooted"
+    given = (
+        "camera.uri=test:",
+        "supervision.frame_timeout_s=0.5",
+        "supervision.restarts=1",
+        "supervision.process_restarts=2",
+        f"supervision.state={tmp_path / 'restarts.json'}",
+        f"supervision.reboot_command={json.dumps(['touch', str(mark)])}",
+    )
+    for process in range(2):
+        assert not mark.exists()
+        flying.start(*given, stall=(0, 99))
+        err = flying.end(status=3)
+        assert err.count("\n") == 1 and "1 restarts of camera and encoder did not help" in err
+        assert mark.exists() is (process == 1)
+    assert "READY=1" not in flying.said()
+
+
+def test_every_task_of_the_table_is_heard_of_in_time(flying: Flying) -> None:
+    flying.start("camera.uri=test:", "supervision.period_s=0.2")
+    seen = [
+        flying.state(lambda s, n=n: s.health is not None and s.health.sent > n) for n in (5, 40)
+    ]
+    for state in seen:
+        assert state.health is not None and state.health.late == []
+        assert state.health.memory_MB is not None and state.health.memory_MB > 5
+    last = seen[-1].health
+    assert last is not None and last.rate_hz > 0 and last.cpu is not None
+    names = [task.name for task in supervision.tasks(settings.Settings())]
+    assert names == ["video", "battery", "autopilot", "health", "clock"]
+    flying.end()
