@@ -115,6 +115,13 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.glob("flight-*.mcap"))
 
 
+def is_cut(path: Path) -> bool:
+    """Whether a file lacks its end, or is damaged."""
+    reader = RecordingReader(path)
+    reader.topics()
+    return reader.cut
+
+
 def eventually(condition: Callable[[], object]) -> None:
     """Waits until it is true; fails when that takes absurdly long."""
     until = time.monotonic() + LIMIT_S
