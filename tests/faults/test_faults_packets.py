@@ -69,7 +69,7 @@ def test_each_fault_did_what_it_is_for(accounts: dict[str, Account]) -> None:
         assert 0.2 * share < counts[name].lost / during < 5 * share, name
     for name in ("reordering", "duplicates", "jitter"):
         assert counts[name].lost == 0, name
-        assert len(accounts[name].seen) == len(accounts[name].left) > 60
+        assert len(accounts[name].visible) == len(accounts[name].left) > 60
     assert counts["reordering"].delayed > 20 < counts["duplicates"].duplicated
     assert counts["jitter"].delayed > 60
     assert min(counts["all"].lost, counts["all"].duplicated, counts["all"].delayed) > 0
