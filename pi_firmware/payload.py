@@ -25,7 +25,7 @@ from pi_firmware.supervision import AUTOPILOT, BATTERY, Supervision
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import messages
 from pi_firmware.wire.config import range_of
-from pi_firmware.wire.errors import BlimpError, StreamError
+from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 
 _FLUSH_LIMIT_S = 10.0
 _COMMAND_LIMIT_S = 30.0
@@ -100,9 +100,9 @@ class Payload:
         announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
         try:
             self._link.start()
-            if self.settings.recording.at_start:
-                self._recorder.start()
             self._capture.start()
+            if self.settings.recording.at_start:
+                threading.Thread(target=self._record_at_start, name="record", daemon=True).start()
             self._supervision.start(self._capture, self._ground, self._recorder, self._telemetry)
             self._battery.start(on_critical=self._on_critical)
             self._autopilot.start()
@@ -190,10 +190,10 @@ class Payload:
         self._telemetry.autopilot(message)
 
     def _on_critical(self) -> None:
-        """On the battery's thread: recordings end first, then the flight."""
+        """On the battery's thread: the recording ends at once, whatever the flight's end takes."""
         self._afterwards = self.settings.battery.shutdown_command
-        self._recorder.close()
         self._stop.set()
+        self._recorder.close()
 
     def _actions(self) -> dict[str, Action]:
         """The table of commands."""
@@ -218,6 +218,13 @@ class Payload:
                 lambda: self._end("supervision.reboot_command", settings.supervision.reboot_command)
             ),
         }
+
+    def _record_at_start(self) -> None:
+        """A card that takes no recording ends no flight."""
+        try:
+            self._recorder.start()
+        except RecordingError as error:
+            self._reporter.announce(messages.EVENT_RECORDING_ENDED, str(error))
 
     def _record(self) -> None:
         self._recorder.start()

@@ -1,0 +1,161 @@
+"""The flying program is told what to do, and a dying battery ends it in order."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from flying import ALL_FRAMES, Flying, numbers
+
+from ground_station.stream import commands
+from pi_firmware.wire import messages
+from pi_firmware.wire.recording import RecordingReader
+
+LIMIT_S = 30.0
+RECORDING = ("recording.min_free_MB=0", "gate.enabled=false")
+
+
+def ask(flying: Flying, name: str, **numbers: float) -> messages.Answer:
+    return commands.ask(flying.listener.session, "blimp-1", name, numbers, LIMIT_S)
+
+
+def flown(flying: Flying, *settings: str) -> None:
+    flying.start("camera.uri=test:", ALL_FRAMES, *settings)
+    flying.state(lambda s: s.gate is not None and s.gate.sent > 5)
+
+
+def test_the_bit_rate_follows_within_its_bounds(flying: Flying) -> None:
+    flown(flying, "encoder.min_bitrate_kbps=500", "supervision.period_s=0.2")
+    assert ask(flying, "bitrate", kbps=800).values == {"kbps": 800}
+    flying.state(lambda s: s.health is not None and s.health.bitrate_kbps == 800)
+    assert ask(flying, "bitrate", kbps=100).values == {"kbps": 500}
+    assert ask(flying, "bitrate", kbps=9000).values == {"kbps": 2000}
+    refused = ask(flying, "bitrate", kbps=1e9)
+    assert not refused.done and "allowed: 50 to 20000" in refused.reason
+    state = flying.has(messages.EVENT_COMMAND)
+    assert any(e.text == "bitrate: done" for e in state.events)
+    flying.end()
+
+
+def test_exposure_is_set_anew_or_left_as_it_was(flying: Flying) -> None:
+    flown(flying)
+    assert ask(flying, "exposure", exposure_s=0.01, gain=2).values == {
+        "exposure_s": 0.01,
+        "gain": 2.0,
+    }
+    frame = until_exposed(flying, 0.01)
+    assert frame == pytest.approx((0.01, 2.0))
+    refused = ask(flying, "exposure", exposure_s=0.5)
+    assert not refused.done and "camera.exposure_s is 0.5" in refused.reason
+    sent = flying.listener.state("blimp-1").gate.sent  # type: ignore[union-attr]
+    flying.state(lambda s: s.gate is not None and s.gate.sent > sent + 30)
+    assert until_exposed(flying, 0.01) == pytest.approx((0.01, 2.0))
+    counted = numbers(flying.end())
+    assert counted["captured"] == counted["sent"] + counted.get("disc", 0)
+
+
+def until_exposed(flying: Flying, exposure_s: float) -> tuple[float | None, float | None]:
+    """Exposure and gain of the first frame that tells this exposure."""
+    while (frame := flying.receiver.get(LIMIT_S)) is not None:
+        if frame.exposure_s is not None and abs(frame.exposure_s - exposure_s) < 1e-6:
+            return frame.exposure_s, frame.gain
+    raise AssertionError("no frame with that exposure came")
+
+
+def test_a_recording_is_made_from_command_to_command(flying: Flying, tmp_path: Path) -> None:
+    flown(flying, f"recording.folder={tmp_path / 'card'}", *RECORDING)
+    assert ask(flying, "record-start").done
+    state = flying.has(messages.EVENT_RECORDING_STARTED)
+    began = state.frames.sent if state.frames else 0
+    flying.state(lambda s: s.gate is not None and s.gate.sent > began + 60)
+    assert ask(flying, "record-stop").done
+    flying.has(messages.EVENT_RECORDING_ENDED)
+    (path,) = (tmp_path / "card").glob("*.mcap")
+    reader = RecordingReader(path)
+    assert len(list(reader.video())) >= 50 and not reader.cut
+    assert "/blimp/gate" in reader.topics()
+    flying.end()
+
+
+def test_a_card_that_takes_no_recording_ends_no_flight(flying: Flying, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    flown(flying, f"recording.folder={tmp_path / 'file'}", "recording.at_start=true", *RECORDING)
+    state = flying.has(messages.EVENT_RECORDING_ENDED)
+    sent = state.gate.sent if state.gate else 0
+    flying.state(lambda s: s.gate is not None and s.gate.sent > sent + 10)
+    flying.end()
+
+
+def test_without_a_folder_recording_is_refused(flying: Flying) -> None:
+    flown(flying)
+    refused = ask(flying, "record-start")
+    assert (refused.done, refused.reason) == (
+        False,
+        "recording.folder is empty: nothing can be recorded",
+    )
+    assert not ask(flying, "record-stop").done
+    assert not ask(flying, "fly").done
+    flying.end()
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("shutdown", "battery.shutdown_command"), ("reboot", "supervision.reboot_command")],
+)
+def test_the_board_ends_by_command_after_all_else(
+    flying: Flying, tmp_path: Path, name: str, key: str
+) -> None:
+    card, seen = tmp_path / "card", tmp_path / "seen"
+    command = ["cp", "-r", str(card), str(seen)]
+    flown(
+        flying,
+        f"{key}={json.dumps(command)}",
+        f"recording.folder={card}",
+        "recording.at_start=true",
+        *RECORDING,
+    )
+    flying.state(lambda s: s.gate is not None and s.gate.sent > 40)
+    assert ask(flying, name).done
+    assert flying.process is not None
+    flying.process.wait(LIMIT_S)
+    flying.end()
+    (path,) = seen.glob("*.mcap")  # whole already when the command ran
+    reader = RecordingReader(path)
+    assert len(list(reader.video())) >= 30 and not reader.cut
+
+
+def test_a_board_that_knows_no_way_to_end_refuses(flying: Flying) -> None:
+    flown(flying)
+    assert "'battery.shutdown_command' is empty" in ask(flying, "shutdown").reason
+    assert "'supervision.reboot_command' is empty" in ask(flying, "reboot").reason
+    flying.end()
+
+
+def test_a_critical_battery_ends_recording_and_flight_and_then_the_board(
+    flying: Flying, tmp_path: Path
+) -> None:
+    card, mark = tmp_path / "card", tmp_path / "off"
+    command = ["sh", "-c", f"ls {card} > {mark}"]
+    flying.start(
+        "camera.uri=test:",
+        "battery.uri=i2c:ina219@fake:0x40?percentage=0.02",
+        "battery.period_s=0.5",
+        f"battery.shutdown_command={json.dumps(command)}",
+        f"recording.folder={card}",
+        "recording.at_start=true",
+        *RECORDING,
+    )
+    assert flying.process is not None
+    flying.process.wait(LIMIT_S)
+    counted = numbers(flying.end())
+    assert counted["captured"] == counted["sent"] + counted.get("disc", 0)
+    state = flying.has(messages.EVENT_STOPPED)
+    names = [event.name for event in state.events]
+    ended = names.index(messages.EVENT_RECORDING_ENDED)
+    assert names.index(messages.EVENT_BATTERY_CRITICAL) < names.index(messages.EVENT_STOPPED)
+    assert ended < names.index(messages.EVENT_STOPPED)
+    assert mark.read_text().split() == [path.name for path in card.iterdir()]
+    (path,) = card.glob("*.mcap")
+    reader = RecordingReader(path)
+    assert list(reader.video()) and not reader.cut
