@@ -7,12 +7,14 @@ and proves nothing: whom a payload then speaks to is for the certificates to dec
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import ipaddress
 import json
 import re
 import socket
 import struct
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +34,8 @@ LOOPBACK_INTERFACE = "lo"
 INTERFACE_WAIT_S = 10.0
 """A radio that was just switched on gets its address within this."""
 _INTERFACE_POLL_S = 0.2
+_CALLBACK_THREAD = "pyo3-closure"
+_CALLBACKS_END_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,8 @@ def open_session(
     """
     import zenoh
 
+    atexit.unregister(_await_callbacks)
+    atexit.register(_await_callbacks)
     held = credentials.load(certificates) if str(certificates) else None
     for endpoint in connect:
         check_endpoint(endpoint, certified=held is not None)
@@ -134,6 +140,22 @@ def open_session(
             where = ", ".join([*endpoints, *connect]) or "no endpoint"
             raise TelemetryError(f"telemetry at {where}: {reason}") from None
     raise AssertionError("unreachable")
+
+
+def callback_threads() -> list[threading.Thread]:
+    """The threads on which Zenoh runs callbacks: one for each subscriber and queryable."""
+    return [thread for thread in threading.enumerate() if _CALLBACK_THREAD in thread.name]
+
+
+def _await_callbacks() -> None:
+    """Lets the callbacks' threads end, which takes a moment after their session is closed.
+
+    One that comes back from Rust when the interpreter is already going makes it abort: an orderly
+    end would be signal 6, in about one of twenty.
+    """
+    until_s = time.monotonic() + _CALLBACKS_END_S
+    for thread in callback_threads():
+        thread.join(max(0.0, until_s - time.monotonic()))
 
 
 def interface_address(interface: str) -> str | None:

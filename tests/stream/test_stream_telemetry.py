@@ -1,6 +1,8 @@
 """The listener keeps what payloads say, refuses what they should not say, and knows who lives."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -180,3 +182,20 @@ def test_a_session_uses_neither_shared_memory_nor_multicast() -> None:
     settings = session_config(["tcp/127.0.0.1:7447"], [])
     for name in ("transport/shared_memory", "scouting/multicast", "scouting/gossip"):
         assert json.loads(settings.get_json(f"{name}/enabled")) is False
+
+
+END = """
+import atexit, sys, threading
+atexit.register(lambda: print([t.name for t in threading.enumerate() if t.daemon]))  # runs last
+from pi_firmware.wire.telemetry import callback_threads, open_session
+session = open_session()
+subscribers = [session.zenoh.declare_subscriber(f"blimp/*/{i}", print) for i in range(20)]
+print(len(callback_threads()))
+session.close()
+"""
+
+
+def test_a_program_ends_after_its_callbacks() -> None:
+    """Otherwise one end in twenty is an abort: Zenoh's threads meet an interpreter that is gone."""
+    run = subprocess.run([sys.executable, "-c", END], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0 and run.stdout.splitlines() == ["20", "[]"], run.stderr
