@@ -6,7 +6,9 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 
 from pi_firmware import gstreamer
 from pi_firmware.media import Counters, Decided, Leave, Media
@@ -67,6 +69,7 @@ class Capture:
         self._started_s = 0.0
         self._due_s: float | None = None
         self._trusted: Settings | None = None
+        self._asked: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._ending = False
         self._media: Media | None = None
         self._source: Source | None = None
@@ -113,6 +116,7 @@ class Capture:
 
         Raises `BlimpError` for a fault that a restart does not mend, `Hopeless` after too many.
         """
+        self._serve()
         if self._due_s is not None:
             time.sleep(_POLL_NS / 1e9)
             if self._ending:
@@ -179,21 +183,41 @@ class Capture:
         if media is not None:
             media.link_report(lost, round_trip_s)
 
-    def use(self, camera: CameraSettings) -> None:
-        """Starts the camera anew with other settings; with the old ones when it refuses.
+    def ask_for(self, camera: CameraSettings) -> Future[None]:
+        """Has the camera started anew with other settings; with the old ones when it refuses.
 
-        Raises `BlimpError` with its reason then. Only on the thread that calls `step`.
+        From any thread: `step` does it. The result is there when it was done, or a `BlimpError`.
         """
+        done: Future[None] = Future()
+        self._asked.put((camera, done))
+        return done
+
+    def _serve(self) -> None:
+        try:
+            camera, done = self._asked.get_nowait()
+        except Empty:
+            return
+        try:
+            self._use(camera)
+        except Hopeless as error:
+            done.set_exception(error)
+            raise
+        except BlimpError as error:
+            done.set_exception(error)
+        else:
+            done.set_result(None)
+
+    def _use(self, camera: CameraSettings) -> None:
         before = self._settings
         self._shut()
         self._settings, self._trusted = dataclasses.replace(before, camera=camera), before
         try:
             self._open()
             self.start()
-        except BlimpError as error:
+        except BlimpError:
             self._shut()
             self._go_back(before)
-            raise error
+            raise
 
     def _give_up(self, error: BlimpError) -> None:
         """The source says that opening it anew would be no better: settings that were asked for on

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
-from queue import Empty, SimpleQueue
 
-from pi_firmware import encoder, link
+from pi_firmware import encoder, link, orders
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.capture import Capture, Hopeless
-from pi_firmware.commands import Action, Commands, Refusal, Values
+from pi_firmware.commands import Commands
 from pi_firmware.ground import Ground
 from pi_firmware.media import Counters, Unit
 from pi_firmware.recording import Recorder
 from pi_firmware.reporting import Reporter
-from pi_firmware.settings import CameraSettings, Settings
+from pi_firmware.settings import Settings
 from pi_firmware.supervision import AUTOPILOT, BATTERY, Supervision
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import messages
-from pi_firmware.wire.config import range_of
 from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 
 _FLUSH_LIMIT_S = 10.0
 _COMMAND_LIMIT_S = 30.0
-_EXPOSURE_LIMIT_S = 10.0
 
 
 class Payload:
@@ -45,9 +40,9 @@ class Payload:
         self.ssrc = link.draw_ssrc(settings.link)
         self._stop = threading.Event()
         self._afterwards: list[str] = []
-        self._requests: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
-        self._link = link.Link(settings.link, self.ssrc)
+        key = link.load_key(settings.telemetry.certificates)
+        self._link = link.Link(settings.link, self.ssrc, key)
         self._recorder = Recorder(
             settings.recording,
             lambda name, text: self._reporter.announce(name, text),
@@ -87,7 +82,8 @@ class Payload:
             on_low=self._capture.limit_bitrate,
         )
         self._commands = Commands(
-            self._actions(), lambda text: self._reporter.announce(messages.EVENT_COMMAND, text)
+            orders.table(settings, self._capture, self._recorder, self._end),
+            lambda text: self._reporter.announce(messages.EVENT_COMMAND, text),
         )
 
     def run(self, stop: threading.Event) -> None:
@@ -159,7 +155,6 @@ class Payload:
     def _fly(self, stop: threading.Event) -> None:
         flush_until: float | None = None
         while self._capture.step():
-            self._serve()
             self._supervision.tend(self._fresh_frames())
             if failure := self._link.failure():
                 raise StreamError(f"video link: {failure}")
@@ -191,33 +186,12 @@ class Payload:
 
     def _on_critical(self) -> None:
         """On the battery's thread: the recording ends at once, whatever the flight's end takes."""
-        self._afterwards = self.settings.battery.shutdown_command
-        self._stop.set()
+        self._end(self.settings.battery.shutdown_command)
         self._recorder.close()
 
-    def _actions(self) -> dict[str, Action]:
-        """The table of commands."""
-        camera, settings = CameraSettings, self.settings
-        return {
-            "idr": Action(self._capture.force_idr),
-            "bitrate": Action(
-                lambda kbps: {"kbps": self._capture.set_bitrate(round(kbps))},
-                {"kbps": (50, 20_000)},
-                frozenset({"kbps"}),
-            ),
-            "exposure": Action(
-                self._expose,
-                {name: range_of(camera, name) for name in ("exposure_s", "gain")},
-            ),
-            "record-start": Action(self._record),
-            "record-stop": Action(self._end_recording),
-            "shutdown": Action(
-                lambda: self._end("battery.shutdown_command", settings.battery.shutdown_command)
-            ),
-            "reboot": Action(
-                lambda: self._end("supervision.reboot_command", settings.supervision.reboot_command)
-            ),
-        }
+    def _end(self, command: list[str]) -> None:
+        self._afterwards = command
+        self._stop.set()
 
     def _record_at_start(self) -> None:
         """A card that takes no recording ends no flight."""
@@ -225,49 +199,6 @@ class Payload:
             self._recorder.start()
         except RecordingError as error:
             self._reporter.announce(messages.EVENT_RECORDING_ENDED, str(error))
-
-    def _record(self) -> None:
-        self._recorder.start()
-
-    def _end_recording(self) -> None:
-        if not self._recorder.stop():
-            raise Refusal("nothing was recorded")
-
-    def _end(self, key: str, command: list[str]) -> None:
-        if not command:
-            raise Refusal(f"'{key}' is empty: this payload does not know how")
-        self._afterwards = command
-        self._stop.set()
-
-    def _expose(self, exposure_s: float | None = None, gain: float | None = None) -> Values:
-        """Starts the camera anew with another exposure or gain, on the thread that may."""
-        if not self._capture.live:
-            raise Refusal("a recording is exposed already")
-        camera = self._capture.camera
-        if exposure_s is not None:
-            camera = dataclasses.replace(camera, exposure_s=exposure_s)
-        if gain is not None:
-            camera = dataclasses.replace(camera, gain=gain)
-        done: Future[None] = Future()
-        self._requests.put((camera, done))
-        try:
-            done.result(_EXPOSURE_LIMIT_S)
-        except TimeoutError:
-            raise Refusal(f"the camera did not answer within {_EXPOSURE_LIMIT_S:g} s") from None
-        return {"exposure_s": camera.exposure_s, "gain": camera.gain}
-
-    def _serve(self) -> None:
-        """What others asked of the camera, on the thread that may restart it."""
-        try:
-            camera, done = self._requests.get_nowait()
-        except Empty:
-            return
-        try:
-            self._capture.use(camera)
-        except BlimpError as error:
-            done.set_exception(error)
-        else:
-            done.set_result(None)
 
 
 def _run_last(command: list[str]) -> None:
