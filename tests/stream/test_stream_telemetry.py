@@ -185,17 +185,19 @@ def test_a_session_uses_neither_shared_memory_nor_multicast() -> None:
 
 
 END = """
-import atexit, sys, threading
+import atexit, threading, time
 atexit.register(lambda: print([t.name for t in threading.enumerate() if t.daemon]))  # runs last
 from pi_firmware.wire.telemetry import callback_threads, open_session
 session = open_session()
-subscribers = [session.zenoh.declare_subscriber(f"blimp/*/{i}", print) for i in range(20)]
-print(len(callback_threads()))
+subscriber = session.zenoh.declare_subscriber("blimp/a/b", print)
+[thread] = callback_threads()
 session.close()
+late = threading.Thread(target=time.sleep, args=(0.5,), name=thread.name, daemon=True)
+late.start()
 """
 
 
 def test_a_program_ends_after_its_callbacks() -> None:
     """Otherwise one end in twenty is an abort: Zenoh's threads meet an interpreter that is gone."""
     run = subprocess.run([sys.executable, "-c", END], capture_output=True, text=True, timeout=60)
-    assert run.returncode == 0 and run.stdout.splitlines() == ["20", "[]"], run.stderr
+    assert run.returncode == 0 and run.stdout == "[]\n", run.stderr
