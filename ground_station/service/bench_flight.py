@@ -12,8 +12,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from ground_station.errors import GroundStationError
@@ -96,10 +97,12 @@ class Ground:
     def _receive(self) -> None:
         counters = Counters()
         reorderer, depacketizer = rtp.Reorderer(counters), rtp.Depacketizer(counters)
-        while not self._closing.is_set():
+        while True:
             try:
                 datagram = self._socket.recv(65535)
             except TimeoutError:
+                if self._closing.is_set():  # and nothing is left
+                    return
                 continue
             packet = rtp.parse(datagram, time.monotonic_ns())
             wall_ns = time.time_ns()
@@ -159,6 +162,7 @@ def fly(
     *,
     before: Sequence[str] = (),
     python: Sequence[str] = (),
+    environment: Mapping[str, str] = MappingProxyType({}),
 ) -> Iterator[Flight]:
     """Starts the program with `KEY=VALUE` settings and kills it at the block's end if need be.
 
@@ -175,7 +179,7 @@ def fly(
             text=True,
             errors="replace",
             # Hashes are drawn at each start otherwise, and with them the cost of every dictionary.
-            env=os.environ | {"PYTHONHASHSEED": "0", "TMPDIR": folder},
+            env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder, **environment},
         )
         flight = Flight(process, begin_ns)
         for target in (flight._read_said, flight._read_errors):

@@ -11,8 +11,9 @@ example:
   blimp bench payload --json out/bench-payload.json
   blimp bench payload --parts instructions --frames 60
 
-Instructions are of this machine's processor and libraries; those of a group repeat within a few
-thousand a frame. Times of two machines do not compare."""
+Instructions are of this machine's processor and libraries. x264's repeat within 1 %, those of
+Python and the bindings within a fifth: a clock that answers slowly is asked again. Times of two
+machines do not compare."""
 
 _PARTS = ("start", "stream", "instructions")
 
