@@ -1,5 +1,6 @@
 """Off loopback nobody sees or forges the video: the payload's link with its key, and without."""
 
+import json
 import socket
 import threading
 import time
@@ -8,9 +9,11 @@ from pathlib import Path
 import pytest
 from numbered_flight import GOP, capture_ns, encoded, number_in, stamped, start_payload
 
-from ground_station.stream import rtp
+from ground_station.keys.authority import Authority
+from ground_station.stream import rtp, srtp
 from ground_station.stream.receiver import ReceivedFrame, Receiver
 from ground_station.stream.srtp import Unprotector
+from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.link import Link, load_key
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import annexb, sei
@@ -199,3 +202,57 @@ def test_a_program_without_a_key_refuses_the_open_air(flight: Path) -> None:
     _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2
     assert err.count("\n") == 1 and "'192.0.2.1': no SRTP key" in err
+
+
+def test_a_program_with_a_key_file_that_was_cut_is_one_line(flight: Path, tmp_path: Path) -> None:
+    folder = Authority.create(tmp_path / "keys").add("payload", "blimp-1")
+    key = (folder / "srtp.key").read_text()
+    (folder / "srtp.key").write_text(key[:40])
+    process = start_payload(
+        f"camera.uri=replay:{flight}", f"telemetry.certificates={folder}", "telemetry.connect=[]"
+    )
+    _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2
+    assert err.count("\n") == 1 and "srtp.key: 20 bytes" in err and key[:40] not in err
+
+
+def test_a_flight_with_certificates_is_seen_by_its_ground_station_only(
+    flight: Path, tmp_path: Path
+) -> None:
+    authority = Authority.create(tmp_path / "keys")
+    ground, payload = authority.add("ground", "main"), authority.add("payload", "blimp-1")
+    authority.add("payload", "blimp-2")
+    keys = srtp.load_keys(ground)
+    with (
+        Receiver(0, queue_frames=100, srtp_keys=keys) as receiver,
+        Receiver(0, queue_frames=100) as stranger,
+        Eavesdropper(receiver.port) as air,
+        TelemetryListener(["tls/127.0.0.1:0"], certificates=ground) as listener,
+    ):
+        process = start_payload(
+            f"camera.uri=replay:{flight}",
+            f"link.port={air.port}",
+            f"telemetry.certificates={payload}",
+            f"telemetry.connect={json.dumps(listener.endpoints)}",
+        )
+        try:
+            out, err = process.communicate(timeout=LIMIT_S)
+        finally:
+            process.kill()
+        assert process.returncode == 0, err
+        assert "60 captured, 0 gated, 60 sent" in out
+        frames = take(receiver, 60)
+        assert [number_in(frame.image) for frame in frames] == list(range(60))
+        assert [frame.time_ns for frame in frames] == [capture_ns(index) for index in range(60)]
+        assert receiver.payload_id == "blimp-1"
+        heard = list(air.heard)
+        counters = receiver.counters
+        assert counters.packets == len(heard)
+        assert counters.refused == counters.replayed == counters.packets_lost == 0
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as relay:
+            for datagram in heard:
+                relay.sendto(datagram, ("127.0.0.1", stranger.port))
+                time.sleep(0.001)
+        assert stranger.get(0.3) is None
+        assert stranger.counters.packets > 50 and stranger.counters.decoded == 0
+    assert_secret(heard, keys["blimp-1"])
