@@ -163,8 +163,8 @@ class Flight:
         took_s = time.monotonic() - asked_s
         left = len(self.witness.left()) - before
         assert seen is not None, (
-            f"no fresh frame within {within_s:g} s ({left} left the payload,"
-            f" running: {self.payload.running})"
+            f"no fresh frame within {within_s:g} s, {left} left the payload;"
+            f" its status: {self.payload.process.poll()}, it wrote: {self.payload.written()}"
         )
         return took_s
 

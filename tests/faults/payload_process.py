@@ -101,6 +101,10 @@ class PayloadProcess:
         """Whether it has not ended."""
         return self.process.poll() is None
 
+    def written(self) -> str:
+        """What it has written so far, on both."""
+        return self._out.read_text() + self._err.read_text()
+
     def end(self, number: signal.Signals | None = signal.SIGTERM) -> Ended:
         """Sends a signal (None: it ends by itself) and waits for the end."""
         asked_s = time.monotonic()

@@ -2,48 +2,23 @@
 
 from __future__ import annotations
 
-import mmap
-import shutil
-import struct
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 from flight import FRESH_S, SMALL_FRAMES, Flight
 from ground import Ground
+from shims import Shim
 
 from pi_firmware.wire import messages
 
 HOUR_NS = 3_600_000_000_000
 EXACT_NS = 1_000_000  # what capture times promise
-SHIM = Path(__file__).with_name("stepped_clock.c")
-
-
-class SteppedClock:
-    """The wall clock of the programs started with `env`; `step_ns` moves it now."""
-
-    def __init__(self, folder: Path) -> None:
-        compiler = shutil.which("cc")
-        if compiler is None:
-            pytest.skip("no C compiler for the clock's shim")
-        library, step = folder / "stepped_clock.so", folder / "step"
-        subprocess.run(
-            [compiler, "-shared", "-fPIC", "-O1", "-o", library, SHIM, "-ldl"], check=True
-        )
-        step.write_bytes(bytes(8))
-        with step.open("r+b") as file:
-            self._step = mmap.mmap(file.fileno(), 8)
-        self.env = {"LD_PRELOAD": str(library), "STEPPED_CLOCK": str(step)}
-
-    def step_to(self, offset_ns: int) -> None:
-        """From now on the clock is this far from the true one."""
-        self._step[:] = struct.pack("=q", offset_ns)
 
 
 @pytest.mark.parametrize("step_ns", [-HOUR_NS, HOUR_NS], ids=["back", "forward"])
 def test_a_clock_that_is_stepped(recording: Path, tmp_path: Path, step_ns: int) -> None:
-    clock = SteppedClock(tmp_path)
+    clock = Shim(tmp_path, "stepped_clock")
     with (
         Ground() as ground,
         Flight(tmp_path, ground, recording, *SMALL_FRAMES, env=clock.env) as flight,
@@ -63,7 +38,7 @@ def test_a_clock_that_is_stepped(recording: Path, tmp_path: Path, step_ns: int) 
         flight.wait_streaming(30)
         assert offset_error_ns(0, 10) is not None
         time.sleep(0.5)
-        clock.step_to(step_ns)
+        clock.set(step_ns)
         stepped_ns = time.time_ns()
         flight.wait_streaming()
         left_s = FRESH_S - (time.time_ns() - stepped_ns) / 1e9

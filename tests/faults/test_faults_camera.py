@@ -1,0 +1,133 @@
+"""A camera that goes or hangs, an encoder that stalls: started anew in the process, or with it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from flight import FRESH_S, Account, Flight
+from ground import Ground
+from payload_process import LIMIT_S
+from shims import Shim
+
+from pi_firmware.wire import messages
+
+SMALL = (
+    "camera.width_px=160",
+    "camera.height_px=120",
+    "camera.rate_hz=15",
+    "gate.enabled=false",
+    "supervision.frame_timeout_s=1",
+)
+TAKES_AND_GIVES_NONE, DOES_NOT_COME_BACK = 1, 2
+HOPELESS = 3
+"""Exit status by which systemd starts the process anew."""
+
+
+def events_of(ground: Ground) -> list[str]:
+    """The names of what the payload announced."""
+    state = ground.listener.state("blimp-1")
+    return [event.name for event in state.events] if state else []
+
+
+def wait_for_gap(flight: Flight, seconds: float) -> float:
+    """Waits until no frame has left the payload for so long; the time of the last one."""
+    last, since_s = -1, time.monotonic()
+    until_s = since_s + LIMIT_S
+    while time.monotonic() < until_s:
+        left = len(flight.witness.left())
+        if left != last:
+            last, since_s = left, time.monotonic()
+        if time.monotonic() - since_s > seconds:
+            return since_s
+        time.sleep(0.02)
+    raise AssertionError("the fault did not come")
+
+
+def assert_accounted(account: Account) -> None:
+    """Whole, and each number that was skipped is one that the payload discarded."""
+    account.assert_exact()
+    assert len(account.seen) == len(account.left)
+    sequences = [frame.sequence for frame in account.left]
+    skipped = set(range(account.ended.counts["captured"])) - set(sequences)
+    assert len(skipped) == account.ended.counts["discarded"]
+
+
+def test_a_camera_that_is_gone_and_back(tmp_path: Path) -> None:
+    uri = "test:?gone_at_s=2&gone_for_s=3"
+    with (
+        Ground(numbered=False) as ground,
+        Flight(tmp_path, ground, None, *SMALL, camera=uri) as flight,
+    ):
+        flight.wait_streaming(30)
+        gone_s = wait_for_gap(flight, 1)
+        flight.wait_streaming(gone_s + 3 + FRESH_S - time.monotonic())
+        time.sleep(0.5)
+        account = flight.finish()
+        events = events_of(ground)
+    assert_accounted(account)
+    assert messages.EVENT_CAMERA_RESTARTED in events
+    assert events.count(messages.EVENT_STREAMING_AGAIN) == 1
+    assert messages.EVENT_FAILED not in events
+
+
+def test_a_camera_that_hangs_is_opened_anew(tmp_path: Path) -> None:
+    uri = "test:?hang_at_s=2&hang_for_s=60"
+    with (
+        Ground(numbered=False) as ground,
+        Flight(tmp_path, ground, None, *SMALL, camera=uri) as flight,
+    ):
+        flight.wait_streaming(30)
+        wait_for_gap(flight, 0.6)
+        flight.wait_streaming()
+        time.sleep(0.5)
+        account = flight.finish()
+        events = events_of(ground)
+    assert_accounted(account)
+    assert events.count(messages.EVENT_CAMERA_RESTARTED) == 1
+    assert events.count(messages.EVENT_STREAMING_AGAIN) == 1
+
+
+def test_an_encoder_that_gives_nothing_is_opened_anew(tmp_path: Path) -> None:
+    encoder = Shim(tmp_path, "encoder_fault")
+    with (
+        Ground(numbered=False) as ground,
+        Flight(tmp_path, ground, None, *SMALL, camera="test:", env=encoder.env) as flight,
+    ):
+        flight.wait_streaming(30)
+        encoder.set(TAKES_AND_GIVES_NONE)
+        assert ground.listener.wait_for_event("blimp-1", messages.EVENT_ENCODER_RESTARTED, LIMIT_S)
+        encoder.set(0)
+        flight.wait_streaming()
+        time.sleep(0.5)
+        account = flight.finish()
+        events = events_of(ground)
+    assert_accounted(account)
+    assert account.ended.counts["discarded"] > 10
+    assert messages.EVENT_STREAMING_AGAIN in events
+    assert messages.EVENT_FAILED not in events
+
+
+def test_an_encoder_that_never_comes_back_ends_the_process_for_a_new_one(tmp_path: Path) -> None:
+    """What hangs inside a call cannot be closed: status 3, the counters right, and the next."""
+    encoder = Shim(tmp_path, "encoder_fault")
+    with Ground(numbered=False) as ground:
+        with Flight(
+            tmp_path / "hangs", ground, None, *SMALL, camera="test:", env=encoder.env
+        ) as flight:
+            flight.wait_streaming(30)
+            encoder.set(DOES_NOT_COME_BACK)
+            ended = flight.payload.end(None)
+            left = flight.witness.left()
+            assert ended.status == HOPELESS, ended.err
+            ended.assert_no_accident()
+            assert ended.err.startswith("pi_firmware: ") and ended.err.count("\n") == 1
+            failed = ground.listener.wait_for_event("blimp-1", messages.EVENT_FAILED, FRESH_S)
+            assert failed is not None and failed.values["sent"] == len(left)
+            assert [frame.sequence for frame in left] == list(range(len(left)))
+        with Flight(tmp_path / "next", ground, None, *SMALL, camera="test:") as successor:
+            started_s = time.monotonic()
+            while ground.frames[-1].ssrc not in successor.witness.ssrcs():
+                assert time.monotonic() - started_s < FRESH_S
+                time.sleep(0.02)
+            successor.payload.end().assert_in_order()
