@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,12 +46,16 @@ def make_authority(folder: Path) -> Authority:
 def test_a_payload_finds_the_ground_it_trusts_on_a_network_that_comes_up_late(
     namespaces: list[str], authority: Authority, tmp_path: Path
 ) -> None:
-    """Two ground stations answer; the one of another authority never learns of the payload."""
+    """The payload's program is told of nobody: it finds telemetry and where its video goes.
+
+    Two ground stations answer; the one of another authority never learns of the payload.
+    """
     foreign = make_authority(tmp_path / "foreign")
     hosts = [*namespaces, sys.executable, str(HOSTS), str(authority.folder), str(foreign.folder)]
     run = subprocess.run(hosts, capture_output=True, text=True, timeout=180)
     assert run.returncode == 0, run.stderr
-    assert json.loads(run.stdout) == {"first": True, "again": True, "stranger": []}
+    heard = {"link told": True, "video": True}
+    assert json.loads(run.stdout) == {"first": heard, "again": heard, "stranger": []}
 
 
 LO = """
@@ -79,7 +84,8 @@ def test_on_loopback_it_needs_no_certificate(
 
 
 def test_elsewhere_nobody_is_looked_for_without_a_certificate() -> None:
-    for options in ({"scout": "wlan0"}, {"discoverable": "wlan0"}):
+    cases: tuple[dict[str, Any], ...] = ({"scout": "wlan0"}, {"discoverable": "wlan0"})
+    for options in cases:
         with pytest.raises(TelemetryError, match="'wlan0': without certificates only 'lo'"):
             open_session(listen=["tcp/127.0.0.1:0"], **options)
 

@@ -7,7 +7,6 @@ other one for the payload. Prints one JSON object of what the ground stations he
 from __future__ import annotations
 
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -15,10 +14,11 @@ import threading
 import time
 from pathlib import Path
 
-from ground_station.stream.telemetry import TelemetryListener
-from pi_firmware.settings import TelemetrySettings
-from pi_firmware.telemetry import Telemetry
-from pi_firmware.wire import messages
+from ground_station.stream.feedback import Feedback
+from ground_station.stream.receiver import Receiver
+from ground_station.stream.srtp import load_keys
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware import __main__ as firmware
 from pi_firmware.wire.telemetry import interface_address
 
 GROUND, PAYLOAD = "ground0", "payload0"
@@ -54,22 +54,35 @@ def ground(certificates: Path, foreign: Path) -> None:
 def listen(certificates: Path, foreign: Path) -> dict[str, object]:
     """What both heard, and what ours heard after it was started anew on another port."""
     said: dict[str, object] = {}
-    endpoint = "tls/10.9.0.1:0"
-    with TelemetryListener(
-        [endpoint], certificates=foreign / "ground" / "main", discoverable=GROUND
-    ) as stranger:
+    endpoint, folder = "tls/10.9.0.1:0", certificates / "ground" / "main"
+    with (
+        TelemetryListener(
+            [endpoint], certificates=foreign / "ground" / "main", discoverable=GROUND
+        ) as stranger,
+        Receiver(0, "10.9.0.1", srtp_keys=load_keys(folder)) as receiver,
+    ):
         for name in ("first", "again"):
-            with TelemetryListener(
-                [endpoint], certificates=certificates / "ground" / "main", discoverable=GROUND
-            ) as ours:
-                state = ours.wait("blimp-1", lambda s: s.battery is not None, LIMIT_S)
-                said[name] = state is not None and state.alive
+            with (
+                TelemetryListener([endpoint], certificates=folder, discoverable=GROUND) as ours,
+                Feedback(ours, {"blimp-1": receiver}.get),
+            ):
+                told = ours.wait("blimp-1", lambda s: s.alive and _told(s), LIMIT_S)
+                frame = receiver.get(LIMIT_S)
+                said[name] = {"link told": told is not None, "video": frame is not None}
         said["stranger"] = stranger.payloads()
     return said
 
 
-def payload(folder: str) -> None:
-    """The payload's host: its interface comes late, and its address later."""
+def _told(state: PayloadState) -> bool:
+    """Whether the payload says that it was told of its link, since it was last lost sight of."""
+    return state.health is not None and state.health.round_trip_s is not None
+
+
+def payload(folder: str) -> int:
+    """The payload's host: its interface comes late, and its address later.
+
+    Its program knows nothing of the ground station but the certificates of both.
+    """
     print("ready", flush=True)
 
     def switch_on() -> None:
@@ -80,15 +93,16 @@ def payload(folder: str) -> None:
 
     assert interface_address(PAYLOAD) is None
     threading.Thread(target=switch_on, daemon=True).start()
-    settings = TelemetrySettings(connect=[], certificates=folder, discover=PAYLOAD)
-    telemetry = Telemetry("blimp-1", settings)
-    while os.getppid() != 1:
-        telemetry.battery(messages.Battery(time_ns=1, voltage=3.9))
-        time.sleep(0.1)
+    settings = (
+        "camera.uri=test:", "camera.rate_hz=10", "link.host=auto", "telemetry.connect=[]",
+        f"telemetry.certificates={folder}", f"telemetry.discover={PAYLOAD}", "wifi.interface=",
+    )  # fmt: skip
+    sys.argv = ["pi_firmware", *(part for setting in settings for part in ("--set", setting))]
+    return firmware.main()
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "payload":
-        payload(sys.argv[2])
+        sys.exit(payload(sys.argv[2]))
     else:
         ground(Path(sys.argv[1]), Path(sys.argv[2]))
