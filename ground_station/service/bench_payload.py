@@ -11,7 +11,7 @@ example:
   blimp bench payload --json out/bench-payload.json
   blimp bench payload --parts instructions --frames 60
 
-Instructions are of this machine's processor and libraries. x264's repeat within 1 %, those of
+Instructions are of this machine's processor and libraries. x264's repeat within 5 %, those of
 Python and the bindings within a fifth: a clock that answers slowly is asked again. Times of two
 machines do not compare."""
 
@@ -169,7 +169,7 @@ def _instructions(
     )
     return [
         *columns(rows),
-        f"{frames} frames at {base['rate_hz']:.0f} Hz under valgrind; at 30 Hz the payload alone "
+        f"{frames} frames, {base['seconds']:.0f} s under valgrind; at 30 Hz the payload alone "
         f"executes {30 * alone[SENT] / 1e6:.0f} million instructions a second",
     ]
 
