@@ -36,29 +36,28 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
-    from pi_firmware import autopilot, battery, settings, sources
+    from pi_firmware import autopilot, battery, link, settings, sources
 
     loaded = settings.load(arguments.config, arguments.set)
     if arguments.check:
         sources.check(loaded.camera.uri)
         battery.open_gauge(loaded.battery.uri, loaded.battery)
         autopilot.open_autopilot(loaded.autopilot)
+        link.load_key(loaded.telemetry.certificates if loaded.link.encrypted else "")
         print("configuration is good")
         return
     from pi_firmware.payload import Payload
 
     payload = Payload(loaded)
     try:
-        link = loaded.link
+        to = loaded.link
         print(
-            f"payload {loaded.payload_id}: {loaded.camera.uri} -> {link.host}:{link.port},"
+            f"payload {loaded.payload_id}: {loaded.camera.uri} -> {to.host}:{to.port},"
             f" ssrc {payload.ssrc}",
             *(f"telemetry on {endpoint}" for endpoint in payload.listening),
             sep="\n",
             flush=True,
         )
-        if payload.notice:
-            print(f"pi_firmware: {payload.notice}", file=sys.stderr)
         payload.run(stop)
         if payload.cut_reason:
             notice = (

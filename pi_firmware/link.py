@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import secrets
 import socket
+import sys
 import threading
 from pathlib import Path
 
@@ -96,9 +97,11 @@ class Link:
         """Why there is nowhere to send to, in one line; empty when there is."""
         if link.host == DISCOVERED:
             self.problem = f"link.host '{DISCOVERED}': no ground station was found yet"
-        elif not self._resolve(link):
-            if self._loopback_only:
-                raise StreamError(_without_key(link.host))
+        elif self._loopback_only or _is_numeric(link.host):
+            if not self._resolve(link):
+                raise StreamError(_without_key(link.host) if self._loopback_only else self.problem)
+        else:
+            # Never on this thread: a name server that is out of reach is waited for half a minute.
             self._resolver = threading.Thread(
                 target=self._resolve_later, args=(link,), name="link-host", daemon=True
             )
@@ -171,8 +174,13 @@ class Link:
             self._resolver.join(_RESOLVE_S)
 
     def _resolve_later(self, link: LinkSettings) -> None:
-        while not self._closing.wait(_RESOLVE_S) and not self._resolve(link):
-            pass
+        told = False
+        while not self._resolve(link):
+            if not told:
+                told = True
+                print(f"pi_firmware: {self.problem}", file=sys.stderr, flush=True)
+            if self._closing.wait(_RESOLVE_S):
+                return
 
     def _resolve(self, link: LinkSettings) -> bool:
         """Finds the host's numeric address: the sink would send nowhere without a word."""
@@ -190,6 +198,14 @@ def _without_key(host: str) -> str:
         f"video to '{host}': no SRTP key; set telemetry.certificates to the folder that"
         " 'blimp keys payload' wrote, or link.encrypted = false to send it for all to see"
     )
+
+
+def _is_numeric(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 def is_loopback(host: str) -> bool:

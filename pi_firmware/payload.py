@@ -41,7 +41,7 @@ class Payload:
         self._stop = threading.Event()
         self._afterwards: list[str] = []
         self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
-        key = link.load_key(settings.telemetry.certificates)
+        key = link.load_key(settings.telemetry.certificates) if settings.link.encrypted else None
         self._link = link.Link(settings.link, self.ssrc, key)
         self._recorder = Recorder(
             settings.recording,
@@ -130,11 +130,6 @@ class Payload:
     def listening(self) -> tuple[str, ...]:
         """Telemetry endpoints that this payload listens on."""
         return self._telemetry.listening
-
-    @property
-    def notice(self) -> str:
-        """What a person should know from the start, in one line; empty when there is nothing."""
-        return self._link.problem
 
     def close(self) -> None:
         """Stops everything and releases it; then runs what was asked for after the end."""
