@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-_GOOD_NS = 20_000
+_GOOD_NS = 100_000  # a tenth of the millisecond that capture times are good for
 _ATTEMPTS = 5
 
 

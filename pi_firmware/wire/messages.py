@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import json
 import math
 import types
@@ -249,12 +250,22 @@ EVENT_RADIO_FAILED = "radio-failed"
 EVENT_COMMAND = "command"
 
 
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+
+
+@functools.cache
+def _names(kind: type[Message]) -> tuple[str, ...]:
+    """The fields of a kind: a message leaves the payload with every frame."""
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
 def encode(message: Message) -> bytes:
     """The message as JSON text; raises `TelemetryError` on a number that is not finite."""
-    document = {"schema": f"{message.SCHEMA}/{message.MAJOR}.{message.MINOR}"}
-    document.update({f.name: getattr(message, f.name) for f in dataclasses.fields(message)})
+    document: dict[str, Any] = {"schema": f"{message.SCHEMA}/{message.MAJOR}.{message.MINOR}"}
+    for name in _names(type(message)):
+        document[name] = getattr(message, name)
     try:
-        return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+        return _ENCODER.encode(document).encode()
     except ValueError:
         raise TelemetryError(f"{message.SCHEMA}: a number is not finite: {message}") from None
 
