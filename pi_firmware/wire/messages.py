@@ -262,7 +262,7 @@ def _names(kind: type[Message]) -> tuple[str, ...]:
 def encode(message: Message) -> bytes:
     """The message as JSON text; raises `TelemetryError` on a number that is not finite."""
     document: dict[str, Any] = {"schema": f"{message.SCHEMA}/{message.MAJOR}.{message.MINOR}"}
-    for name in _names(type(message)):
+    for name in _names(type(message)):  # type: ignore[arg-type]  # a class is hashable
         document[name] = getattr(message, name)
     try:
         return _ENCODER.encode(document).encode()
