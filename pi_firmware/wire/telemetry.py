@@ -1,19 +1,12 @@
-"""Zenoh sessions as both sides open them: explicit endpoints, scouting only where it is asked for.
-
-Scouting is Zenoh's: a payload asks a multicast group (224.0.0.224, UDP port 7446) on one interface
-who is there, a ground station answers with the endpoints it listens on. That says nothing secret
-and proves nothing: whom a payload then speaks to is for the certificates to decide.
-"""
+"""Zenoh sessions as both sides open them: explicit endpoints, scouting only where it is asked."""
 
 from __future__ import annotations
 
 import atexit
-import fcntl
 import ipaddress
 import json
 import re
 import socket
-import struct
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -22,18 +15,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from pi_firmware.wire import credentials
+from pi_firmware.wire import credentials, scouting
 from pi_firmware.wire.errors import TelemetryError
 
 PORT = 7447
 LOCAL_ENDPOINT = f"tcp/127.0.0.1:{PORT}"
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^\[\]:/#?]+):(\d{1,5})")
 _ATTEMPTS = 5
-_SIOCGIFADDR = 0x8915  # Linux, not in Python's modules
-LOOPBACK_INTERFACE = "lo"
-INTERFACE_WAIT_S = 10.0
-"""A radio that was just switched on gets its address within this."""
-_INTERFACE_POLL_S = 0.2
 _CALLBACK_THREAD = "pyo3-closure"
 _CALLBACKS_END_S = 2.0
 
@@ -42,12 +30,24 @@ _CALLBACKS_END_S = 2.0
 class Session:
     """An open Zenoh session and the endpoints it listens on, ephemeral ports filled in.
 
-    `scouting` is whether it looks for others or can be found; see `open_session`.
+    `interface` is the one that it is to look or answer on, and `scouting` the address that it does
+    so from; both are empty where it does not.
     """
 
     zenoh: Any
     listening: tuple[str, ...]
-    scouting: bool = False
+    interface: str = ""
+    scouting: str = ""
+
+    @property
+    def outdated(self) -> bool:
+        """Whether the interface has another address now than the one that it looks from.
+
+        Zenoh looks from the addresses that were there when the session was opened: only a new
+        session finds anyone from this one.
+        """
+        address = scouting.interface_address(self.interface) if self.interface else None
+        return address is not None and address != self.scouting
 
     def close(self) -> None:
         """Sends what is queued and closes; a second call does nothing."""
@@ -103,8 +103,7 @@ def open_session(
     `scout` names an interface to look on for others, again and again at most 8 s apart, and to
     connect to whoever answers; `discoverable` one to answer on, with the endpoints of `listen`.
     Without certificates it can only be `lo`. An interface that has no address yet is waited for;
-    if it gets none the session is opened all the same and `scouting` is false: it will not look
-    until it is opened anew.
+    if it gets none the session is opened all the same, and is `outdated` once there is one.
 
     With `client_timeout_s` it is a client: it has one link, to the first of `connect` that takes it
     within that time, and whoever that is hands on what it says to its own peers. Otherwise it is a
@@ -120,15 +119,18 @@ def open_session(
     held = credentials.load(certificates) if str(certificates) else None
     for endpoint in connect:
         check_endpoint(endpoint, certified=held is not None)
-    more = _scouting(scout, discoverable, listen, certified=held is not None)
-    scouting = bool(more)
+    interface = scouting.check(scout, discoverable, listen, certified=held is not None)
+    address = scouting.await_address(interface) if interface else ""
+    more: dict[str, Any] = {}
+    if address:
+        more = scouting.settings(interface, look=bool(scout), answer=bool(discoverable))
     if client_timeout_s is not None:
         more |= {"mode": "client", "connect/timeout_ms": round(1000 * client_timeout_s)}
     for attempt in range(_ATTEMPTS):
         endpoints = [_with_port(endpoint, held is not None) for endpoint in listen]
         try:
             config = session_config(endpoints, connect, held, more)
-            return Session(zenoh.open(config), tuple(endpoints), scouting)
+            return Session(zenoh.open(config), tuple(endpoints), interface, address)
         except zenoh.ZError as error:
             in_use = "in use" in str(error)
             # Another program may take the free port between choosing and opening it.
@@ -156,57 +158,6 @@ def _await_callbacks() -> None:
     until_s = time.monotonic() + _CALLBACKS_END_S
     for thread in callback_threads():
         thread.join(max(0.0, until_s - time.monotonic()))
-
-
-def interface_address(interface: str) -> str | None:
-    """The interface's IPv4 address; None while it has none, or is not there."""
-    name = interface.encode(errors="replace")
-    if not 0 < len(name) < 16:  # Linux has no longer names
-        return None
-    request = struct.pack("256s", name)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        try:
-            reply = fcntl.ioctl(any_socket.fileno(), _SIOCGIFADDR, request)
-        except OSError:
-            return None
-    return socket.inet_ntoa(reply[20:24])
-
-
-def _scouting(
-    scout: str, discoverable: str, listen: Sequence[str], *, certified: bool
-) -> dict[str, Any]:
-    """Zenoh's settings of `scouting/multicast`; none when nobody is to look or be found."""
-    interface = scout or discoverable
-    if not interface:
-        return {}
-    if scout and discoverable and scout != discoverable:
-        raise TelemetryError(f"discovery on {scout!r} and {discoverable!r}: only one is possible")
-    if not certified and interface != LOOPBACK_INTERFACE:
-        raise TelemetryError(
-            f"discovery on {interface!r}: without certificates only"
-            f" {LOOPBACK_INTERFACE!r} is allowed"
-        )
-    if discoverable and not listen:
-        raise TelemetryError(f"discovery on {interface!r}: an endpoint to listen on is needed")
-    until_s = time.monotonic() + INTERFACE_WAIT_S
-    while interface_address(interface) is None:
-        if time.monotonic() > until_s:
-            known = [name for _, name in socket.if_nameindex()]
-            if interface not in known:
-                raise TelemetryError(
-                    f"discovery on {interface!r}: no such interface"
-                    f" (there are: {', '.join(known) or 'none'})"
-                )
-            return {}
-        time.sleep(_INTERFACE_POLL_S)
-    settings = {
-        "enabled": True,
-        "interface": interface,
-        "ttl": 1,  # this network and no further
-        "listen": bool(discoverable),
-        "autoconnect": {"peer": ["peer"] if scout else []},
-    }
-    return {f"scouting/multicast/{name}": value for name, value in settings.items()}
 
 
 def _with_port(endpoint: str, certified: bool) -> str:

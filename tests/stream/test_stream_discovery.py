@@ -11,7 +11,7 @@ import pytest
 
 from ground_station.keys.authority import Authority
 from ground_station.stream.telemetry import TelemetryListener
-from pi_firmware.wire import telemetry
+from pi_firmware.wire import scouting
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import open_session
 
@@ -93,7 +93,7 @@ def test_elsewhere_nobody_is_looked_for_without_a_certificate() -> None:
 def test_an_interface_that_is_not_there_is_named(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(telemetry, "INTERFACE_WAIT_S", 0.0)
+    monkeypatch.setattr(scouting, "INTERFACE_WAIT_S", 0.0)
     certificates = authority.of("payload.blimp-1")
     for name in ("nosuch0", "x" * 40):
         with pytest.raises(TelemetryError, match=rf"'{name}': no such interface \(there are: .*lo"):
@@ -103,10 +103,25 @@ def test_an_interface_that_is_not_there_is_named(
 def test_an_interface_without_an_address_does_not_hold_a_flight_up(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(telemetry, "INTERFACE_WAIT_S", 0.0)
-    monkeypatch.setattr(telemetry, "interface_address", lambda interface: None)
-    session = open_session(certificates=authority.of("payload.blimp-1"), scout="lo")
-    assert not session.scouting
+    """It is flown without a ground station, and one that comes needs a new session."""
+    addresses: dict[str, str] = {}
+    monkeypatch.setattr(scouting, "INTERFACE_WAIT_S", 0.0)
+    monkeypatch.setattr(scouting, "interface_address", addresses.get)
+    certificates = authority.of("payload.blimp-1")
+    session = open_session(certificates=certificates, scout="lo")
+    assert not session.scouting and not session.outdated
+    addresses["lo"] = "127.0.0.1"
+    assert session.outdated
+    session.close()
+    session = open_session(certificates=certificates, scout="lo")
+    assert session.scouting == "127.0.0.1" and not session.outdated
+    addresses.clear()  # gone for a moment: the same one may come back
+    assert not session.outdated
+    addresses["lo"] = "127.0.0.2"
+    assert session.outdated
+    session.close()
+    session = open_session(certificates=certificates)
+    assert not session.outdated
     session.close()
 
 

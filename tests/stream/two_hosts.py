@@ -19,7 +19,7 @@ from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import __main__ as firmware
-from pi_firmware.wire.telemetry import interface_address
+from pi_firmware.wire.scouting import interface_address
 
 GROUND, PAYLOAD = "ground0", "payload0"
 LIMIT_S = 60.0
