@@ -123,14 +123,16 @@ class Flight:
         payload_id: str = "blimp-1",
         env: Mapping[str, str] | None = None,
         prefix: Sequence[str] = (),
+        host: str = "127.0.0.1",
     ) -> None:
         self.payload_id = payload_id
         self.ground: Ground | GroundProcess = ground
         self.witness = Witness()
         self._numbered = not camera
+        self._speaks = "telemetry.enabled=false" not in settings
         self._stack = contextlib.ExitStack()
         self.link = self._stack.enter_context(
-            ImpairedLink(ground.port, impairment, seed=seed, tap=self.witness)
+            ImpairedLink(ground.port, impairment, seed=seed, tap=self.witness, host=host)
         )
         self.payload = self._stack.enter_context(
             PayloadProcess(
@@ -195,7 +197,7 @@ class Flight:
 
     def _said(self) -> dict[str, int]:
         """The counters of the last event in telemetry, where a listener is at hand."""
-        if not isinstance(self.ground, Ground):
+        if not (isinstance(self.ground, Ground) and self._speaks):
             return {}
         ends = (messages.EVENT_STOPPED, messages.EVENT_END_OF_STREAM)
         listener = self.ground.listener

@@ -68,7 +68,7 @@ class _Held:
 
 
 class ImpairedLink:
-    """Relays datagrams from its own `port` on loopback to another one there; a context manager.
+    """Relays datagrams from its own `port` on `host` to another on loopback; a context manager.
 
     `tap` is called for each datagram that comes, in order and before it goes on, with whether it is
     lost. Packets to a port where nobody listens count as passed, as they would on the air.
@@ -81,6 +81,7 @@ class ImpairedLink:
         *,
         seed: int = 0,
         tap: Callable[[bytes, bool], None] | None = None,
+        host: str = "127.0.0.1",
     ) -> None:
         self._counts = LinkCounts()
         self._impairment = impairment
@@ -96,7 +97,7 @@ class ImpairedLink:
         for option in (socket.SO_RCVBUF, _SO_RCVBUFFORCE):
             with contextlib.suppress(OSError):
                 self._in.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
-        self._in.bind(("127.0.0.1", 0))
+        self._in.bind((host, 0))
         self.port: int = self._in.getsockname()[1]
         self.retarget(to_port)
         self._closing = threading.Event()
