@@ -1,0 +1,94 @@
+"""The whole way of a pose: recording, firmware, link, localizer, firmware, autopilot."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import threading
+import tty
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from ground_station.localization.settings import load_preset
+from ground_station.mapping import store
+from ground_station.recording.flight import trajectory_of
+from ground_station.service import replay
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+
+SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
+
+
+class Vehicle:
+    """An autopilot's end of a serial line, which keeps what it is told; a context manager."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self.estimates: list[Any] = []
+        self._coder = mavlink.MAVLink(None)
+        self._coder.robust_parsing = True
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Vehicle:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        os.close(self.master)
+        os.close(self._slave)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            if select.select([self.master], [], [], 0.05)[0]:
+                for message in self._coder.parse_buffer(os.read(self.master, 4096)) or []:
+                    if message.get_type() == "VISION_POSITION_ESTIMATE":
+                        self.estimates.append(message)
+
+
+def test_poses_of_the_localizer_reach_the_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are where the truth is, in the autopilot's frame, and the payload hears of its link."""
+    settings = replay.settings_for(
+        "thesis", SAMPLE / "flight.mcap", start_s=2.0, duration_s=4.0, queue_frames=64
+    )
+    config = replay._payload_config
+    told: list[PayloadState] = []
+    state = TelemetryListener.state
+
+    def keep_state(listener: TelemetryListener, payload_id: str) -> PayloadState | None:
+        found = state(listener, payload_id)
+        if found is not None and found.health is not None:
+            told.append(found)
+        return found
+
+    monkeypatch.setattr(TelemetryListener, "state", keep_state)
+    with Vehicle() as vehicle:
+        # However slow the machine: a pose that came late is sent all the same.
+        autopilot = {"uri": f"serial:{vehicle.path}?baud=921600", "max_age_s": 5.0}
+        monkeypatch.setattr(
+            replay, "_payload_config", lambda *given: config(*given) | {"autopilot": autopilot}
+        )
+        result = replay.replay(store.load(SAMPLE), load_preset("thesis"), settings)
+    localized = [frame for frame in result.live.frames if frame.estimate.localized]
+    # The last ones meet a payload that has ended, on a slow machine more of them.
+    assert len(localized) >= 15 and 3 <= len(vehicle.estimates) <= len(localized)
+    by_clock = {frame.clock_ns // 1000: frame for frame in localized}
+    truth = trajectory_of(SAMPLE / "flight.mcap")
+    for message in vehicle.estimates:
+        frame = by_clock[message.usec]  # of the payload's clock at capture
+        at = truth.position_m[np.searchsorted(truth.time_ns, frame.estimate.time_ns)]
+        # North, east and down are the map's x, -y and -z.
+        np.testing.assert_allclose([message.x, -message.y, -message.z], at, atol=0.3)
+        assert not np.isnan(message.covariance[0]) and message.covariance[0] > 0
+    heard = [s.health for s in told if s.health is not None]
+    round_trips_s = [h.round_trip_s for h in heard if h.round_trip_s is not None]
+    assert round_trips_s and max(round_trips_s) < 10
+    assert {h.lost for h in heard} <= {None, 0.0}
