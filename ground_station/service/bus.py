@@ -1,0 +1,207 @@
+"""The service's local bus: a Zenoh router on a unix socket that only its own user can reach.
+
+The parent holds the router, every process is a client of it: one that dies and comes back is heard
+again without anyone else noticing. Pictures do not cross it; they lie in `pictures`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from ground_station.errors import GroundStationError
+from ground_station.service import notes
+from ground_station.service.notes import N, Note, ProcessNote
+from pi_firmware.wire.errors import BlimpError
+
+_SOCKET = "bus"
+_OPEN_LIMIT_S = 10.0
+
+Do = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+T = TypeVar("T", bound=Note)
+
+
+class BusError(GroundStationError):
+    """A bus that cannot be opened."""
+
+
+def _config(mode: str, folder: Path) -> Any:
+    import zenoh
+
+    endpoint = f"unixsock-stream/{folder / _SOCKET}"
+    config = zenoh.Config()
+    for name, value in {
+        "mode": mode,
+        "listen/endpoints": [endpoint] if mode == "router" else [],
+        "connect/endpoints": [] if mode == "router" else [endpoint],
+        "connect/timeout_ms": int(_OPEN_LIMIT_S * 1000),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+class Router:
+    """The bus itself, in the parent; raises `BusError` when the folder has no room for it."""
+
+    def __init__(self, folder: Path) -> None:
+        import zenoh
+
+        try:
+            self._session = zenoh.open(_config("router", folder))
+        except zenoh.ZError as error:
+            raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
+
+    def close(self) -> None:
+        """Ends it; clients wait for the next one."""
+        self._session.close()
+
+
+class Newest(Generic[T]):
+    """Keeps the newest note only; `skipped` counts those that nobody took. Safe from any thread."""
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        self._note: T | None = None
+        self._there = threading.Condition()
+
+    def put(self, note: T) -> None:
+        """Takes a note in place of the one before."""
+        with self._there:
+            self.skipped += self._note is not None
+            self._note = note
+            self._there.notify()
+
+    def take(self, timeout_s: float) -> T | None:
+        """The newest note that was not taken yet; None when none comes in time."""
+        with self._there:
+            self._there.wait_for(lambda: self._note is not None, timeout_s)
+            note, self._note = self._note, None
+            return note
+
+
+class Bus:
+    """A process's place on the bus; a context manager.
+
+    Handlers run on a thread of the session and must return soon. `dropped` counts what was no note.
+    Raises `BusError` when there is no bus in the folder.
+    """
+
+    def __init__(self, folder: Path, process: str) -> None:
+        import zenoh
+
+        self.process = process
+        self.dropped = 0
+        self._started_s = time.monotonic()
+        self._beat_s, self._cpu_s = self._started_s, _cpu_s()
+        try:
+            self._session = zenoh.open(_config("client", folder))
+        except zenoh.ZError as error:
+            raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
+        self._declared: list[Any] = []
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._session.close()
+
+    def say(self, kind: str, payload_id: str, note: Note) -> None:
+        """Tells all processes; one that is too slow to hear loses it."""
+        self._session.put(f"station/{kind}/{payload_id}", notes.encode(note))
+
+    def hear(
+        self, kind: str, of: type[N], take: Callable[[str, N], None], payload_id: str = "*"
+    ) -> None:
+        """Calls `take` with the payload's id and each note of a kind."""
+
+        def received(sample: Any) -> None:
+            try:
+                note = notes.decode(of, sample.payload.to_bytes())
+            except notes.NoteError:
+                self.dropped += 1
+                return
+            take(str(sample.key_expr).rpartition("/")[2], note)
+
+        key = f"station/{kind}/{payload_id}"
+        self._declared.append(self._session.declare_subscriber(key, received))
+
+    def newest(self, kind: str, of: type[N], payload_id: str = "*") -> Newest[N]:
+        """Where the newest note of a kind lies."""
+        newest: Newest[N] = Newest()
+        self.hear(kind, of, lambda _, note: newest.put(note), payload_id)
+        return newest
+
+    def serve(self, name: str, do: Do) -> None:
+        """Answers questions at a name; a `BlimpError` becomes a refusal with its text."""
+        key = f"station/do/{name}"
+
+        def asked(query: Any) -> None:
+            try:
+                request = json.loads(query.payload.to_bytes()) if query.payload else None
+                if not isinstance(request, dict):
+                    raise notes.NoteError("the question is no JSON object")
+                answer = {"done": True, "reason": "", **do(request)}
+            except BlimpError as error:
+                answer = {"done": False, "reason": str(error)}
+            except Exception as error:  # a question must not end a process
+                answer = {"done": False, "reason": f"{type(error).__name__}: {error}"}
+            with contextlib.suppress(Exception):  # whoever asked may be gone
+                query.reply(key, json.dumps(answer).encode())
+
+        self._declared.append(self._session.declare_queryable(key, asked))
+
+    def ask(
+        self, name: str, request: Mapping[str, Any], timeout_s: float = 5.0
+    ) -> Mapping[str, Any]:
+        """Asks at a name; without an answer in time it is a refusal that says so."""
+        body = json.dumps(request).encode()
+        key = f"station/do/{name}"
+        with contextlib.suppress(Exception):
+            for reply in self._session.get(key, payload=body, timeout=timeout_s):
+                if reply.ok is not None:
+                    answer = json.loads(reply.ok.payload.to_bytes())
+                    if isinstance(answer, dict):
+                        return {"done": False, "reason": "", **answer}
+        return {"done": False, "reason": f"the service's {name} did not answer"}
+
+    def beat(self) -> None:
+        """Says that this process lives, at most once a second; to be called from its main loop."""
+        now_s = time.monotonic()
+        span_s = now_s - self._beat_s
+        if span_s < 1.0 and self._beat_s != self._started_s:
+            return
+        used_s = _cpu_s()
+        share = (used_s - self._cpu_s) / span_s if span_s > 0 else 0.0
+        self._beat_s, self._cpu_s = now_s, used_s
+        note = ProcessNote(
+            name=self.process,
+            pid=os.getpid(),
+            memory_MB=_resident_mb(),
+            cpu=share,
+            uptime_s=now_s - self._started_s,
+        )
+        self.say(notes.PROCESS, notes.STATION, note)
+
+
+def _cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6

@@ -1,0 +1,189 @@
+"""What the service's processes say to one another: JSON objects on the local bus.
+
+All of them run the same version, so a note has no schema of its own; what does not fit is dropped.
+Times are int nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine's wall clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from ground_station.errors import GroundStationError
+
+FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
+EVENT, RECORDING, PROCESS = "event", "recording", "process"
+KINDS = (FRAME, ESTIMATE, PAYLOAD, EVENT, RECORDING, PROCESS)
+STATION = "-"
+"""Stands for a payload's id where a note is of none."""
+
+INFO, WARNING, ALARM = "info", "warning", "alarm"
+
+N = TypeVar("N", bound="Note")
+
+
+class NoteError(GroundStationError):
+    """Bytes on the bus that are no note of the kind."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """Base of all notes."""
+
+
+@dataclass(frozen=True)
+class FrameNote(Note):
+    """A received frame, whose picture lies in the ring at `slot` while `stamp` still holds."""
+
+    slot: int
+    stamp: int
+    sequence: int
+    time_ns: int  # the camera's
+    clock_ns: int  # the payload's clock at capture
+    arrival_ns: int
+    width_px: int
+    height_px: int
+    ssrc: int
+    capture_ns: int | None = None  # None while the payload's clock is not known
+    exposure_s: float | None = None
+    gain: float | None = None
+    entropy_bits: float = 0.0
+    sharpness: float = 0.0
+    heartbeat: bool = False
+
+
+@dataclass(frozen=True)
+class EstimateNote(Note):
+    """A frame's pose, or why there is none.
+
+    `quaternion_xyzw` and `position_m` are wTc, `covariance` (36, row by row) is of the right
+    tangent in the camera's axes, rotation before translation; `position_sigma_m` (9) is the
+    position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns.
+    `processed`, `localized` and `skipped` count this payload's frames since the localizer's start.
+    """
+
+    sequence: int
+    time_ns: int
+    clock_ns: int
+    done_ns: int
+    state: str
+    capture_ns: int | None = None
+    reason: str = ""
+    position_m: list[float] | None = None
+    quaternion_xyzw: list[float] | None = None
+    covariance: list[float] | None = None
+    position_sigma_m: list[float] | None = None
+    velocity_mps: list[float] | None = None  # world axes
+    heading_deg: float | None = None  # of the view, from the map's x axis towards y
+    speed_mps: float | None = None
+    height_m: float | None = None
+    relocalized: bool = False
+    tracked: bool = False
+    inliers: int = 0
+    expected: int = 0
+    points_px: list[float] = field(default_factory=list)
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    map: str = ""
+    processed: int = 0
+    localized: int = 0
+    skipped: int = 0
+
+
+@dataclass(frozen=True)
+class PayloadNote(Note):
+    """A payload as the intake sees it, twice a second.
+
+    `frames` by fate: captured, gated, sent, discarded (the payload's own account), received, lost,
+    withheld, dropped. `stream` has the receiver's counters. `battery`, `health` and `autopilot` are
+    the newest messages as they came.
+    """
+
+    alive: bool
+    seen_ns: int
+    ssrc: int | None = None
+    encrypted: bool = False
+    frames: dict[str, int] = field(default_factory=dict)
+    stream: dict[str, int] = field(default_factory=dict)
+    rate_hz: float = 0.0
+    bitrate_kbps: float = 0.0  # as received
+    lost_share: float = 0.0  # of late
+    clock: dict[str, int] | None = None  # offset_ns, uncertainty_ns
+    round_trip_s: float | None = None
+    battery: dict[str, Any] | None = None
+    health: dict[str, Any] | None = None
+    autopilot: dict[str, Any] | None = None
+    recording: str = ""  # the file on the payload's own card
+
+
+@dataclass(frozen=True)
+class EventNote(Note):
+    """Something that happened; `source` is payload, intake, localizer, web or station."""
+
+    time_ns: int
+    source: str
+    level: str
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
+class RecordingNote(Note):
+    """The ground's own recording, each second."""
+
+    active: bool
+    file: str = ""
+    size_MB: float = 0.0
+    duration_s: float = 0.0
+    dropped: int = 0
+    free_MB: float | None = None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class ProcessNote(Note):
+    """A process of the service says that it lives."""
+
+    name: str
+    pid: int
+    memory_MB: float = 0.0
+    cpu: float = 0.0  # of one core, since the last note
+    uptime_s: float = 0.0
+    restarts: int = 0
+
+
+def encode(note: Note) -> bytes:
+    """A note as JSON; numbers that are not finite become null, which JSON can say."""
+    document = {item.name: getattr(note, item.name) for item in dataclasses.fields(note)}
+    try:
+        return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    except ValueError:
+        return json.dumps(_finite(document), separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode(kind: type[N], data: bytes) -> N:
+    """A note of a kind; raises `NoteError` with one line."""
+    try:
+        document = json.loads(data)
+        return kind(**document)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise NoteError(f"{kind.__name__}: {str(error)[:120]}") from None
+
+
+def as_document(note: Note) -> dict[str, Any]:
+    """A note as plain JSON values."""
+    document = {item.name: getattr(note, item.name) for item in dataclasses.fields(note)}
+    finite: dict[str, Any] = _finite(document)
+    return finite
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

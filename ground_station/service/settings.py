@@ -1,0 +1,186 @@
+"""The ground station's configuration; `station.toml` beside this file is its commented form."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pi_firmware.wire import video
+from pi_firmware.wire.config import from_mapping, key, read, table
+from pi_firmware.wire.errors import ConfigError, TelemetryError
+from pi_firmware.wire.keys import check_payload_id
+from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
+
+SHIPPED = Path(__file__).with_name("station.toml")
+RUN_FILE = "station.json"
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Where poses are in."""
+
+    folder: str = key("maps/atrium", "a registered map")
+    shelf: str = key("maps", "folder of the maps that can be chosen")
+    camera: str = key("", "camera.toml of the payloads; empty: the map's")
+
+
+@dataclass(frozen=True)
+class PayloadSettings:
+    """Who is taken up."""
+
+    ids: list[str] = key([], "payloads that are taken up; empty: all")
+    most: int = key(4, "at once", low=1, high=16)
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """Where the video comes in."""
+
+    host: str = key("127.0.0.1", "address that is listened on; 0.0.0.0: all")
+    port: int = key(video.PORT, "UDP port", low=1, high=65535)
+
+
+@dataclass(frozen=True)
+class TelemetrySettings:
+    """Zenoh with the payloads."""
+
+    listen: list[str] = key([LOCAL_ENDPOINT], "endpoints to listen on, tcp/ or tls/HOST:PORT")
+    connect: list[str] = key([], "payloads that listen themselves")
+    certificates: str = key("", "folder that `blimp keys ground` wrote; empty: loopback only")
+    discoverable: str = key("", "interface on which payloads find this station; empty: none")
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.connect):
+            try:
+                check_endpoint(endpoint, certified=bool(self.certificates))
+            except TelemetryError as error:
+                raise ValueError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class LocalizerSettings:
+    """How poses are found."""
+
+    preset: str = key("default", "the localizer's settings", choices=("default", "thesis"))
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """The ground's recordings."""
+
+    folder: str = key("recordings", "where they go")
+    at_start: bool = key(False, "records from the start")
+    max_file_MB: int = key(1024, "a file ends at this size", unit="MB", low=1, high=4000)
+    max_file_s: float = key(3600.0, "and at this age", unit="s", low=10, high=86_400)
+    max_total_MB: int = key(20_000, "oldest are deleted beyond", unit="MB", low=1, high=10_000_000)
+    min_free_MB: int = key(1024, "left free on the disk", unit="MB", low=0, high=10_000_000)
+    sync_s: float = key(1.0, "the most that a power cut costs", unit="s", low=0.1, high=60)
+
+
+@dataclass(frozen=True)
+class HttpSettings:
+    """The dashboard and the API."""
+
+    host: str = key("127.0.0.1", "address; other than loopback needs token_file")
+    port: int = key(8080, "TCP port; 0: any free one", low=0, high=65535)
+    token_file: str = key("", "file with the token, readable by its owner only")
+    names: list[str] = key([], "host names under which it is reached, besides its address")
+    video_rate_hz: float = key(15.0, "pictures for each viewer", unit="Hz", low=1, high=60)
+    jpeg_quality: int = key(80, "of these pictures", low=10, high=100)
+    viewers: int = key(8, "live connections at once", low=1, high=100)
+
+
+@dataclass(frozen=True)
+class FoxgloveSettings:
+    """The live channel for Foxglove."""
+
+    enabled: bool = key(True, "false: no such process")
+    host: str = key("127.0.0.1", "address; loopback only")
+    port: int = key(8765, "TCP port; 0: any free one", low=0, high=65535)
+
+    def __post_init__(self) -> None:
+        if self.host not in ("127.0.0.1", "::1", "localhost"):
+            raise ValueError(
+                f"'foxglove.host' is {self.host!r}; only loopback: Foxglove's protocol has no"
+                " token, take a tunnel such as ssh -L"
+            )
+
+
+@dataclass(frozen=True)
+class StationSettings:
+    """All of `station.toml`."""
+
+    name: str = key("main", "this station's name in reports")
+    map: MapSettings = table(MapSettings)
+    payloads: PayloadSettings = table(PayloadSettings)
+    video: VideoSettings = table(VideoSettings)
+    telemetry: TelemetrySettings = table(TelemetrySettings)
+    localizer: LocalizerSettings = table(LocalizerSettings)
+    recording: RecordingSettings = table(RecordingSettings)
+    http: HttpSettings = table(HttpSettings)
+    foxglove: FoxgloveSettings = table(FoxgloveSettings)
+
+    def __post_init__(self) -> None:
+        try:
+            for name in (self.name, *self.payloads.ids):
+                check_payload_id(name)
+        except TelemetryError as error:
+            raise ValueError(str(error).replace("payload_id", "the name", 1)) from None
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of the service as its processes read it: settings, and whether it is the demo."""
+
+    station: StationSettings = table(StationSettings)
+    demo: bool = key(False, "the sample flight is played")
+    started_ns: int = key(0, "wall clock", unit="ns")
+
+
+def load(path: Path | None, overrides: Iterable[str] = ()) -> StationSettings:
+    """The settings from a file (the defaults without one) with `key.sub=value` on top of it.
+
+    Raises `ConfigError` with one line.
+    """
+    document = {} if path is None else read(path)
+    for override in overrides:
+        name, equals, text = override.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {override!r}: expected key=value, as http.port=8081")
+        *tables, last = name.strip().split(".")
+        inner = document
+        for part in tables:
+            inner = inner.setdefault(part, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"--set {override!r}: '{part}' is not a table")
+        inner[last] = _value(text)
+    return from_mapping(document, StationSettings, where=str(path or "defaults"))
+
+
+def write_run(folder: Path, run: Run) -> None:
+    """Puts a run's settings where its processes find them."""
+    (folder / RUN_FILE).write_text(json.dumps(dataclasses.asdict(run)))
+
+
+def load_run(folder: Path) -> Run:
+    """The settings of the run in a folder; raises `ConfigError` with one line."""
+    path = folder / RUN_FILE
+    try:
+        return from_mapping(json.loads(path.read_bytes()), Run, where=str(path))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except ValueError:
+        raise ConfigError(f"{path}: not JSON text") from None
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text itself where it is none: strings need no quotes."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        return text
