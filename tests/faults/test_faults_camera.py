@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
 from flight import FRESH_S, Account, Flight
 from ground import Ground
 from payload_process import LIMIT_S
@@ -53,26 +56,32 @@ def assert_accounted(account: Account) -> None:
     assert len(skipped) == account.ended.counts["discarded"]
 
 
-def test_a_camera_that_is_gone_and_back(tmp_path: Path) -> None:
-    uri = "test:?gone_at_s=2&gone_for_s=3"
+def fly_without_camera(folder: Path) -> tuple[Account, list[str]]:
+    """A flight whose camera is gone for 3 s and must be seen again within 5 s of its return."""
+    uri = "test:?gone_at_s=5&gone_for_s=3"
     with (
         Ground(numbered=False) as ground,
-        Flight(tmp_path, ground, None, *SMALL, camera=uri) as flight,
+        Flight(folder, ground, None, *SMALL, camera=uri) as flight,
     ):
         flight.wait_streaming(30)
         gone_s = wait_for_gap(flight, 1)
         flight.wait_streaming(gone_s + 3 + FRESH_S - time.monotonic())
         time.sleep(0.5)
         account = flight.finish()
-        events = events_of(ground)
-    assert_accounted(account)
-    assert messages.EVENT_CAMERA_RESTARTED in events
-    assert events.count(messages.EVENT_STREAMING_AGAIN) == 1
-    assert messages.EVENT_FAILED not in events
+        return account, events_of(ground)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_camera(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Future[tuple[Account, list[str]]]]:
+    """It flies behind the other tests: what it does is wait."""
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(fly_without_camera, tmp_path_factory.mktemp("gone"))
 
 
 def test_a_camera_that_hangs_is_opened_anew(tmp_path: Path) -> None:
-    uri = "test:?hang_at_s=2&hang_for_s=60"
+    uri = "test:?hang_at_s=3&hang_for_s=60"
     with (
         Ground(numbered=False) as ground,
         Flight(tmp_path, ground, None, *SMALL, camera=uri) as flight,
@@ -131,3 +140,13 @@ def test_an_encoder_that_never_comes_back_ends_the_process_for_a_new_one(tmp_pat
                 assert time.monotonic() - started_s < FRESH_S
                 time.sleep(0.02)
             successor.payload.end().assert_in_order()
+
+
+def test_a_camera_that_is_gone_and_back(
+    without_camera: Future[tuple[Account, list[str]]],
+) -> None:
+    account, events = without_camera.result()
+    assert_accounted(account)
+    assert messages.EVENT_CAMERA_RESTARTED in events
+    assert events.count(messages.EVENT_STREAMING_AGAIN) == 1
+    assert messages.EVENT_FAILED not in events

@@ -20,7 +20,7 @@ from payload_process import LIMIT_S
 from pi_firmware.wire import messages, sei
 from pi_firmware.wire.recording import RecordingReader
 
-DISK_KB = 1200
+DISK_KB = 800
 MOUNT = f'mount -t tmpfs -o size={DISK_KB}k none "$0" && exec "$@"'
 AWAY_S = 3.0
 
