@@ -211,4 +211,7 @@ def _payload_config(
         "encoder": {"bitrate_kbps": settings.bitrate_kbps, "adapt": False},
         "link": {"port": port},
         "telemetry": {"connect": list(endpoints)},
+        # A busy machine is no hanging encoder, and its radio is not the payload's to restart.
+        "supervision": {"frame_timeout_s": 14.0},
+        "wifi": {"interface": ""},
     }
