@@ -105,6 +105,13 @@ class PayloadProcess:
         """What it has written so far, on both."""
         return self._out.read_text() + self._err.read_text()
 
+    def wait_written(self, text: str) -> None:
+        """Waits until it has written this; fails when it ends without, or beyond any patience."""
+        until_s = time.monotonic() + LIMIT_S
+        while text not in self.written():
+            assert self.running and time.monotonic() < until_s, self.written()
+            time.sleep(0.02)
+
     def end(self, number: signal.Signals | None = signal.SIGTERM) -> Ended:
         """Sends a signal (None: it ends by itself) and waits for the end."""
         asked_s = time.monotonic()

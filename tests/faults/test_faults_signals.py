@@ -127,7 +127,7 @@ def test_after_sigkill_the_next_process_streams(tmp_path: Path) -> None:
 def test_a_second_sigterm_changes_nothing(tmp_path: Path) -> None:
     settings = (*SMALL, "telemetry.enabled=false", f"link.port={free_port(socket.SOCK_DGRAM)}")
     with PayloadProcess(tmp_path, *settings) as payload:
-        time.sleep(1)
+        payload.wait_written("payload blimp-1")
         payload.process.send_signal(signal.SIGTERM)
         ended = payload.end(signal.SIGTERM)
     ended.assert_in_order()

@@ -9,7 +9,6 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -115,7 +114,7 @@ def test_a_network_that_comes_late_and_goes(recording: Path, tmp_path: Path) -> 
             host="0.0.0.0",
         ) as flight,
     ):
-        wait_until(lambda: "payload blimp-1" in flight.payload.written())
+        flight.payload.wait_written("payload blimp-1")
         time.sleep(1)
         assert flight.payload.running and not flight.witness.left()
         wire = Wire(flight.payload.pid, host)
@@ -138,11 +137,3 @@ def test_a_network_that_comes_late_and_goes(recording: Path, tmp_path: Path) -> 
     assert received is not None and received.packets == account.link.passed
     assert received.packets_lost == account.witness.gaps > 100
     assert received.failed == received.garbage == received.dropped == 0
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    """Waits for it; fails beyond any patience."""
-    until_s = time.monotonic() + LIMIT_S
-    while not true():
-        assert time.monotonic() < until_s
-        time.sleep(0.02)

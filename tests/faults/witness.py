@@ -73,7 +73,8 @@ class Witness:
     def _follow(self, packet: rtp.Packet, lost: bool) -> None:
         stream = self._streams.setdefault(packet.ssrc, _Stream())
         if stream.next_sequence is not None:
-            self.gaps += (packet.sequence - stream.next_sequence) & 0xFFFF
+            ahead = (packet.sequence - stream.next_sequence) & 0xFFFF
+            self.gaps += ahead - (ahead >> 15 << 16)  # out of order they cancel each other
         stream.next_sequence = (packet.sequence + 1) & 0xFFFF
         if packet.payload[0] & 0x1F == annexb.NAL_AUD:
             stream.undelimited = lost
