@@ -18,6 +18,7 @@ _COMMANDS = (
     ("localize", "ground_station.localization.command", "find the camera in a map, frame by frame"),
     ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
     ("command", "ground_station.stream.command", "ask a payload to do something"),
+    ("serve", "ground_station.service.serve_command", "run the ground station and its dashboard"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
     ("bench", "ground_station.service.bench_command", "measure what each step costs"),

@@ -10,12 +10,13 @@ from pathlib import Path
 
 from pi_firmware.capture import Capture
 from pi_firmware.ground import Ground
-from pi_firmware.health import Board, Notifier, PeriodicThread, Restarts, Table, Task, Wifi
+from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import Settings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.clock_offset import OffsetFilter
 from pi_firmware.wire.messages import Health
+from pi_firmware.wire.systemd import Notifier
 
 VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
 _FEED_S = 1.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pi_firmware.health import Notifier
+from pi_firmware.wire.systemd import Notifier
 
 LIMIT_S = 20.0
 
@@ -54,7 +54,7 @@ def test_a_status_stays_one_line_and_short(manager: tuple[socket.socket, str]) -
 def test_children_do_not_inherit_the_variables() -> None:
     program = (
         "import os\n"
-        "from pi_firmware.health import Notifier\n"
+        "from pi_firmware.wire.systemd import Notifier\n"
         "watchdog_s = Notifier().watchdog_s\n"
         "left = [n for n in os.environ if n.startswith(('NOTIFY', 'WATCHDOG'))]\n"
         "print(watchdog_s, left, os.system('test -z \"$NOTIFY_SOCKET$WATCHDOG_USEC\"'))\n"

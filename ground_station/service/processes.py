@@ -1,0 +1,223 @@
+"""The service's processes: one table, started, watched and started again.
+
+Each says on the bus that it lives (`Bus.beat`). One that ends or falls silent is started anew,
+after a pause that doubles; nobody else waits for it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ground_station.errors import GroundStationError
+
+INTAKE, LOCALIZER, WEB, FOXGLOVE, PAYLOAD = "intake", "localizer", "web", "foxglove", "demo-payload"
+BAD_INPUT = 2
+_SILENT_S = 10.0
+_START_S = 60.0  # the first beat of a process that loads a large map on a busy machine
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
+_STEADY_S = 30.0  # who has lived this long begins with the shortest pause again
+_TERM_S = 8.0
+
+
+class ServiceError(GroundStationError):
+    """A service that cannot start, or must end."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A process: its name, `python -m` module and arguments.
+
+    `needed`: bad input at its start ends the service, with its own line on standard error. `beats`:
+    it says that it lives.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...] = ()
+    needed: bool = True
+    beats: bool = True
+
+
+class Child:
+    """One process of the table, from start to start."""
+
+    def __init__(self, spec: Spec, clock: Callable[[], float] = time.monotonic) -> None:
+        self.spec = spec
+        self.restarts = 0
+        self.reason = ""
+        """Why it was started anew last."""
+        self._clock = clock
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started_s = 0.0
+        self._heard_s: float | None = None
+        self._due_s: float | None = clock()
+        self._pause_s = _FIRST_PAUSE_S
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id while it runs."""
+        return self._process.pid if self._process else None
+
+    @property
+    def living(self) -> bool:
+        """Whether it runs and, if it beats, was heard within 10 s."""
+        if self._process is None:
+            return False
+        return not self.spec.beats or (
+            self._heard_s is not None and self._clock() - self._heard_s < _SILENT_S
+        )
+
+    def beat(self, pid: int) -> None:
+        """It was heard; a beat of the process before it does not count."""
+        if self._process is not None and pid == self._process.pid:
+            self._heard_s = self._clock()
+
+    def step(self) -> str:
+        """Starts it when it is due, and ends one that is silent; what happened, in words, or "".
+
+        Raises `ServiceError` when a needed one refuses its input before its first beat.
+        """
+        now_s = self._clock()
+        if self._process is None:
+            if self._due_s is not None and now_s >= self._due_s:
+                self._start()
+            return ""
+        status = self._process.poll()
+        if status is not None:
+            bad = status == BAD_INPUT and self._heard_s is None
+            if bad and self.spec.needed:
+                raise ServiceError(f"{self.spec.name} cannot start")
+            return self._fell(f"ended with status {status}")
+        since_s = now_s - (self._started_s if self._heard_s is None else self._heard_s)
+        if self.spec.beats and since_s > (_START_S if self._heard_s is None else _SILENT_S):
+            self._kill()
+            return self._fell(f"was silent for {since_s:.0f} s")
+        return ""
+
+    def terminate(self) -> None:
+        """Asks it to end."""
+        self._due_s = None
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+
+    def wait(self, until_s: float) -> None:
+        """Waits until it has ended, and ends it the hard way at an instant of the clock."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(max(0.0, until_s - self._clock()))
+        except subprocess.TimeoutExpired:
+            self._kill()
+        self._process = None
+
+    def _start(self) -> None:
+        command = [sys.executable, "-m", self.spec.module, *self.spec.arguments]
+        # A parent that is killed takes its children with it, whoever started it.
+        if setpriv := shutil.which("setpriv"):
+            command = [setpriv, "--pdeathsig", "KILL", "--", *command]
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        self._started_s, self._heard_s, self._due_s = self._clock(), None, None
+
+    def _fell(self, reason: str) -> str:
+        now_s = self._clock()
+        if now_s - self._started_s > _STEADY_S:
+            self._pause_s = _FIRST_PAUSE_S
+        self._process = None
+        self._due_s = now_s + self._pause_s
+        self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self.restarts += 1
+        self.reason = reason
+        return f"{self.spec.name} {reason}; it is started anew"
+
+    def _kill(self) -> None:
+        assert self._process is not None
+        self._process.send_signal(signal.SIGKILL)
+        self._process.wait()
+
+
+class Children:
+    """The table at work; `step` it from the thread that made it, `beat` it from any."""
+
+    def __init__(self, specs: tuple[Spec, ...], report: Callable[[str], object]) -> None:
+        self._report = report
+        self._lock = threading.Lock()
+        self._children = {spec.name: Child(spec) for spec in specs}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._children
+
+    def add(self, spec: Spec) -> None:
+        """Another process, unless one of its name is there."""
+        with self._lock:
+            self._children.setdefault(spec.name, Child(spec))
+
+    def remove(self, name: str) -> None:
+        """Ends a process and forgets it."""
+        with self._lock:
+            child = self._children.pop(name, None)
+        if child is not None:
+            child.terminate()
+            child.wait(time.monotonic() + _TERM_S)
+
+    def beat(self, name: str, pid: int) -> None:
+        """A process was heard."""
+        with self._lock:
+            child = self._children.get(name)
+        if child is not None:
+            child.beat(pid)
+
+    def step(self) -> None:
+        """Starts what is due; raises `ServiceError` when a needed process cannot start."""
+        for child in list(self._children.values()):
+            if said := child.step():
+                self._report(said)
+
+    def restarts(self) -> dict[str, int]:
+        """How often each was started anew."""
+        return {name: child.restarts for name, child in list(self._children.items())}
+
+    def living(self) -> bool:
+        """Whether every needed process runs and was heard of late."""
+        children = list(self._children.values())
+        return all(child.living for child in children if child.spec.needed)
+
+    def close(self) -> None:
+        """Ends all, the last ones started first."""
+        children = list(reversed(self._children.values()))
+        for child in children:
+            child.terminate()
+        until_s = time.monotonic() + _TERM_S
+        for child in children:
+            child.wait(until_s)
+
+
+def table(folder: Path, *, foxglove: bool, demo: Path | None) -> tuple[Spec, ...]:
+    """The processes from the start; localizers come with their payloads.
+
+    `demo` is the configuration of the payload that is played.
+    """
+    run = str(folder)
+    specs = [
+        Spec(INTAKE, "ground_station.service.intake", (run,)),
+        Spec(WEB, "ground_station.service.web", (run,)),
+    ]
+    if foxglove:
+        specs.append(Spec(FOXGLOVE, "ground_station.service.foxglove", (run,), needed=False))
+    if demo is not None:
+        specs.append(Spec(PAYLOAD, "pi_firmware", ("--config", str(demo)), beats=False))
+    return tuple(specs)
+
+
+def localizer(folder: Path, payload_id: str) -> Spec:
+    """The localizer of a payload."""
+    arguments = (str(folder), payload_id)
+    name = f"{LOCALIZER}/{payload_id}"
+    return Spec(name, "ground_station.service.localizing", arguments, needed=False)

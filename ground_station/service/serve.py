@@ -1,0 +1,155 @@
+"""The service's parent: the bus, the table of processes, and what systemd is told."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import tomli_w
+
+from ground_station.errors import InputError
+from ground_station.mapping import store
+from ground_station.recording.flight import camera_of
+from ground_station.service import notes, processes
+from ground_station.service.bus import Bus, Router
+from ground_station.service.notes import EventNote, PayloadNote, ProcessNote
+from ground_station.service.processes import Children
+from ground_station.service.settings import Run, StationSettings, write_run
+from pi_firmware.wire.recording import RecordingReader
+from pi_firmware.wire.systemd import Notifier
+
+DEMO_PAYLOAD = "demo"
+_STEP_S = 0.1
+_GONE_S = 60.0
+_FEED_S = 2.0
+
+
+def serve(settings: StationSettings, stop: threading.Event, *, demo: Path | None = None) -> None:
+    """Runs the service until `stop` is set; `demo` is a recording that is played again and again.
+
+    Raises a `BlimpError` with one line when it cannot start.
+    """
+    _check_map(Path(settings.map.folder))
+    notifier = Notifier()
+    with _run_folder() as folder:
+        write_run(folder, Run(settings, demo=demo is not None, started_ns=time.time_ns()))
+        config = _demo_config(folder, settings, demo) if demo else None
+        router = Router(folder)
+        try:
+            with Bus(folder, "station") as bus:
+                parent = _Parent(folder, settings, bus, config)
+                try:
+                    parent.run(stop, notifier)
+                finally:
+                    notifier.stopping()
+                    parent.children.close()
+        finally:
+            router.close()
+
+
+class _Parent:
+    """Takes up payloads with a localizer each, and keeps all processes alive."""
+
+    def __init__(
+        self, folder: Path, settings: StationSettings, bus: Bus, demo: Path | None
+    ) -> None:
+        self._folder, self._settings, self._bus = folder, settings, bus
+        self._lock = threading.Lock()
+        self._alive_s: dict[str, float] = {}
+        specs = processes.table(folder, foxglove=settings.foxglove.enabled, demo=demo)
+        self.children = Children(specs, self._report)
+        bus.hear(
+            notes.PROCESS, ProcessNote, lambda _, note: self.children.beat(note.name, note.pid)
+        )
+        bus.hear(notes.PAYLOAD, PayloadNote, self._hear_payload)
+
+    def run(self, stop: threading.Event, notifier: Notifier) -> None:
+        """Until `stop`; systemd's watchdog is fed while every needed process is heard of."""
+        ready, fed_s = False, 0.0
+        while not stop.wait(_STEP_S):
+            self.children.step()
+            self._follow_payloads()
+            self._bus.beat()
+            now_s = time.monotonic()
+            if self.children.living() and now_s - fed_s > _FEED_S:
+                fed_s = now_s
+                ready = ready or notifier.ready()
+                notifier.alive()
+
+    def _hear_payload(self, payload_id: str, note: PayloadNote) -> None:
+        if note.alive:
+            with self._lock:
+                self._alive_s[payload_id] = time.monotonic()
+
+    def _follow_payloads(self) -> None:
+        """A localizer for each payload that lives; one that is gone keeps its own for a minute."""
+        now_s = time.monotonic()
+        with self._lock:
+            heard = dict(self._alive_s)
+        wanted = sorted(heard, key=lambda name: -heard[name])[: self._settings.payloads.most]
+        for payload_id, seen_s in heard.items():
+            spec = processes.localizer(self._folder, payload_id)
+            gone = now_s - seen_s > _GONE_S or payload_id not in wanted
+            if gone and spec.name in self.children:
+                self.children.remove(spec.name)
+            elif not gone:
+                self.children.add(spec)
+
+    def _report(self, text: str) -> None:
+        print(f"blimp serve: {text}", file=sys.stderr, flush=True)
+        note = EventNote(time.time_ns(), "station", notes.WARNING, "process-restarted", text)
+        with contextlib.suppress(Exception):  # the bus may be what fails
+            self._bus.say(notes.EVENT, notes.STATION, note)
+
+
+@contextlib.contextmanager
+def _run_folder() -> Iterator[Path]:
+    """A private folder in memory, gone with the service; systemd's own where it gives one."""
+    for place in (
+        os.environ.get("RUNTIME_DIRECTORY"),
+        os.environ.get("XDG_RUNTIME_DIR"),
+        "/dev/shm",
+    ):
+        if place and os.access(place, os.W_OK):
+            break
+    else:
+        place = tempfile.gettempdir()
+    folder = Path(tempfile.mkdtemp(prefix="blimp-", dir=place))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _check_map(folder: Path) -> None:
+    """Raises `MapError` or `InputError` for what no localizer could use."""
+    if not store.load(folder).info.registered:
+        raise InputError(f"{folder}: it is not registered to a floor plan; see blimp map register")
+
+
+def _demo_config(folder: Path, settings: StationSettings, recording: Path) -> Path:
+    """The configuration of a payload that plays a recording to this station."""
+    camera = camera_of(RecordingReader(recording))
+    if camera is None:
+        raise InputError(f"{recording}: it carries no camera calibration")
+    document = {
+        "payload_id": DEMO_PAYLOAD,
+        "camera": {
+            "uri": f"replay:{recording.resolve()}?loop=1",
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "rate_hz": 30.0,
+        },
+        "link": {"port": settings.video.port},
+        "telemetry": {"connect": list(settings.telemetry.listen)},
+    }
+    path = folder / "demo-payload.toml"
+    path.write_bytes(tomli_w.dumps(document).encode())
+    return path

@@ -1,0 +1,54 @@
+"""`blimp serve`: the ground station as one service."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import signal
+import threading
+from pathlib import Path
+
+_EPILOG = """\
+examples:
+  blimp serve --demo                      # the sample flight, played by the real firmware
+  blimp serve --map maps/hall
+  blimp serve --config station.toml --set http.port=8081
+
+The dashboard is at http://127.0.0.1:8080/ then; service/station.toml names every key."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = _EPILOG
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file (default: defaults)")
+    parser.add_argument("--map", type=Path, metavar="MAP", help="folder of a registered map")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
+    )
+    parser.add_argument(
+        "--demo", action="store_true", help="play the sample flight, over loopback only"
+    )
+    parser.add_argument("--check", action="store_true", help="check the configuration and exit")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serves until a signal; raises a `BlimpError` with one line when it cannot start."""
+    from ground_station.service import settings
+    from ground_station.service.demo import SAMPLE
+    from ground_station.service.serve import serve
+
+    loaded = settings.load(args.config, args.set)
+    if args.map is not None:
+        folder = dataclasses.replace(loaded.map, folder=str(args.map))
+        loaded = dataclasses.replace(loaded, map=folder)
+    if args.check:
+        print("configuration is good")
+        return 0
+    if args.demo and args.map is None and args.config is None:
+        shelf = dataclasses.replace(loaded.map, folder=str(SAMPLE), shelf=str(SAMPLE.parent))
+        loaded = dataclasses.replace(loaded, map=shelf)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    serve(loaded, stop, demo=SAMPLE / "flight.mcap" if args.demo else None)
+    return 0

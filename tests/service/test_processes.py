@@ -1,0 +1,247 @@
+"""Processes that end, hang or refuse are started anew or end the service; nobody is left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_station.service import notes, settings
+from ground_station.service.bus import Bus, Router
+from ground_station.service.notes import EventNote, FrameNote, PayloadNote
+from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter, path_of
+from ground_station.service.processes import Child, Children, ServiceError, Spec
+from pi_firmware.wire.config import differences
+from pi_firmware.wire.errors import BlimpError, ConfigError
+
+LIMIT_S = 20.0
+
+MODULES = {
+    "stays": "import time\nwhile True: time.sleep(0.1)\n",
+    "ends": "import sys\nsys.exit(1)\n",
+    "refuses": "import sys\nprint('stand-in: no such port', file=sys.stderr)\nsys.exit(2)\n",
+}
+
+
+@pytest.fixture
+def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, text in MODULES.items():
+        (tmp_path / f"stand_in_{name}.py").write_text(text)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def bus_folder(tmp_path: Path) -> Iterator[Path]:
+    router = Router(tmp_path)
+    yield tmp_path
+    router.close()
+
+
+def until(condition: Callable[[], bool], step: Callable[[], object] = lambda: None) -> None:
+    deadline_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come"
+        step()
+        time.sleep(0.02)
+
+
+class Time:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_a_process_that_ends_is_started_anew_after_ever_longer_pauses(modules: Path) -> None:
+    clock = Time()
+    child = Child(Spec("ends", "stand_in_ends"), clock)
+    pauses = []
+    for _ in range(7):
+        before_s = clock.now_s
+        child.step()
+        while child.pid is None:
+            clock.now_s += 0.25
+            child.step()
+        pauses.append(clock.now_s - before_s)
+        said: list[str] = []
+        until(lambda s=said: any(s), lambda s=said: s.append(child.step()))  # type: ignore[misc]
+        assert said[-1] == "ends ended with status 1; it is started anew"
+    assert child.restarts == 7
+    assert pauses == sorted(pauses) and 9 < pauses[-1] <= 10.5
+
+
+def test_a_process_that_falls_silent_is_killed_and_started_anew(modules: Path) -> None:
+    clock = Time()
+    child = Child(Spec("stays", "stand_in_stays"), clock)
+    child.step()
+    first = child.pid
+    assert first is not None and not child.living
+    child.beat(first + 1)  # of one that is long gone
+    assert not child.living
+    child.beat(first)
+    assert child.living
+    clock.now_s += 9.9
+    assert child.step() == "" and child.living
+    clock.now_s += 0.2
+    assert "was silent for 10 s" in child.step()
+    with pytest.raises(ProcessLookupError):
+        os.kill(first, 0)
+    clock.now_s += 0.6
+    child.step()
+    assert child.pid not in (None, first)
+    child.terminate()
+    child.wait(clock() + LIMIT_S)
+
+
+def test_bad_input_of_a_needed_process_ends_the_service(modules: Path) -> None:
+    children = Children((Spec("refuses", "stand_in_refuses"),), lambda text: None)
+
+    def step() -> bool:
+        try:
+            children.step()
+        except ServiceError as error:
+            assert str(error) == "refuses cannot start"
+            return True
+        return False
+
+    until(step)
+    one_may = Child(Spec("refuses", "stand_in_refuses", needed=False))
+    said: list[str] = []
+    until(lambda: bool(said and said[-1]), lambda: said.append(one_may.step()))
+    assert "status 2" in said[-1]
+
+
+def test_children_end_with_a_parent_that_is_killed(modules: Path, tmp_path: Path) -> None:
+    parent = (
+        "import sys, time\n"
+        "from ground_station.service.processes import Child, Spec\n"
+        "child = Child(Spec('stays', 'stand_in_stays'))\n"
+        "child.step()\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        time.sleep(0.3)  # setpriv gives way to the program
+        process.send_signal(signal.SIGKILL)
+    until(lambda: not _runs(pid))
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_notes_cross_the_bus_and_what_is_none_is_dropped(bus_folder: Path) -> None:
+    with Bus(bus_folder, "one") as one, Bus(bus_folder, "two") as two:
+        heard: list[tuple[str, EventNote]] = []
+        two.hear(notes.EVENT, EventNote, lambda payload, note: heard.append((payload, note)))
+        newest = two.newest(notes.PAYLOAD, PayloadNote, "blimp-1")
+        event = EventNote(1, "station", notes.INFO, "hello", "zwölf °")
+        until(lambda: bool(heard), lambda: one.say(notes.EVENT, "blimp-1", event))
+        assert heard[0] == ("blimp-1", event)
+        one._session.put("station/event/x", b'{"time_ns": 1}')
+        one._session.put("station/event/x", b"\xff")
+        until(lambda: two.dropped == 2)
+        one.say(notes.PAYLOAD, "blimp-2", PayloadNote(True, 1))
+        for seen_ns in range(1, 6):
+            one.say(notes.PAYLOAD, "blimp-1", PayloadNote(True, seen_ns, lost_share=float("nan")))
+        until(lambda: newest.skipped == 4)
+        note = newest.take(LIMIT_S)
+        assert note is not None and note.seen_ns == 5 and note.lost_share is None
+        assert newest.take(0.01) is None
+
+
+def test_questions_are_answered_refused_or_not_answered(bus_folder: Path) -> None:
+    class Refusal(BlimpError):
+        pass
+
+    def do(request: object) -> dict[str, object]:
+        if request == {"do": "refuse"}:
+            raise Refusal("not now")
+        if request == {"do": "break"}:
+            raise KeyError("inside")
+        return {"asked": request}
+
+    with Bus(bus_folder, "one") as one, Bus(bus_folder, "two") as two:
+        one.serve("intake", do)
+        until(lambda: two.ask("intake", {"do": "x"})["done"] is True)
+        assert two.ask("intake", {"do": "x"}) == {"done": True, "reason": "", "asked": {"do": "x"}}
+        assert two.ask("intake", {"do": "refuse"}) == {"done": False, "reason": "not now"}
+        assert two.ask("intake", {"do": "break"})["reason"] == "KeyError: 'inside'"
+        nobody = two.ask("nobody", {}, timeout_s=0.5)
+        assert nobody == {"done": False, "reason": "the service's nobody did not answer"}
+
+
+def test_a_picture_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    writer, reader = PictureWriter(tmp_path, "b"), PictureReader(tmp_path, "b")
+    assert reader.read(0, 2) is None
+    images = [np.full((48, 64), n, np.uint8) for n in range(SLOTS + 1)]
+    written = [writer.write(image) for image in images]
+    for image, (slot, stamp) in list(zip(images, written, strict=True))[1:]:
+        read = reader.read(slot, stamp)
+        assert read is not None and np.array_equal(read, image)
+    assert reader.read(*written[0]) is None  # overwritten
+    assert reader.read(99, 2) is None and reader.read(-1, 2) is None
+    slot, stamp = writer.write(np.full((32, 96), 7, np.uint8))  # another camera mode
+    again = reader.read(slot, stamp)
+    assert again is not None and again.shape == (32, 96) and (again == 7).all()
+    assert path_of(tmp_path, "b").stat().st_mode & 0o077 == 0
+    writer.close()
+    assert reader.read(slot, stamp) is None
+    path_of(tmp_path, "b").write_bytes(b"nonsense" * 100)
+    assert reader.read(slot, stamp) is None
+
+
+def test_a_frames_note_survives_json() -> None:
+    note = FrameNote(1, 2, 3, 4, 5, 6, 640, 480, 7, exposure_s=0.01)
+    assert notes.decode(FrameNote, notes.encode(note)) == note
+
+
+def test_the_shipped_file_documents_every_key() -> None:
+    assert differences(settings.SHIPPED, settings.StationSettings) == []
+    text = settings.SHIPPED.read_text()
+    assert settings.load(settings.SHIPPED) == settings.StationSettings()
+    for line in text.splitlines():
+        assert len(line) <= 100
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("http.port=70000", "'http.port' is 70000; allowed: 0 to 65535"),
+        ("foxglove.host=0.0.0.0", "'foxglove.host' is '0.0.0.0'; only loopback"),
+        ("telemetry.listen=['tcp/10.0.0.1:7447']", "only loopback is allowed"),
+        ("payloads.ids=['a b']", "the name 'a b'"),
+        ("name=.", "the name '.'"),
+        ("colour=1", "unknown key 'colour'"),
+        ("http", "expected key=value"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(override: str, named: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        settings.load(None, [override])
+    assert named in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_run_is_read_as_it_was_written(tmp_path: Path) -> None:
+    run = settings.Run(settings.load(None, ["http.port=0"]), demo=True, started_ns=5)
+    settings.write_run(tmp_path, run)
+    assert settings.load_run(tmp_path) == run
+    (tmp_path / settings.RUN_FILE).write_text("{")
+    with pytest.raises(ConfigError):
+        settings.load_run(tmp_path)
