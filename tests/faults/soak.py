@@ -137,17 +137,13 @@ def robust_slope(points: NDArray[np.float64]) -> float:
 
 
 def windows(latency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of (s, latency s) points, (N, 2): time, least, tenth and median of each ten seconds, (M, 4).
+    """Of (s, latency s) points, (N, 2): time, least and median of each ten seconds, (M, 3).
 
-    What delays a frame only ever adds: the quick ones show how the two clocks stand. The tenth of
-    a hundred and not the very least: a wall clock that is set while a frame is on its way makes
-    that one seem quicker than light.
+    What delays a frame only ever adds: the least ones show how the two clocks stand.
     """
     number = (latency[:, 0] // SAMPLE_S).astype(int)
     parts = [latency[number == n] for n in np.unique(number)]
-    return np.array(
-        [(part[:, 0].mean(), *np.quantile(part[:, 1], (0.0, 0.1, 0.5))) for part in parts]
-    )
+    return np.array([(part[:, 0].mean(), *np.quantile(part[:, 1], (0.0, 0.5))) for part in parts])
 
 
 def rows(flown: Flown, duration_s: float) -> list[Row]:
@@ -175,7 +171,7 @@ def memory_rows(memory: NDArray[np.float64], duration_s: float) -> list[Row]:
 
 def clock_rows(latency: NDArray[np.float64], duration_s: float) -> list[Row]:
     """The capture clock against the wall clock of the arrival."""
-    quick = windows(latency)[:, [0, 2]]
+    quick = windows(latency)[:, :2]
     ppm = 1e6 * robust_slope(quick)
     drift_s = ppm * 1e-6 * duration_s
     off_s = float(abs(quick[:, 1] - np.median(quick[:, 1])).max())
