@@ -21,7 +21,7 @@ from pi_firmware.wire.errors import StreamError
 
 DISCOVERED = "auto"
 """`link.host` that waits for a ground station to say where it is."""
-_QUEUE_UNITS = 10
+_QUEUE_UNITS = 30  # a second: a busy board catches up, a network that hangs does not
 _RESOLVE_S = 2.0
 _FLUSH_LIMIT_NS = 5_000_000_000
 

@@ -25,6 +25,7 @@ from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 
 _FLUSH_LIMIT_S = 10.0
 _COMMAND_LIMIT_S = 30.0
+_LOOK_S = 1.0
 
 
 class Payload:
@@ -40,6 +41,7 @@ class Payload:
         self.ssrc = link.draw_ssrc(settings.link)
         self._stop = threading.Event()
         self._afterwards: list[str] = []
+        self._looks_s = 0.0
         self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
         key = link.load_key(settings.telemetry.certificates) if settings.link.encrypted else None
         self._link = link.Link(settings.link, self.ssrc, key)
@@ -151,6 +153,7 @@ class Payload:
         flush_until: float | None = None
         while self._capture.step():
             self._supervision.tend(self._fresh_frames())
+            self._look_for_ground()
             if failure := self._link.failure():
                 raise StreamError(f"video link: {failure}")
             if stop.is_set() and flush_until is None:
@@ -159,6 +162,15 @@ class Payload:
             if flush_until is not None and time.monotonic() > flush_until:
                 raise StreamError(f"the encoder did not end within {_FLUSH_LIMIT_S:g} s")
         self._link.flush()
+
+    def _look_for_ground(self) -> None:
+        """A radio that came late, or has a new address, is not looked on by the session we have."""
+        now_s = time.monotonic()
+        if now_s < self._looks_s or self.settings.telemetry.discover == "":
+            return
+        self._looks_s = now_s + _LOOK_S
+        if self._telemetry.outdated and self._ground.seen is None:
+            raise Hopeless("telemetry.discover: the interface has another address by now")
 
     def _leave(self, unit: Unit) -> bool:
         """On the encoder's thread: a finished frame's way out."""

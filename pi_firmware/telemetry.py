@@ -77,6 +77,11 @@ class Telemetry:
         """Endpoints that this session listens on."""
         return self._session.listening if self._session else ()
 
+    @property
+    def outdated(self) -> bool:
+        """Whether only a new session finds the ground station; see `Session.outdated`."""
+        return self._session is not None and self._session.outdated
+
     def battery(self, message: messages.Battery) -> None:
         """Publishes a gauge's reading."""
         self._put(keys.BATTERY, message)

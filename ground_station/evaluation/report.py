@@ -32,6 +32,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 _FRAME_MEANINGS = {
     "captured": "taken by the camera",
     "gated": "held back by the payload: too little to see in them",
+    "discarded": "passed the gate, but never left the payload",
     "sent": "left the payload over the radio",
     "received": "arrived whole at the ground station",
     "lost": "sent, but never arrived whole",

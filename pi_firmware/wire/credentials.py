@@ -136,6 +136,21 @@ def access_rules(credentials: Credentials) -> dict[str, Any]:
             )
         subjects.append({"id": peer, "cert_common_names": [peer]})
         policies.append({"rules": [rule[0] for rule in named], "subjects": [peer]})
+    if ground:
+        # A second program with this very certificate, as `blimp command`, asks through the first.
+        commands = keys.every_payload(f"{keys.COMMAND}/**")
+        asked = [commands, keys.every_payload(keys.ALIVE)]
+        rules.append(
+            {
+                "id": "own",
+                "permission": "allow",
+                "flows": ["egress", "ingress"],
+                "messages": ["query", *_SERVE, "liveliness_query", "liveliness_token"],
+                "key_exprs": asked,
+            }
+        )
+        subjects.append({"id": credentials.name, "cert_common_names": [credentials.name]})
+        policies.append({"rules": ["own"], "subjects": [credentials.name]})
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -14,8 +14,12 @@ COMMANDS = [
     ["map", "info"],
     ["localize"],
     ["replay"],
+    ["command"],
+    ["serve"],
     ["evaluate"],
+    ["keys"],
     ["bench", "localize"],
+    ["bench", "payload"],
 ]
 HEAVY = ("numpy", "cv2", "pycolmap", "gtsam", "mujoco", "matplotlib", "zenoh", "av", "gi", "scipy")
 
