@@ -202,8 +202,8 @@ def test_it_says_its_name(live: Live) -> None:
 def test_its_camera_is_the_one_named_and_is_started_anew_in_time(live: Live) -> None:
     """Only the camera of this URI hangs."""
     assert "hang_at_s" in str(live.asked["camera.uri"])
-    (event,) = live.events("camera-restarted")
-    assert f"for {live.asked['supervision.frame_timeout_s']} s" in event.text
+    said = f"the camera gave no frame for {live.asked['supervision.frame_timeout_s']} s"
+    assert any(said in event.text for event in live.events("camera-restarted"))
 
 
 def test_pictures_have_the_configured_size_and_rate(live: Live) -> None:
