@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import threading
+import time
 from collections.abc import Callable, Mapping
 
-from pi_firmware.recording.file import DurableFile, OpenFile
-from pi_firmware.recording.run import Run
+from pi_firmware.recording.flight import FlightRun, Telemetry
 from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire import messages, sei
-from pi_firmware.wire.errors import RecordingError
-
-_START_LIMIT_S = 15.0
-"""A slow card from which the writer's modules are read for the first time is waited for."""
-
-_STOP_LIMIT_S = 8.0
+from pi_firmware.wire.recorder import recorder
+from pi_firmware.wire.recorder.durable import DurableFile, OpenFile
 
 
-class Recorder:
+class Recorder(recorder.Recorder):
     """Records video and telemetry into `recording.folder`, one recording at a time.
 
-    A recording is one file or several: the next begins at an IDR, without a gap, when a file is
-    full or the clock was set. A power cut costs what came in the last `sync_s`. Full, broken or
-    slow disks end or thin out the recording and nothing else. The camera's calibration is not in
-    it: the payload does not know it.
-
-    `announce` gets events: started for each file, ended once for each recording, with the reason
-    when nobody asked for it. `force_idr` asks the encoder for an IDR, so that a file begins soon.
-    `payload` is put into each file, as the metadata table of that name. Both may be called on the
-    recorder's thread or that of `start` and `stop`.
+    The next file begins at an IDR, without a gap, when one is full or the clock was set. The
+    camera's calibration is not in it: the payload does not know it. `payload` is put into each
+    file, as the metadata table of that name.
     """
+
+    run_type = FlightRun
 
     def __init__(
         self,
@@ -41,128 +32,19 @@ class Recorder:
         payload: Mapping[str, str] | None = None,
         open_file: OpenFile = DurableFile,
     ) -> None:
-        self._settings = settings
-        self._announce = announce
-        self._force_idr = force_idr
-        self._payload = payload or {}
-        self._open_file = open_file
-        self._run: Run | None = None
-        self._latest: Run | None = None
-        self._hung: Run | None = None
-        self._left_out = 0
-        self._closed = False
-        self._commands = threading.Lock()
-
-    @property
-    def file(self) -> str:
-        """The name of the file being written, "" when none is."""
-        run = self._run
-        return run.name if run else ""
-
-    @property
-    def size_MB(self) -> float:
-        """Its size, 1e6 bytes; 0 when none is written."""
-        run = self._run
-        return run.size_bytes / 1e6 if run else 0.0
-
-    @property
-    def dropped(self) -> int:
-        """Frames since the program's start that no file has although it was recording.
-
-        The disk was too slow or broke, or the clock was set between two IDRs.
-        """
-        latest = self._latest
-        return self._left_out + (latest.left_out if latest else 0)
-
-    def start(self) -> str:
-        """Begins a recording; the name of its first file. When one is made already: of its file.
-
-        Raises `RecordingError` with one line: no folder is configured, it cannot be written, too
-        little is free, the disk does not answer.
-        """
-        with self._commands:
-            if self._closed:
-                raise RecordingError("the recorder is closed")
-            if self._run is not None:
-                return self.file
-            if not self._settings.folder:
-                raise RecordingError("recording.folder is empty: nothing can be recorded")
-            if self._hung is not None and self._hung.is_alive():
-                raise RecordingError(
-                    f"recording.folder '{self._settings.folder}': the disk has not yet answered"
-                    " to the recording before"
-                )
-            run = self._begun()
-            name = run.name
-        self._tell(messages.EVENT_RECORDING_STARTED, name)
-        with contextlib.suppress(Exception):
-            self._force_idr()
-        return name
-
-    def stop(self) -> str:
-        """Ends the recording within some seconds; the last file's name, "" when there was none.
-
-        The file is whole and on the card then. A disk that does not answer is left to itself, which
-        the event says. A second call does nothing.
-        """
-        with self._commands:
-            run, self._run = self._run, None
-            if run is not None and not run.end(_STOP_LIMIT_S):
-                run.give_up()
-                self._hung = run
-                self._tell(
-                    messages.EVENT_RECORDING_ENDED,
-                    f"{run.name}: the disk did not take its end within {_STOP_LIMIT_S:g} s",
-                )
-            return self._latest.name if self._latest else ""
+        head = {"payload": payload} if payload else {}
+        super().__init__(settings, announce, force_idr=force_idr, head=head, open_file=open_file)
 
     def unit(self, info: sei.FrameInfo, access_unit: bytes) -> None:
         """Records an access unit when a recording is made; never waits and never raises."""
         run = self._run
         if run is not None:
             with contextlib.suppress(Exception):
-                run.intake.unit(info, access_unit)
+                run.queue.unit(info, access_unit)
 
     def message(self, kind: str, message: messages.Message) -> None:
         """Records a message on `/blimp/<kind>`, likewise; from any thread."""
         run = self._run
         if run is not None and isinstance(message, messages.Message):
             with contextlib.suppress(Exception):
-                run.intake.message(kind, message)
-
-    def close(self) -> None:
-        """Stops for good."""
-        self._closed = True
-        self.stop()
-
-    def _begun(self) -> Run:
-        def told(goes_on: bool, text: str) -> None:
-            if goes_on:
-                self._tell(messages.EVENT_RECORDING_STARTED, text)
-                return
-            if self._run is run:
-                self._run = None
-            self._tell(messages.EVENT_RECORDING_ENDED, text)
-
-        run = Run(
-            self._settings,
-            told=told,
-            force_idr=self._force_idr,
-            payload=self._payload,
-            open_file=self._open_file,
-        )
-        try:
-            run.begin(_START_LIMIT_S)
-        except RecordingError:
-            self._hung = run
-            raise
-        if self._latest is not None:
-            self._left_out += self._latest.left_out
-        self._latest = self._run = run
-        run.go()
-        return run
-
-    def _tell(self, name: str, text: str) -> None:
-        """A link that fails to take an event ends no recording."""
-        with contextlib.suppress(Exception):
-            self._announce(name, text)
+                run.queue.put(Telemetry(kind, message, time.monotonic()))

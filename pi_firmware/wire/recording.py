@@ -120,12 +120,21 @@ class RecordingWriter:
             self._writer.flush()
 
     def write_video(
-        self, time_ns: int, data: bytes, *, topic: str = VIDEO_TOPIC, frame_id: str = "camera"
+        self,
+        time_ns: int,
+        data: bytes,
+        *,
+        topic: str = VIDEO_TOPIC,
+        frame_id: str = "camera",
+        log_ns: int | None = None,
     ) -> None:
-        """Adds one H.264 access unit in Annex B form."""
+        """Adds one H.264 access unit in Annex B form.
+
+        `log_ns` is the log time where that is another clock's, as in a file of several cameras.
+        """
         message = CompressedVideo(frame_id=frame_id, data=data, format="h264")
         message.timestamp.FromNanoseconds(time_ns)
-        self._write_protobuf(topic, time_ns, message)
+        self._write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
     def write_calibration(
         self,
@@ -161,14 +170,15 @@ class RecordingWriter:
         *,
         topic: str,
         frame_id: str = "world",
+        log_ns: int | None = None,
     ) -> None:
-        """Adds `wTc`: position in metres, quaternion x, y, z, w."""
+        """Adds `wTc`: position in metres, quaternion x, y, z, w; `log_ns` as in `write_video`."""
         message = PoseInFrame(frame_id=frame_id)
         message.timestamp.FromNanoseconds(time_ns)
         position, orientation = message.pose.position, message.pose.orientation
         position.x, position.y, position.z = map(float, position_m)
         orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion_xyzw)
-        self._write_protobuf(topic, time_ns, message)
+        self._write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
     def write_json(
         self,

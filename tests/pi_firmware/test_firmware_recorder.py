@@ -29,12 +29,13 @@ from recorded import (
 )
 
 from ground_station.recording.open import open_input
-from pi_firmware.recording import Recorder, file, run
+from pi_firmware.recording import Recorder
 from pi_firmware.settings import RecordingSettings
 from pi_firmware.sources.decoding import RecordingDecoder
 from pi_firmware.wire import annexb, messages
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.messages import EVENT_RECORDING_ENDED, EVENT_RECORDING_STARTED
+from pi_firmware.wire.recorder import file, run
 from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader
 
 BATTERY = messages.Battery(time_ns=START_NS + 5, voltage=3.9, percentage=0.5)
@@ -135,7 +136,7 @@ def test_a_file_ends_before_its_index_outgrows_memory(
 def test_a_stream_without_idrs_is_asked_for_one_and_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "_OVERRUN_BYTES", 500_000)
+    monkeypatch.setattr(run, "OVERRUN_BYTES", 500_000)
     asked: list[int] = []
     settings = RecordingSettings(folder=str(tmp_path), min_free_MB=0, max_file_MB=1)
     made = Recorder(settings, Events(), force_idr=lambda: asked.append(1))
@@ -294,7 +295,7 @@ def test_memory_does_not_grow_with_what_was_recorded(tmp_path: Path) -> None:
     try:
         for block in range(4):
             feed(made, range(block * 300, block * 300 + 300), 15_000)
-            eventually(lambda: made._run is not None and not made._run.intake._items)
+            eventually(lambda: made._run is not None and not made._run.queue._items)
             taken.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()

@@ -43,7 +43,7 @@ def test_a_file_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
     made.start()
     for block in range(8):
         feed(made, range(block * 10, block * 10 + 10), 3000)
-        eventually(lambda: made._run is not None and not made._run.intake._items)
+        eventually(lambda: made._run is not None and not made._run.queue._items)
         time.sleep(0.1)  # a sync passes; that it has is not needed
     path = tmp_path / made.stop()
     whole, ends = path.read_bytes(), chunk_ends(path)

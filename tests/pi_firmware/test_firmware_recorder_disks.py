@@ -34,12 +34,12 @@ from recorded import (
 )
 
 from ground_station.recording.h264 import grey
-from pi_firmware.recording import folder as folder_module
-from pi_firmware.recording import recorder as recorder_module
-from pi_firmware.recording import run
 from pi_firmware.wire import annexb
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.messages import EVENT_RECORDING_ENDED, EVENT_RECORDING_STARTED
+from pi_firmware.wire.recorder import folder as folder_module
+from pi_firmware.wire.recorder import recorder as recorder_module
+from pi_firmware.wire.recorder import run
 from pi_firmware.wire.recording import RecordingReader
 
 
@@ -162,7 +162,7 @@ def test_what_is_to_be_left_free_ends_the_recording_with_a_whole_file(
     made = recorder(tmp_path, events, min_free_MB=50, sync_s=0.1)
     made.start()
     units = feed(made, range(20))
-    eventually(lambda: made._run is not None and not made._run.intake._items)
+    eventually(lambda: made._run is not None and not made._run.queue._items)
     free[0] = 49_000_000  # another program took it
     feed(made, range(20, 30))
     eventually(lambda: len(events.told) > 1)
@@ -197,7 +197,7 @@ def test_a_slow_disk_costs_whole_ends_of_groups_and_each_frame_is_counted(
         slowest_s = max(slowest_s, time.monotonic() - begin)
     assert made.dropped > 10 and slowest_s < 1.0
     held_disk.set()
-    eventually(lambda: made._run is not None and not made._run.intake._items)
+    eventually(lambda: made._run is not None and not made._run.queue._items)
     feed(made, range(85, 120), 3000)
     path = tmp_path / made.stop()
     read = sequences(path)

@@ -7,71 +7,71 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-from pi_firmware.wire import annexb, messages, sei
+from pi_firmware.wire import annexb, sei
 
 _ITEM_BYTES = 512
-"""What an item takes beside a unit's bytes, about; a message as a whole."""
+"""What an item takes beside a unit's bytes, about; any other as a whole."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """An access unit, and when it came, by the monotonic clock."""
+    """An access unit, and when it came, by the monotonic clock.
+
+    `stream` tells apart the cameras of a recording; `log_ns` is its log time where that is not its
+    capture time.
+    """
 
     info: sei.FrameInfo
     data: bytes
     arrived_s: float
+    stream: str = ""
+    log_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Telemetry:
-    """A message of one kind, and when it came, by the monotonic clock."""
-
-    kind: str
-    message: messages.Message
-    arrived_s: float
-
-
-class Intake:
+class Queue:
     """A queue from many threads to one.
 
-    When a unit does not fit, it and all that follow are left out up to an IDR that finds the queue
-    half empty: what is recorded of a group of pictures is always its beginning, so it decodes.
+    When a unit does not fit, it and all that follow of its stream are left out up to an IDR that
+    finds the queue half empty: what is recorded of a group of pictures is always its beginning, so
+    it decodes.
     """
 
     def __init__(self, limit_bytes: int, wake_bytes: int) -> None:
         self.left_out = 0
         """Units that were not taken."""
         self._limit_bytes, self._wake_bytes = limit_bytes, wake_bytes
-        self._items: deque[Unit | Telemetry] = deque()
+        self._items: deque[object] = deque()
         self._bytes = 0
-        self._skipping = False
+        self._skipping: set[str] = set()
         self._closed = False
         self._lock = threading.Lock()
         self._wake = threading.Event()
 
-    def unit(self, info: sei.FrameInfo, access_unit: bytes) -> None:
+    def unit(
+        self, info: sei.FrameInfo, access_unit: bytes, stream: str = "", log_ns: int | None = None
+    ) -> None:
         """Queues an access unit, or counts it as left out."""
         size = len(access_unit) + _ITEM_BYTES
         with self._lock:
             if self._closed:
                 return
-            fits = self._bytes + size <= self._limit_bytes
-            if self._skipping:
+            takes = self._bytes + size <= self._limit_bytes
+            if stream in self._skipping:
                 # Only now does anyone look into the unit: the encoder's thread has little time.
                 calm = self._bytes <= self._limit_bytes // 2
-                self._skipping = not (fits and calm and annexb.is_idr(access_unit))
+                takes = takes and calm and annexb.is_idr(access_unit)
+            if takes:
+                self._skipping.discard(stream)
+                self._add(Unit(info, access_unit, time.monotonic(), stream, log_ns), size)
             else:
-                self._skipping = not fits
-            if self._skipping:
+                self._skipping.add(stream)
                 self.left_out += 1
-            else:
-                self._add(Unit(info, access_unit, time.monotonic()), size)
 
-    def message(self, kind: str, message: messages.Message) -> None:
-        """Queues a message; a full queue does not take it."""
+    def put(self, item: object) -> None:
+        """Queues anything small; a full queue does not take it."""
         with self._lock:
             if not self._closed and self._bytes + _ITEM_BYTES <= self._limit_bytes:
-                self._add(Telemetry(kind, message, time.monotonic()), _ITEM_BYTES)
+                self._add(item, _ITEM_BYTES)
 
     def wait(self, until_s: float) -> bool:
         """Until this monotonic time, or until much waits; whether the end has come."""
@@ -80,7 +80,7 @@ class Intake:
             self._wake.clear()
         return self._closed
 
-    def take(self) -> Unit | Telemetry | None:
+    def take(self) -> object | None:
         """The oldest item, None when there is none."""
         with self._lock:
             if not self._items:
@@ -102,7 +102,7 @@ class Intake:
             self._items.clear()
             self._bytes = 0
 
-    def _add(self, item: Unit | Telemetry, size: int) -> None:
+    def _add(self, item: object, size: int) -> None:
         self._items.append(item)
         self._bytes += size
         if self._bytes >= self._wake_bytes:

@@ -1,17 +1,16 @@
-"""One file of a recording: video, what the camera told of each frame, and telemetry."""
+"""One file of a recording: video, what the camera told of each frame, and what else is said."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
-from pi_firmware.wire import messages, sei
+from pi_firmware.wire import sei
 from pi_firmware.wire.errors import BlimpError, RecordingError
+from pi_firmware.wire.recorder.durable import OpenFile
 
 if TYPE_CHECKING:
     from pi_firmware.wire.recording import RecordingWriter
@@ -20,7 +19,6 @@ CHUNK_BYTES = 256 * 1024
 """A chunk ends, and is written, when it has so much or is synced, and only if there is room."""
 
 _NEVER_BY_ITSELF = 1 << 40
-TELEMETRY_ROOT = "/blimp"
 FRAME_SCHEMA = "blimp.Frame"
 _RECORD_BYTES = 96
 """What a message takes in the file beside its content, at most: record, protobuf, index."""
@@ -31,77 +29,7 @@ _MAX_CHUNKS = 8192
 """The index of a file's chunks is held in memory until the file ends: about 1 kB each."""
 
 
-class DurableFile:
-    """A new file, never one that is there; after a write that failed it takes no other.
-
-    Not buffered: what was written is the system's, and after `sync` the card's.
-    """
-
-    def __init__(self, path: Path) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        self._handle = os.open(path, flags, 0o644)
-        self._at = 0
-        self._failure: OSError | None = None
-        self.closed = False
-
-    def write(self, data: bytes) -> int:
-        """Writes all of it or raises `OSError`."""
-        if self.closed:
-            raise OSError(errno.EBADF, "the file is closed")
-        if self._failure is not None:
-            raise self._failure
-        rest = memoryview(data)
-        try:
-            while rest:
-                written = self._write(rest)
-                self._at += written
-                rest = rest[written:]
-        except OSError as error:
-            self._failure = error
-            raise
-        return len(data)
-
-    def _write(self, data: memoryview) -> int:
-        return os.write(self._handle, data)
-
-    def tell(self) -> int:
-        """Bytes written."""
-        return self._at
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def sync(self) -> None:
-        """Waits until the card has it; a file that somebody deleted is no place for more."""
-        try:
-            os.fdatasync(self._handle)
-            if os.fstat(self._handle).st_nlink == 0:
-                raise OSError(errno.ENOENT, "deleted while it was written")
-        except OSError as error:  # the system forgets what it could not write: no second chance
-            self._failure = error
-            raise
-
-    def close(self) -> None:
-        """Syncs and closes; a second call does nothing."""
-        if not self.closed:
-            self.closed = True
-            try:
-                if self._failure is None:
-                    self.sync()
-            finally:
-                os.close(self._handle)
-
-    def __enter__(self) -> DurableFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-OpenFile = Callable[[Path], DurableFile]
-
-
-class FlightFile:
+class RecordingFile:
     """Writes one file; raises `RecordingError` with one line when the disk does not take it.
 
     `head` are metadata tables. Its video begins with the first unit given, which is to be an IDR.
@@ -173,37 +101,42 @@ class FlightFile:
         too_long = self.size_bytes + self._longest_gop_bytes > limit_bytes
         return too_long or self._chunks >= _MAX_CHUNKS
 
-    def unit(self, info: sei.FrameInfo, access_unit: bytes, *, idr: bool) -> None:
-        """Adds an access unit and what the camera told of its frame, both at its capture time."""
+    @property
+    def writer(self) -> RecordingWriter:
+        """What its other messages are written with; to be told of by `added`."""
+        return self._writer
+
+    def unit(
+        self,
+        info: sei.FrameInfo,
+        access_unit: bytes,
+        *,
+        idr: bool,
+        prefix: str = "",
+        log_ns: int | None = None,
+    ) -> None:
+        """Adds an access unit and what the camera told of its frame.
+
+        `prefix` is put before the topics, `log_ns` is the log time where it is not the capture's.
+        """
+        log_ns = info.time_ns if log_ns is None else log_ns
         told = {"exposure_s": info.exposure_s, "gain": info.gain}
         known = {k: v for k, v in told.items() if v is not None and math.isfinite(v)}
-        self._writer.write_video(info.time_ns, access_unit)
+        topic = prefix + self._kinds.VIDEO_TOPIC
+        self._writer.write_video(info.time_ns, access_unit, topic=topic, log_ns=log_ns)
         self._writer.write_json(
-            self._kinds.FRAME_INFO_TOPIC,
-            info.time_ns,
+            prefix + self._kinds.FRAME_INFO_TOPIC,
+            log_ns,
             {"sequence": info.sequence, **known},
             schema_name=FRAME_SCHEMA,
         )
         self.frames += 1
-        self._added(len(access_unit) + 100)
+        self.added(len(access_unit) + 100)
         self._gop_bytes = len(access_unit) + (0 if idr else self._gop_bytes)
         self._longest_gop_bytes = max(self._longest_gop_bytes, self._gop_bytes)
 
-    def message(self, kind: str, message: messages.Message, shift_ns: int) -> None:
-        """Adds a telemetry message, `shift_ns` after its own time.
-
-        Raises `TelemetryError` for what JSON cannot say.
-        """
-        text = messages.encode(message)
-        self._writer.write_json_text(
-            f"{TELEMETRY_ROOT}/{kind}",
-            message.time_ns + shift_ns,
-            text,
-            schema_name=message.SCHEMA,
-        )
-        self._added(len(text))
-
-    def _added(self, content_bytes: int) -> None:
+    def added(self, content_bytes: int) -> None:
+        """One more message, of so many bytes, was written with `writer`."""
         self._pending_bytes += content_bytes + _RECORD_BYTES
         self._unsynced = True
 

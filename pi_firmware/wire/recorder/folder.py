@@ -6,8 +6,8 @@ import os
 import re
 from pathlib import Path
 
-from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.recorder.limits import Limits
 
 MB = 1_000_000
 _NAME = re.compile(r"flight-([0-9]{6,9})\.mcap")
@@ -22,7 +22,7 @@ class Folder:
     Methods raise `RecordingError` with one line.
     """
 
-    def __init__(self, settings: RecordingSettings) -> None:
+    def __init__(self, settings: Limits) -> None:
         self.path = Path(settings.folder)
         self._total_bytes = settings.max_total_MB * MB
         self._min_free_bytes = settings.min_free_MB * MB

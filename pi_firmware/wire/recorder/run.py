@@ -1,0 +1,240 @@
+"""One recording from start to stop: a thread that writes files, one after the other."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.recorder.durable import OpenFile
+from pi_firmware.wire.recorder.file import CHUNK_BYTES, HEAD_BYTES, RecordingFile
+from pi_firmware.wire.recorder.folder import Folder
+from pi_firmware.wire.recorder.limits import Limits
+from pi_firmware.wire.recorder.queue import Queue
+
+QUEUE_BYTES = 8_000_000
+"""What may wait for the disk: half a minute at 2 Mbit/s."""
+
+_SYNC_SHARE = 0.75
+"""Of `sync_s`, from one sync to the next: the rest is the card's, to take what was handed to it."""
+
+_DRAIN_LIMIT_S = 3.0
+"""How long an end waits for a slow disk to take what is queued."""
+
+_IDR_PERIOD_S = 1.0
+OVERRUN_BYTES = 8_000_000
+"""A file whose next one cannot begin yet may outgrow its limit by so much."""
+TIMES_NS = range(1 << 63)
+"""What MCAP and its readers take."""
+
+
+class Run:
+    """Writes what `queue` is given until `end`, or until the disk takes no more.
+
+    `told` is called on the thread with True and a text for a file that goes on from another, and
+    once with False and how much there is when all has ended, and why unless `end` was called.
+    What an item is, where it goes and when the next file begins is a subclass's: `_put`.
+    """
+
+    file_type: type[RecordingFile] = RecordingFile
+
+    def __init__(
+        self,
+        limits: Limits,
+        *,
+        told: Callable[[bool, str], None],
+        force_idr: Callable[[], object],
+        head: Mapping[str, Mapping[str, str]],
+        open_file: OpenFile,
+        queue_bytes: int = 0,
+    ) -> None:
+        self.queue = Queue(queue_bytes or QUEUE_BYTES, CHUNK_BYTES)
+        self.name = ""
+        self.size_bytes = 0
+        """Of the file `name`."""
+        self.reason = ""
+        """Why it ended, in words, when nobody asked for it."""
+        self._limits = limits
+        self._told, self._force_idr = told, force_idr
+        self._head = dict(head)
+        self._open_file = open_file
+        self._folder = Folder(limits)
+        self._files: list[RecordingFile] = []
+        """Those being written: the newest last, and others only while their last frames come."""
+        self._first = ""
+        self._part = 0
+        self._frames = 0  # in earlier files
+        self._given_up = False
+        self._left_out = 0
+        self._asked_s = float("-inf")
+        self._refused: str | None = None
+        self._opened, self._closed = threading.Event(), threading.Event()
+        self._go = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    @property
+    def left_out(self) -> int:
+        """Frames that are in no file since it began to record: the disk was slow or broke, or the
+        clock was set and the frames up to the next IDR belong to neither file."""
+        return self._left_out + self.queue.left_out
+
+    def begin(self, limit_s: float) -> None:
+        """Opens the first file; raises `RecordingError` with one line when that is not possible."""
+        self._thread.start()
+        if not self._opened.wait(limit_s):
+            self.give_up()
+            raise RecordingError(
+                f"recording.folder '{self._folder.path}': no answer within {limit_s:g} s"
+            )
+        if self._refused is not None:
+            self._thread.join()
+            raise RecordingError(self._refused)
+
+    def go(self) -> None:
+        """Lets it write: whoever began it is ready for its end."""
+        self._go.set()
+
+    def end(self, limit_s: float) -> bool:
+        """Ends the file; whether that was done within the limit.
+
+        What `told` does of it may take as long again, at most.
+        """
+        self.queue.close()
+        done = self._closed.wait(limit_s)
+        if done:
+            self._thread.join(limit_s)
+        return done
+
+    def give_up(self) -> None:
+        """Ends it without waiting, and tells nothing of it any more."""
+        self._given_up = True
+        self.queue.close()
+        self._go.set()
+
+    def is_alive(self) -> bool:
+        """Whether its thread still runs: it hangs on a disk when `end` was not done."""
+        return self._thread.is_alive()
+
+    def _put(self, item: object) -> None:
+        """Writes an item of the queue; a frame that cannot be written is one of `_left_out`."""
+        raise NotImplementedError
+
+    def _before_end(self) -> None:
+        """All of the queue is written; what else there is goes into the file now."""
+
+    def _run(self) -> None:
+        reason: str | None = None
+        try:
+            self._open_next()
+            self._opened.set()
+            self._go.wait()
+            self._write()
+        except RecordingError as error:
+            reason = str(error)
+        except Exception as error:  # whatever it is, a flight does not end for its recording
+            reason = f"{type(error).__name__}: {error}"
+        self.queue.close()
+        self.queue.clear()
+        if not self._opened.is_set():
+            self._refused = reason
+            self._opened.set()
+            return
+        for file in list(self._files):
+            try:
+                self._end_file(file, reason or "")
+            except Exception as error:
+                reason = reason or str(error)
+        self.reason = reason or ""
+        self._closed.set()
+        if not self._given_up:
+            self._told(False, self._told_at_end(reason))
+
+    def _told_at_end(self, reason: str | None) -> str:
+        names = self.name if self.name == self._first else f"{self._first} to {self.name}"
+        text = f"{names}: {self._frames} frames"
+        return f"{text}; {reason}" if reason else text
+
+    def _write(self) -> None:
+        period_s = _SYNC_SHARE * self._limits.sync_s
+        due_s = wake_s = time.monotonic() + period_s
+        last_s = math.inf
+        while True:
+            ending = self.queue.wait(wake_s)
+            now_s = time.monotonic()
+            if ending:
+                last_s = min(last_s, now_s + _DRAIN_LIMIT_S)
+            pause_s = min(now_s + period_s, last_s)  # however much waits, it is synced between
+            while (item := self.queue.take()) is not None:
+                self._put(item)
+                self.size_bytes = self._current.size_bytes
+                if self._current.pending_bytes >= CHUNK_BYTES:
+                    self._flush(self._current)
+                if time.monotonic() >= pause_s:
+                    break
+            now_s = time.monotonic()
+            if ending and (item is None or now_s >= last_s):
+                self._before_end()
+                return
+            if now_s >= due_s:
+                due_s = now_s + period_s
+                for file in self._files:
+                    self._flush(file)
+                    file.sync()
+            wake_s = due_s if item is None else now_s
+
+    @property
+    def _current(self) -> RecordingFile:
+        return self._files[-1]
+
+    def _flush(self, file: RecordingFile) -> None:
+        self._folder.make_room(file.size_bytes, file.pending_bytes)
+        file.flush()
+
+    def _turn(self) -> None:
+        """Begins the next file beside the one of now, which is to be ended by `_end_earlier`."""
+        before = self.name
+        self._open_next()
+        self._told(True, f"{self.name}, after {before}")
+
+    def _end_earlier(self, file: RecordingFile) -> None:
+        """Ends a file that has all that belongs to it, while the newest goes on."""
+        self._end_file(file, "goes on in the next file")
+
+    def _open_next(self) -> None:
+        path = self._folder.next_path()
+        self._folder.make_room(HEAD_BYTES, HEAD_BYTES)
+        self._first = self._first or path.name
+        self._part += 1
+        head = {"recording": {"first_file": self._first, "part": str(self._part)}, **self._head}
+        file = self.file_type(path, self._open_file, head)
+        try:
+            self._folder.sync()
+        except RecordingError:
+            file.close({})
+            raise
+        self._files.append(file)
+        self.name, self.size_bytes = path.name, file.size_bytes
+
+    def _end_file(self, file: RecordingFile, reason: str) -> None:
+        with contextlib.suppress(RecordingError):  # its index may lie in what is to be left free
+            self._folder.make_room(file.size_bytes, 0)
+        end = {"frames": str(file.frames), "left_out": str(self.left_out)}
+        try:
+            file.close({**end, "reason": reason} if reason else end)
+        finally:
+            self._files.remove(file)
+            self._frames += file.kept
+            self._left_out += file.frames - file.kept
+        if not self._files:
+            self.size_bytes = file.written_bytes
+        self._folder.sync()
+
+    def _ask_for_idr(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._asked_s >= _IDR_PERIOD_S:
+            self._asked_s = now_s
+            with contextlib.suppress(Exception):
+                self._force_idr()
