@@ -14,6 +14,8 @@ class Counters:
     Every access unit of which anything arrived is one of `decoded`, `withheld` (damaged, or after
     a loss and before the next IDR), `failed` (the decoder refused it) or `unstamped` (without
     capture time). Of the decoded ones `dropped` left the full queue before anyone took them.
+    `overrun` packets were thrown away unread because those before them took too long to decode;
+    they come to be lost.
     """
 
     packets: int = 0
@@ -30,3 +32,4 @@ class Counters:
     failed: int = 0
     unstamped: int = 0
     dropped: int = 0
+    overrun: int = 0

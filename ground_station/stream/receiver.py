@@ -1,4 +1,4 @@
-"""The video's receiver: RTP from UDP into frames that keep their capture time.
+"""One payload's video: RTP from UDP into frames that keep their capture time.
 
 One thread takes datagrams, decodes, and fills a bounded queue that drops its oldest frame. What it
 hands out is only what the payload sent: no frame painted over a loss, none without capture time.
@@ -6,68 +6,25 @@ hands out is only what the payload sent: no frame painted over a loss, none with
 
 from __future__ import annotations
 
-import contextlib
-import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
+from ground_station.stream.assembly import SETS_TIMEOUT_S, Assembly, ReceivedFrame
 from ground_station.stream.counters import Counters
-from ground_station.stream.decoder import Decoder
 from ground_station.stream.srtp import Unprotector
-from pi_firmware.wire import sei
-from pi_firmware.wire.annexb import NO_PARAMETER_SETS
+from ground_station.stream.udp import bind
 from pi_firmware.wire.errors import StreamError
 from pi_firmware.wire.video import PORT
 
-_BUFFER_BYTES = 4 << 20
-_SO_RCVBUFFORCE = 33  # Linux, not in Python's socket module
+__all__ = ["ReceivedFrame", "Receiver"]
+
 _POLL_S = 0.02
 _SILENCE_NS = 2_000_000_000
 _CANDIDATES = 8
-
-
-@dataclass(frozen=True)
-class ReceivedFrame:
-    """One frame as captured.
-
-    `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
-    machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is uint8,
-    gray (H, W) or, from a receiver with `color`, BGR (H, W, 3). `exposure_s` is None where the
-    payload does not tell it or what it tells cannot be.
-    """
-
-    image: NDArray[np.uint8]
-    sequence: int
-    time_ns: int
-    clock_ns: int
-    arrival_ns: int
-    entropy_bits: float
-    sharpness: float
-    exposure_s: float | None
-    gain: float | None
-    heartbeat: bool
-    ssrc: int
-
-
-class _Stream:
-    """What belongs to one SSRC from its first packet to its last."""
-
-    def __init__(self, ssrc: int, payload_id: str | None, counters: Counters, color: bool) -> None:
-        self.ssrc = ssrc
-        self.payload_id = payload_id
-        self.reorderer = rtp.Reorderer(counters)
-        self.depacketizer = rtp.Depacketizer(counters)
-        self.decoder = Decoder(counters, color=color)
-        self.first_arrival_ns: int | None = None
-        self.last_arrival_ns = 0
 
 
 class Receiver:
@@ -90,12 +47,12 @@ class Receiver:
         queue_frames: int = 4,
         ssrc: int | None = None,
         color: bool = False,
-        parameter_sets_timeout_s: float = 3.0,
+        parameter_sets_timeout_s: float = SETS_TIMEOUT_S,
         srtp_keys: Mapping[str, bytes] | None = None,
     ) -> None:
         self._wanted_ssrc = ssrc
         self._color = color
-        self._sets_timeout_ns = int(parameter_sets_timeout_s * 1e9)
+        self._sets_timeout_s = parameter_sets_timeout_s
         self._queue: deque[ReceivedFrame] = deque()
         self._queue_frames = queue_frames
         self._ready = threading.Condition()
@@ -103,11 +60,11 @@ class Receiver:
         self._unprotector: Unprotector | None = None
         if srtp_keys is not None:
             self._unprotector = Unprotector(srtp_keys, self._counters, ssrc=ssrc)
-        self._stream: _Stream | None = None
+        self._stream: Assembly | None = None
         self._candidates: dict[int, rtp.Packet] = {}
         self._problem: str | None = None
         self._closing = threading.Event()
-        self._socket = _bind(host, port)
+        self._socket = bind(host, port, _POLL_S)
         self.host, self.port = self._socket.getsockname()[:2]
         self._thread = threading.Thread(target=self._run, name="video-receiver", daemon=True)
         self._thread.start()
@@ -189,8 +146,10 @@ class Receiver:
                 packet = self._parse(datagram, now_ns)
                 if packet is not None:
                     for own in self._select(packet):
-                        self._take(own)
-            self._expire(now_ns)
+                        assert self._stream is not None
+                        self._deliver(self._stream.push(own))
+            if self._stream is not None:
+                self._watch(self._stream, now_ns)
 
     def _parse(self, datagram: bytes, arrival_ns: int) -> rtp.Packet | None:
         """The packet in a datagram, authentic where that is asked for; if none, it is counted."""
@@ -232,86 +191,28 @@ class Receiver:
             self._counters.other_streams += 1
         return []
 
-    def _begin(self, ssrc: int) -> _Stream:
-        owner = self._unprotector.payload_id(ssrc) if self._unprotector else None
-        return _Stream(ssrc, owner, self._counters, self._color)
+    def _begin(self, ssrc: int) -> Assembly:
+        return Assembly(
+            ssrc,
+            self._counters,
+            payload_id=self._unprotector.payload_id(ssrc) if self._unprotector else None,
+            color=self._color,
+            sets_timeout_s=self._sets_timeout_s,
+        )
 
-    def _take(self, packet: rtp.Packet) -> None:
-        stream = self._stream
-        assert stream is not None
-        self._counters.packets += 1
-        stream.last_arrival_ns = packet.arrival_ns
-        if stream.first_arrival_ns is None:
-            stream.first_arrival_ns = packet.arrival_ns
-        for ordered, gap in stream.reorderer.push(packet):
-            self._assemble(stream, ordered, gap)
-
-    def _expire(self, now_ns: int) -> None:
-        stream = self._stream
-        if stream is None or stream.first_arrival_ns is None:
-            return
-        for ordered, gap in stream.reorderer.expire(now_ns):
-            self._assemble(stream, ordered, gap)
-        if stream.decoder.saw_parameter_sets:
+    def _watch(self, stream: Assembly, now_ns: int) -> None:
+        """Gives up what is missing too long, and a stream that cannot be shown."""
+        self._deliver(stream.expire(now_ns))
+        if (problem := stream.problem) is not None:
+            self._tell_problem(problem)
+        else:
             self._problem = None
-        elif stream.last_arrival_ns - stream.first_arrival_ns > self._sets_timeout_ns:
-            self._tell_problem(NO_PARAMETER_SETS)
 
-    def _assemble(self, stream: _Stream, packet: rtp.Packet, gap: bool) -> None:
-        for unit in stream.depacketizer.push(packet, gap):
-            self._counters.access_units += 1
-            image = stream.decoder.decode(unit)
-            if image is None:
-                continue
-            info = sei.find(unit.data)
-            if info is None:
-                self._counters.unstamped += 1
-                continue
-            self._counters.decoded += 1
-            since_ns = time.monotonic_ns() - unit.arrival_ns
-            self._deliver(_frame(image, info, time.time_ns() - since_ns, stream.ssrc))
-
-    def _deliver(self, frame: ReceivedFrame) -> None:
-        with self._ready:
-            self._queue.append(frame)
-            if len(self._queue) > self._queue_frames:
-                self._queue.popleft()
-                self._counters.dropped += 1
-            self._ready.notify()
-
-
-def _frame(
-    image: NDArray[np.uint8], info: sei.FrameInfo, arrival_ns: int, ssrc: int
-) -> ReceivedFrame:
-    return ReceivedFrame(
-        image=image,
-        sequence=info.sequence,
-        time_ns=info.time_ns,
-        clock_ns=info.clock_ns,
-        arrival_ns=arrival_ns,
-        entropy_bits=info.entropy_bits,
-        sharpness=info.sharpness,
-        exposure_s=plausible_exposure_s(info.exposure_s),
-        gain=info.gain,
-        heartbeat=info.heartbeat,
-        ssrc=ssrc,
-    )
-
-
-def _bind(host: str, port: int) -> socket.socket:
-    """A UDP socket with room for a burst; raises `StreamError` with one line."""
-    try:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        receiver = socket.socket(family, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
-    try:
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        with contextlib.suppress(OSError):  # beyond the system's limit, where we may
-            receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
-        receiver.bind(address)
-    except OSError as error:
-        receiver.close()
-        raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
-    receiver.settimeout(_POLL_S)
-    return receiver
+    def _deliver(self, frames: Iterable[ReceivedFrame]) -> None:
+        for frame in frames:
+            with self._ready:
+                self._queue.append(frame)
+                if len(self._queue) > self._queue_frames:
+                    self._queue.popleft()
+                    self._counters.dropped += 1
+                self._ready.notify()

@@ -1,0 +1,122 @@
+"""One stream's packets into its frames: in order, whole, decoded, each with its capture time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_station.recording.frames import plausible_exposure_s
+from ground_station.stream import rtp
+from ground_station.stream.counters import Counters
+from ground_station.stream.decoder import Decoder
+from pi_firmware.wire import sei
+from pi_firmware.wire.annexb import NO_PARAMETER_SETS
+
+SETS_TIMEOUT_S = 3.0
+"""A stream that has come for so long without parameter sets cannot be shown."""
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    """One frame as captured.
+
+    `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
+    machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is uint8,
+    gray (H, W) or, from a receiver with `color`, BGR (H, W, 3). `exposure_s` is None where the
+    payload does not tell it or what it tells cannot be. `access_unit` is what it was decoded from,
+    Annex B with its SEI.
+    """
+
+    image: NDArray[np.uint8]
+    sequence: int
+    time_ns: int
+    clock_ns: int
+    arrival_ns: int
+    entropy_bits: float
+    sharpness: float
+    exposure_s: float | None
+    gain: float | None
+    heartbeat: bool
+    ssrc: int
+    access_unit: bytes = b""
+
+
+class Assembly:
+    """What belongs to one SSRC from its first packet to its last; for one thread.
+
+    It gives out only what the payload sent: no frame painted over a loss, none without capture
+    time. All else is counted in `counters`.
+    """
+
+    def __init__(
+        self,
+        ssrc: int,
+        counters: Counters,
+        *,
+        payload_id: str | None = None,
+        color: bool = False,
+        sets_timeout_s: float = SETS_TIMEOUT_S,
+    ) -> None:
+        self.ssrc = ssrc
+        self.payload_id = payload_id
+        self.last_arrival_ns = 0
+        """Monotonic, of the newest packet."""
+        self._counters = counters
+        self._reorderer = rtp.Reorderer(counters)
+        self._depacketizer = rtp.Depacketizer(counters)
+        self._decoder = Decoder(counters, color=color)
+        self._sets_timeout_ns = int(sets_timeout_s * 1e9)
+        self._first_arrival_ns: int | None = None
+
+    @property
+    def problem(self) -> str | None:
+        """Why the stream cannot be shown, in words; None while it can."""
+        if self._first_arrival_ns is None or self._decoder.saw_parameter_sets:
+            return None
+        came_ns = self.last_arrival_ns - self._first_arrival_ns
+        return NO_PARAMETER_SETS if came_ns > self._sets_timeout_ns else None
+
+    def push(self, packet: rtp.Packet) -> Iterator[ReceivedFrame]:
+        """Takes a packet; the frames that are whole with it."""
+        self._counters.packets += 1
+        self.last_arrival_ns = packet.arrival_ns
+        if self._first_arrival_ns is None:
+            self._first_arrival_ns = packet.arrival_ns
+        for ordered, gap in self._reorderer.push(packet):
+            yield from self._assemble(ordered, gap)
+
+    def expire(self, now_ns: int) -> Iterator[ReceivedFrame]:
+        """The frames that are whole because what is missing before them is given up."""
+        for ordered, gap in self._reorderer.expire(now_ns):
+            yield from self._assemble(ordered, gap)
+
+    def _assemble(self, packet: rtp.Packet, gap: bool) -> Iterator[ReceivedFrame]:
+        for unit in self._depacketizer.push(packet, gap):
+            self._counters.access_units += 1
+            image = self._decoder.decode(unit)
+            if image is None:
+                continue
+            info = sei.find(unit.data)
+            if info is None:
+                self._counters.unstamped += 1
+                continue
+            self._counters.decoded += 1
+            since_ns = time.monotonic_ns() - unit.arrival_ns
+            yield ReceivedFrame(
+                image=image,
+                sequence=info.sequence,
+                time_ns=info.time_ns,
+                clock_ns=info.clock_ns,
+                arrival_ns=time.time_ns() - since_ns,
+                entropy_bits=info.entropy_bits,
+                sharpness=info.sharpness,
+                exposure_s=plausible_exposure_s(info.exposure_s),
+                gain=info.gain,
+                heartbeat=info.heartbeat,
+                ssrc=self.ssrc,
+                access_unit=unit.data,
+            )

@@ -1,0 +1,333 @@
+"""The video of several payloads on one UDP port, told apart by SSRC.
+
+One thread takes datagrams and never waits for a decoder: each stream is put together and decoded on
+a thread of its own, which PyAV lets run beside the others. Streams that nobody vouches for are
+counted, held for a moment, and forgotten.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from ground_station.stream import rtp
+from ground_station.stream.assembly import Assembly, ReceivedFrame
+from ground_station.stream.counters import Counters
+from ground_station.stream.srtp import Unprotector
+from ground_station.stream.udp import bind
+from pi_firmware.wire.video import PORT
+
+Owner = Callable[[int, str | None, float], str | None]
+"""(SSRC, the payload whose key it was made with, seconds that it has come) -> its payload.
+
+None: not known, or not taken. It is asked on the receiver's thread and has to return at once.
+"""
+OnFrame = Callable[[str, ReceivedFrame], None]
+
+_POLL_S = 0.05
+_BUSY_POLL_S, _IDLE_POLL_S = 0.01, 0.25
+_BUSY_NS = 200_000_000
+_ASK_NS = 100_000_000
+"""How often the owner of a stream that nobody vouched for is asked for again."""
+_CANDIDATES = 8
+_HELD_PACKETS = 512
+"""Of a stream whose owner is not known yet: about a second, from its first packet on."""
+_CANDIDATE_NS = 10_000_000_000
+"""A candidate silent for so long is forgotten."""
+_GIVE_WAY_NS = 500_000_000
+"""A payload's earlier stream that is silent for so long gives way to its new one."""
+_QUEUE_PACKETS = 2048
+_SILENT_NS = 60_000_000_000
+_ACCOUNTS = 64
+
+
+class Stream:
+    """One payload's stream, decoded on a thread of its own; what `Feedback` reports on."""
+
+    def __init__(
+        self, ssrc: int, payload_id: str, port: int, counters: Counters, on_frame: OnFrame
+    ) -> None:
+        self.ssrc = ssrc
+        self.payload_id = payload_id
+        self.port = port
+        self.bytes = 0
+        """Of the packets that came, as RTP."""
+        self.failure = ""
+        """Why its frames are not taken any more, in words."""
+        self.began_ns = self.last_ns = time.monotonic_ns()
+        self._counters = counters
+        self._assembly = Assembly(ssrc, counters, payload_id=payload_id)
+        self._on_frame = on_frame
+        self._waiting: deque[rtp.Packet] = deque()
+        self._there = threading.Condition()
+        self._closing = False
+        name = f"video-{payload_id}"
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def counters(self) -> Counters:
+        """A snapshot of the counters."""
+        return replace(self._counters)
+
+    @property
+    def problem(self) -> str:
+        """Why the stream cannot be shown, in words; "" while it can."""
+        return self.failure or self._assembly.problem or ""
+
+    def put(self, packet: rtp.Packet) -> None:
+        """Queues a packet; a stream that is decoded too slowly loses it, and nobody else does."""
+        self.last_ns = packet.arrival_ns
+        self.bytes += len(packet.payload)
+        with self._there:
+            if len(self._waiting) >= _QUEUE_PACKETS:
+                self._counters.overrun += 1
+                return
+            self._waiting.append(packet)
+            self._there.notify()
+
+    def end(self) -> None:
+        """Decodes what waits and ends, by itself."""
+        with self._there:
+            self._closing = True
+            self._there.notify()
+
+    def join(self, timeout_s: float) -> None:
+        """Waits for its end."""
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            busy = time.monotonic_ns() - self.last_ns < _BUSY_NS
+            with self._there:
+                if not self._waiting and not self._closing:
+                    self._there.wait(_BUSY_POLL_S if busy else _IDLE_POLL_S)
+                packets, closing = list(self._waiting), self._closing
+                self._waiting.clear()
+            for packet in packets:
+                self._give(self._assembly.push(packet))
+            # After the queue, so that a packet that waits in it is not given up.
+            self._give(self._assembly.expire(time.monotonic_ns()))
+            if closing:
+                return
+
+    def _give(self, frames: object) -> None:
+        try:
+            for frame in frames:  # type: ignore[attr-defined]
+                self._on_frame(self.payload_id, frame)
+        except Exception as error:  # one payload's trouble is not to end its stream
+            self.failure = f"{type(error).__name__}: {error}"
+        else:
+            self.failure = ""
+
+
+@dataclass
+class _Candidate:
+    """A stream that nobody has vouched for: its first packets, held for when somebody does."""
+
+    key_owner: str | None
+    first_ns: int
+    last_ns: int
+    asked_ns: int = 0
+    packets: deque[rtp.Packet] = field(default_factory=deque)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether two packets in a row came: random bytes can look like one, not like two."""
+        numbers = [packet.sequence for packet in self.packets]
+        return any((a + 1) & 0xFFFF == b for a, b in itertools.pairwise(numbers))
+
+
+class SeveralReceiver:
+    """Receives the video of up to `most` payloads at a port; a context manager.
+
+    `owner` says whose a stream is; `on_frame` gets each frame with its payload's id, on that
+    stream's own thread, and must not wait. A payload has one stream at a time: another that is its
+    own, too, is taken once the one before has been silent for half a second, with what was held
+    of it. With `srtp_keys` (30 bytes by payload id) only SRTP of these payloads is looked at.
+
+    Raises `StreamError` with one line when the port is in use. `port` 0 takes a free one.
+    """
+
+    def __init__(
+        self,
+        port: int = PORT,
+        host: str = "127.0.0.1",
+        *,
+        owner: Owner,
+        on_frame: OnFrame,
+        most: int = 16,
+        srtp_keys: Mapping[str, bytes] | None = None,
+    ) -> None:
+        self._owner, self._on_frame, self._most = owner, on_frame, most
+        self._counters = Counters()
+        self._unprotector = None if srtp_keys is None else Unprotector(srtp_keys, self._counters)
+        self._streams: dict[int, Stream] = {}
+        self._candidates: dict[int, _Candidate] = {}
+        self._accounts: dict[int, Counters] = {}
+        self._changed = threading.Lock()
+        self._closing = threading.Event()
+        self._failure = ""
+        self._socket = bind(host, port, _POLL_S)
+        self.host, self.port = self._socket.getsockname()[:2]
+        self._thread = threading.Thread(target=self._run, name="video-receiver", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> SeveralReceiver:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stops receiving; what has come is decoded before."""
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+        for stream in self.streams():
+            stream.end()
+        for stream in self.streams():
+            stream.join(2.0)
+
+    @property
+    def counters(self) -> Counters:
+        """Of the port: `garbage`, `refused`, `replayed`, and datagrams of `other_streams`."""
+        return replace(self._counters)
+
+    @property
+    def encrypted(self) -> bool:
+        """Whether only SRTP is taken."""
+        return self._unprotector is not None
+
+    @property
+    def failure(self) -> str:
+        """Why nothing is received any more; "" while it is."""
+        return self._failure
+
+    def streams(self) -> list[Stream]:
+        """Those being received."""
+        with self._changed:
+            return list(self._streams.values())
+
+    def stream_of(self, payload_id: str) -> Stream | None:
+        """A payload's stream; None while there is none."""
+        found = (stream for stream in self.streams() if stream.payload_id == payload_id)
+        return next(found, None)
+
+    def _run(self) -> None:
+        try:
+            self._receive()
+        except Exception as error:
+            self._failure = f"the receiver failed: {error!r}"
+            raise
+
+    def _receive(self) -> None:
+        tidied_ns = 0
+        while not self._closing.is_set():
+            try:
+                datagram: bytes | None = self._socket.recv(65535)
+            except TimeoutError:
+                datagram = None
+            except OSError:
+                continue  # an ICMP error of someone else's datagram
+            now_ns = time.monotonic_ns()
+            if datagram is not None:
+                self._take(datagram, now_ns)
+            if now_ns - tidied_ns >= _ASK_NS:
+                tidied_ns = now_ns
+                self._tidy(now_ns)
+
+    def _take(self, datagram: bytes, now_ns: int) -> None:
+        if self._unprotector is not None:
+            plain = self._unprotector.unprotect(datagram)
+            if plain is None:
+                return
+            datagram = plain
+        packet = rtp.parse(datagram, now_ns)
+        if packet is None:
+            self._counters.garbage += 1
+            return
+        stream = self._streams.get(packet.ssrc)
+        if stream is not None:
+            stream.put(packet)
+            return
+        self._hold(packet)
+
+    def _hold(self, packet: rtp.Packet) -> None:
+        """Keeps a stranger's packet; beyond the limits the oldest is another stream's datagram."""
+        ssrc, now_ns = packet.ssrc, packet.arrival_ns
+        candidate = self._candidates.get(ssrc)
+        if candidate is None:
+            if len(self._candidates) >= _CANDIDATES:
+                # Whoever has shown the least goes first: random SSRCs push out one another.
+                least = min(
+                    self._candidates, key=lambda known: len(self._candidates[known].packets)
+                )
+                self._forget(least)
+            key_owner = self._unprotector.payload_id(ssrc) if self._unprotector else None
+            candidate = self._candidates[ssrc] = _Candidate(key_owner, now_ns, now_ns)
+        candidate.last_ns = now_ns
+        candidate.packets.append(packet)
+        if len(candidate.packets) > _HELD_PACKETS:
+            candidate.packets.popleft()
+            self._counters.other_streams += 1
+        if now_ns - candidate.asked_ns >= _ASK_NS:
+            self._ask(ssrc, candidate, now_ns)
+
+    def _ask(self, ssrc: int, candidate: _Candidate, now_ns: int) -> None:
+        """Begins the stream if somebody vouches for it now."""
+        candidate.asked_ns = now_ns
+        age_s = (now_ns - candidate.first_ns) / 1e9 if candidate.continuous else 0.0
+        owner = self._owner(ssrc, candidate.key_owner, age_s)
+        if owner is None or candidate.key_owner not in (None, owner):
+            return
+        if not self._make_room(owner, now_ns):
+            return
+        del self._candidates[ssrc]
+        counters = self._accounts.pop(ssrc, None) or Counters()
+        self._accounts[ssrc] = counters
+        if len(self._accounts) > _ACCOUNTS:
+            del self._accounts[next(iter(self._accounts))]
+        stream = Stream(ssrc, owner, self.port, counters, self._on_frame)
+        with self._changed:
+            self._streams[ssrc] = stream
+        for packet in candidate.packets:
+            stream.put(packet)
+
+    def _make_room(self, owner: str, now_ns: int) -> bool:
+        """Whether a payload's new stream can be taken: its earlier one has gone, or goes now."""
+        for stream in self.streams():
+            if stream.payload_id == owner:
+                if now_ns - stream.last_ns < _GIVE_WAY_NS:
+                    return False
+                self._drop(stream)
+        if len(self._streams) < self._most:
+            return True
+        silent = min(self.streams(), key=lambda stream: stream.last_ns)
+        if now_ns - silent.last_ns < _GIVE_WAY_NS:
+            return False
+        self._drop(silent)
+        return True
+
+    def _drop(self, stream: Stream) -> None:
+        with self._changed:
+            self._streams.pop(stream.ssrc, None)
+        stream.end()
+
+    def _forget(self, ssrc: int) -> None:
+        self._counters.other_streams += len(self._candidates.pop(ssrc).packets)
+
+    def _tidy(self, now_ns: int) -> None:
+        """Asks for the strangers again, and lets go of who has been silent for long."""
+        for ssrc, candidate in list(self._candidates.items()):
+            if now_ns - candidate.last_ns > _CANDIDATE_NS:
+                self._forget(ssrc)
+            elif now_ns - candidate.asked_ns >= _ASK_NS:
+                self._ask(ssrc, candidate, now_ns)
+        for stream in self.streams():
+            if now_ns - stream.last_ns > _SILENT_NS:
+                self._drop(stream)
