@@ -7,6 +7,7 @@ import os
 import pty
 import select
 import statistics
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
@@ -103,9 +104,6 @@ class Live:
         """Speaks to the payload until all has been seen that is to be; then ends it."""
         until = Waiting(self.listen)
         try:
-            out = self.process.stdout
-            assert out is not None
-            endpoint = [out.readline() for _ in range(2)][1].split()[-1]
             until(lambda: self.has("radio-failed") and self.has("battery-low"))
             until(lambda: self.has("camera-restarted") and self.has("streaming-again"))
             until(lambda: self.autopilot_heard, lambda: self.put(keys.POSE, pose()))
@@ -113,17 +111,25 @@ class Live:
             self.answer = commands.ask(
                 self.session, self.payload_id, "bitrate", {"kbps": 50}, LIMIT_S
             )
-            if endpoint.startswith("tcp/"):
-                other = open_session(connect=[endpoint])
-                elsewhere = Heard(other)
-                until(lambda: elsewhere.said)
-                self.heard_elsewhere = len(elsewhere.said)
-                other.close()
+            other = open_session(connect=self.endpoints())
+            elsewhere = Heard(other)
+            until(lambda: elsewhere.said)
+            other.close()
+            self.heard_elsewhere = len(elsewhere.said)
             self.process.terminate()
             self.process.communicate(timeout=LIMIT_S)
         finally:
             self.process.kill()
             self.process.wait()
+
+    def endpoints(self) -> list[str]:
+        """Where the program says that its telemetry listens, in the second line if it does."""
+        assert self.process.stdout is not None
+        in_vain = threading.Timer(LIMIT_S / 2, self.process.kill)
+        in_vain.start()
+        lines = [self.process.stdout.readline() for _ in range(2)]
+        in_vain.cancel()
+        return [lines[1].split()[-1]] if lines[1].startswith("telemetry on ") else []
 
     def listen(self) -> None:
         if select.select([self.master], [], [], 0.05)[0]:
