@@ -19,6 +19,11 @@ _COMMANDS = (
     ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
     ("command", "ground_station.stream.command", "ask a payload to do something"),
     ("serve", "ground_station.service.serve_command", "run the ground station and its dashboard"),
+    (
+        "doctor",
+        "ground_station.service.doctor.command",
+        "check this machine, and say how to mend it",
+    ),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
     ("bench", "ground_station.service.bench_command", "measure what each step costs"),
