@@ -1,0 +1,66 @@
+"""`python -m ground_station.service.localizing RUN_FOLDER PAYLOAD_ID`: one payload's localizer."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from pi_firmware.wire.errors import BlimpError
+
+_BAD_INPUT = 2
+_END_S = 1.5
+"""An orderly end may take this long; a search in a large map takes longer and is not waited for."""
+
+
+def _ending() -> threading.Event:
+    """Is set by SIGTERM or SIGINT."""
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        if not stop.is_set():
+            stop.set()
+            limit = threading.Timer(_END_S, os._exit, (0,))
+            limit.daemon = True
+            limit.start()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    return stop
+
+
+def main(arguments: list[str]) -> int:
+    """Localizes until it is told to end; 0, 2 for bad input, 3 when only a new process can help."""
+    if len(arguments) != 2:
+        usage = "usage: python -m ground_station.service.localizing RUN_FOLDER PAYLOAD_ID"
+        print(usage, file=sys.stderr)
+        return _BAD_INPUT
+    stop = _ending()
+    # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import cv2
+
+    from ground_station.service import processes, settings
+    from ground_station.service.bus import Bus
+    from ground_station.service.localizing.process import Localizing
+    from pi_firmware.wire.keys import check_payload_id
+
+    cv2.setNumThreads(1)
+    folder, payload_id = Path(arguments[0]), arguments[1]
+    try:
+        check_payload_id(payload_id)
+        run = settings.load_run(folder)
+        with Bus(folder, f"{processes.LOCALIZER}/{payload_id}") as bus:
+            return Localizing(bus, folder, payload_id, run.station).run(stop)
+    except BlimpError as error:
+        print(f"localizer {payload_id}: {error}", file=sys.stderr, flush=True)
+        return _BAD_INPUT
+
+
+if __name__ == "__main__":
+    status = main(sys.argv[1:])
+    sys.stdout.flush()
+    # Not sys.exit: it waits for the thread of keyframes, which may be in a search.
+    os._exit(status)

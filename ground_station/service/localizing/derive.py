@@ -1,0 +1,153 @@
+"""What a viewer or pilot wants to know of a pose, from the estimate: pure functions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry.poses import to_quaternion
+from ground_station.localization.estimate import Observations, PoseEstimate, State
+from ground_station.service.notes import EstimateNote, FrameNote
+
+Array = npt.NDArray[np.float64]
+
+MOST_POINTS = 300
+STEEPEST_DEG = 85.0
+"""A view that is steeper, up or down, has no heading: a little swing would turn it around."""
+
+
+@dataclass(frozen=True)
+class Accounts:
+    """A payload's frames since the start: those taken, of these localized, and those not taken."""
+
+    processed: int = 0
+    localized: int = 0
+    skipped: int = 0
+
+
+def position_covariance(wTc: Array, covariance: Array) -> Array:
+    """The position's covariance (3, 3) in world axes, m².
+
+    `covariance` (6, 6) is of the right tangent of wTc (4, 4), rotation first: wTc·exp(ξ) moves the
+    position by R·ξ_t to first order (Barfoot 2017, section 7.3.1), so it is R·Σ_tt·Rᵀ.
+    """
+    R = wTc[:3, :3]
+    turned = R @ covariance[3:, 3:] @ R.T
+    return np.asarray((turned + turned.T) / 2)
+
+
+def world_velocity(wTc: Array, twist: Array | None) -> Array | None:
+    """The camera's velocity (3,) in world axes, m/s, from a twist (6,) in its own axes.
+
+    None for a twist of exactly zero, which stands for one that is not estimated (yet).
+    """
+    if twist is None or not np.isfinite(twist).all() or not twist.any():
+        return None
+    return np.asarray(wTc[:3, :3] @ twist[3:])
+
+
+def heading_deg(wTc: Array) -> float | None:
+    """Where the camera looks on the floor, degrees from the map's x axis towards y, -180 to 180.
+
+    It is the camera's z axis without its vertical part; None where the view is within 5° of the
+    vertical.
+    """
+    x, y, z = (float(value) for value in wTc[:3, 2])
+    across = float(np.hypot(x, y))
+    if np.rad2deg(np.arctan2(abs(z), across)) > STEEPEST_DEG:
+        return None
+    return float(np.rad2deg(np.arctan2(y, x)))
+
+
+def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float]:
+    """The inliers' pixels in the frame as it was taken (distorted), u, v by turns.
+
+    At most `most` of them, evenly chosen in the order of the observations; to a tenth of a pixel.
+    """
+    pixels = observations.pixel_px[observations.inlier]
+    if len(pixels) > most:
+        pixels = pixels[np.arange(most) * len(pixels) // most]
+    return [round(value, 1) for value in pixels.astype(np.float64).ravel().tolist()]
+
+
+def estimate_note(
+    frame: FrameNote, estimate: PoseEstimate, accounts: Accounts, map_name: str, done_ns: int
+) -> EstimateNote:
+    """An estimate as the other processes take it; `done_ns` is this machine's wall clock.
+
+    What is not finite is not told: without a finite pose the frame counts as LOST.
+    """
+    wTc = estimate.wTc
+    if wTc is None or not np.isfinite(wTc).all():
+        state = estimate.state if wTc is None else State.LOST
+        reason = estimate.reason if wTc is None else "the pose is not finite"
+        return unsolved_note(frame, state, reason, accounts, map_name, done_ns, estimate)
+    covariance, sigma = estimate.covariance, None
+    if covariance is not None:
+        if np.isfinite(covariance).all():
+            sigma = position_covariance(wTc, covariance).ravel().tolist()
+        else:
+            covariance = None
+    velocity = world_velocity(wTc, estimate.twist)
+    return EstimateNote(
+        sequence=frame.sequence,
+        time_ns=frame.time_ns,
+        clock_ns=frame.clock_ns,
+        capture_ns=frame.capture_ns,
+        done_ns=done_ns,
+        state=estimate.state.value,
+        reason=estimate.reason,
+        position_m=wTc[:3, 3].tolist(),
+        quaternion_xyzw=to_quaternion(wTc).tolist(),
+        covariance=None if covariance is None else covariance.ravel().tolist(),
+        position_sigma_m=sigma,
+        velocity_mps=None if velocity is None else velocity.tolist(),
+        heading_deg=heading_deg(wTc),
+        speed_mps=None if velocity is None else float(np.linalg.norm(velocity)),
+        height_m=float(wTc[2, 3]),
+        relocalized=estimate.relocalized,
+        tracked=estimate.tracked,
+        inliers=estimate.counts.inliers,
+        expected=estimate.counts.projected,
+        points_px=points_px(estimate.observations),
+        stage_ms=_stages(estimate),
+        map=map_name,
+        processed=accounts.processed,
+        localized=accounts.localized,
+        skipped=accounts.skipped,
+    )
+
+
+def unsolved_note(
+    frame: FrameNote,
+    state: State,
+    reason: str,
+    accounts: Accounts,
+    map_name: str,
+    done_ns: int,
+    estimate: PoseEstimate | None = None,
+) -> EstimateNote:
+    """A frame without a pose, and why; `estimate` where the localizer saw it."""
+    counts = None if estimate is None else estimate.counts
+    return EstimateNote(
+        sequence=frame.sequence,
+        time_ns=frame.time_ns,
+        clock_ns=frame.clock_ns,
+        capture_ns=frame.capture_ns,
+        done_ns=done_ns,
+        state=state.value,
+        reason=reason,
+        inliers=counts.inliers if counts else 0,
+        expected=counts.projected if counts else 0,
+        stage_ms=_stages(estimate) if estimate else {},
+        map=map_name,
+        processed=accounts.processed,
+        localized=accounts.localized,
+        skipped=accounts.skipped,
+    )
+
+
+def _stages(estimate: PoseEstimate) -> dict[str, float]:
+    return {stage: round(value, 3) for stage, value in estimate.stage_ms.items()}

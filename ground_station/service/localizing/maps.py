@@ -1,0 +1,108 @@
+"""Maps for a running localizer: found by name on the shelf, loaded beside the frames."""
+
+from __future__ import annotations
+
+import re
+import threading
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ground_station.errors import MapError
+from ground_station.features import extractors
+from ground_station.geometry.camera import load_camera
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import for_live, load_preset
+from ground_station.mapping import store
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire.errors import BlimpError
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+def folder_of(settings: StationSettings, name: object) -> Path:
+    """The folder of the map that is asked for by name: one on the shelf, or the configured one.
+
+    Raises `MapError` for what is no plain name, for a name that is not there, and for a link that
+    leads elsewhere.
+    """
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise MapError(f"map {name!r:.80}: a plain name is needed, as 'atrium'")
+    shelf, configured = Path(settings.map.shelf), Path(settings.map.folder)
+    folder = shelf / name
+    if folder.is_dir() and folder.resolve().parent == shelf.resolve():
+        return folder
+    if configured.name == name and configured.is_dir():
+        return configured
+    raise MapError(f"map {name!r}: there is none of that name in {shelf}")
+
+
+def prepare(folder: Path, settings: StationSettings) -> Localizer:
+    """A localizer in a map, for live frames.
+
+    It finds its first pose in the whole map whatever the preset says: nobody tells a service one.
+    Raises a `BlimpError` with one line: a map that is broken, not registered or of other features.
+    """
+    chosen = load_preset(settings.localizer.preset)
+    live = for_live(replace(chosen, recovery=replace(chosen.recovery, relocalize=True)))
+    map_ = store.load(folder)
+    if not map_.info.registered:
+        raise MapError(f"{folder}: it is not registered, so its poses are not in metres")
+    camera = load_camera(settings.map.camera) if settings.map.camera else map_.info.camera
+    features = live.features
+    extractor = extractors.create(features.extractor, features.max_features)
+    return Localizer(map_, camera, extractor, live)
+
+
+@dataclass
+class Loading:
+    """A map on its way; `localizer` or `refused` is there once `ready` is set.
+
+    `taken` is set when the process uses it or has said why not.
+    """
+
+    folder: Path
+    localizer: Localizer | None = None
+    refused: str = ""
+    ready: threading.Event = field(default_factory=threading.Event)
+    taken: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def name(self) -> str:
+        """The folder's own."""
+        return self.folder.resolve().name
+
+
+class Loader:
+    """Loads one map at a time, on a thread of its own; safe from any thread."""
+
+    def __init__(self, settings: StationSettings) -> None:
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._loading: Loading | None = None
+
+    def begin(self, folder: Path) -> Loading:
+        """Starts loading; raises `MapError` while another is under way."""
+        with self._lock:
+            if self._loading is not None:
+                raise MapError(f"the map '{self._loading.name}' is being loaded; try again then")
+            loading = self._loading = Loading(folder)
+        threading.Thread(target=self._load, args=(loading,), name="map", daemon=True).start()
+        return loading
+
+    def landed(self) -> Loading | None:
+        """One that is ready, once."""
+        with self._lock:
+            loading = self._loading
+            if loading is None or not loading.ready.is_set():
+                return None
+            self._loading = None
+            return loading
+
+    def _load(self, loading: Loading) -> None:
+        try:
+            loading.localizer = prepare(loading.folder, self._settings)
+        except BlimpError as error:
+            loading.refused = str(error)
+        except Exception as error:  # as too little memory: the map in use stays
+            loading.refused = f"{loading.folder}: {type(error).__name__}: {error}"
+        loading.ready.set()

@@ -1,0 +1,211 @@
+"""The localizer process's loop: the newest frame wins, and what is not taken is counted."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import GroundStationError, MapError
+from ground_station.localization.estimate import State
+from ground_station.localization.localizer import Localizer
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.localizing import derive, frames
+from ground_station.service.localizing.derive import Accounts
+from ground_station.service.localizing.frames import Taken
+from ground_station.service.localizing.maps import Loader, Loading, folder_of
+from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.notes import EventNote, FrameNote
+from ground_station.service.pictures import PictureReader
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire.errors import BlimpError
+
+RESTART = 3
+"""Exit status: only a new process can help."""
+
+_POLL_S = 0.2
+_ANSWER_S = 3.0
+"""A question for a map waits this long for it to be loaded; a larger one is told by an event."""
+_REFUSED_EVERY_S = 1.0
+_FORGET_AFTER, _END_AFTER = 3, 10
+"""Frames in a row that failed: what is known of the flight may be the cause; the process is."""
+_BESIDE_NICE = 5
+
+
+class LocalizingError(GroundStationError):
+    """Something the localizer process cannot do."""
+
+
+class Localizing:
+    """One payload's frames to poses, on the bus."""
+
+    def __init__(self, bus: Bus, folder: Path, payload_id: str, settings: StationSettings) -> None:
+        self._bus, self._payload_id, self._settings = bus, payload_id, settings
+        self._pictures = PictureReader(folder, payload_id)
+        self._loader = Loader(settings)
+        self._localizer: Localizer | None = None
+        self._map, self._refused = "", "the map is being loaded"
+        self._forget = threading.Event()
+        self._stream: tuple[int, int] | None = None  # ssrc and time of the last frame
+        self._failed = 0
+        self._own = Accounts()
+        self._told_s = 0.0
+        self._complain = Seldom(lambda name, text: self._event(notes.WARNING, name, text))
+        self._newest = bus.newest(notes.FRAME, FrameNote, payload_id)
+        self._loader.begin(Path(settings.map.folder))
+        bus.serve(bus.process, self._do)
+
+    @property
+    def accounts(self) -> Accounts:
+        """Every frame that was ever told of: processed + skipped, but for one not yet taken."""
+        return replace(self._own, skipped=self._own.skipped + self._newest.skipped)
+
+    def run(self, stop: threading.Event) -> int:
+        """Until `stop` is set: 0, or `RESTART` after too many failures in a row."""
+        while not stop.is_set():
+            self._bus.beat()
+            self._take_map()
+            note = self._newest.take(_POLL_S)
+            if note is not None:
+                self._frame(note)
+            if self._failed >= _END_AFTER:
+                text = f"{self._failed} frames in a row failed; the localizer starts anew"
+                self._event(notes.ALARM, "localizer-failed", text)
+                return RESTART
+        return 0
+
+    # Frames
+
+    def _frame(self, note: FrameNote) -> None:
+        if self._localizer is None:
+            self._skip()
+            self._tell_refused(note)
+            return
+        taken = frames.take(self._pictures, note)
+        if isinstance(taken, str):
+            self._skip()
+            if taken is not frames.GONE:
+                self._complain("frame-refused", f"a frame that cannot be: {taken}")
+            return
+        self._follow_stream(self._localizer, note)
+        self._localize(self._localizer, taken)
+
+    def _skip(self) -> None:
+        self._own = replace(self._own, skipped=self._own.skipped + 1)
+
+    def _follow_stream(self, localizer: Localizer, note: FrameNote) -> None:
+        """Begins anew where another stream does: the payload was restarted, or its replay was."""
+        last, self._stream = self._stream, (note.ssrc, note.time_ns)
+        another = last is not None and (note.ssrc != last[0] or note.time_ns < last[1])
+        if another or self._forget.is_set():
+            self._forget.clear()
+            localizer.reset()
+
+    def _localize(self, localizer: Localizer, taken: Taken) -> None:
+        note = taken.note
+        estimate, reason = None, ""
+        try:
+            estimate = localizer.process(note.time_ns, taken.image, note.sequence, taken.exposure_s)
+            self._failed = 0
+        except BlimpError as error:  # the frame is at fault, as one of another camera's size
+            reason = str(error)
+            self._complain("frame-refused", reason)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            self._fail(localizer, reason)
+        own = self._own
+        solved = estimate is not None and estimate.localized
+        self._own = replace(own, processed=own.processed + 1, localized=own.localized + solved)
+        about = (self.accounts, self._map, time.time_ns())
+        if estimate is not None:
+            told = derive.estimate_note(note, estimate, *about)
+        else:
+            fresh = localizer.state is State.INITIALIZING
+            state = State.INITIALIZING if fresh else State.LOST
+            told = derive.unsolved_note(note, state, reason, *about)
+        self._bus.say(notes.ESTIMATE, self._payload_id, told)
+        _step_aside()
+
+    def _fail(self, localizer: Localizer, reason: str) -> None:
+        self._failed += 1
+        if self._complain("frame-failed", f"a frame failed: {reason}"):
+            traceback.print_exc(file=sys.stderr)
+        if self._failed == _FORGET_AFTER:
+            localizer.reset()
+
+    # Maps
+
+    def _take_map(self) -> None:
+        loading = self._loader.landed()
+        if loading is None:
+            return
+        if loading.localizer is None:
+            self._refuse(loading)
+        else:
+            self._localizer, self._map, self._refused = loading.localizer, loading.name, ""
+            self._failed = 0
+            count = len(loading.localizer.map.landmarks)
+            text = f"the map '{loading.name}' is in use: {count} landmarks"
+            self._event(notes.INFO, "map-loaded", text)
+        loading.taken.set()
+
+    def _refuse(self, loading: Loading) -> None:
+        kept = f"; '{self._map}' stays in use" if self._map else ""
+        if not self._map:
+            self._refused = loading.refused
+        level = notes.WARNING if self._map else notes.ALARM
+        self._event(level, "map-refused", f"{loading.refused}{kept}")
+
+    def _tell_refused(self, note: FrameNote) -> None:
+        """Without a map a frame's state says so, each second: an event may have been missed."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < _REFUSED_EVERY_S or frames.fault_of(note):
+            return
+        self._told_s = now_s
+        reason = f"no map: {self._refused}"
+        about = (self.accounts, "", time.time_ns())
+        told = derive.unsolved_note(note, State.INITIALIZING, reason, *about)
+        self._bus.say(notes.ESTIMATE, self._payload_id, told)
+
+    # Questions, on a thread of the bus
+
+    def _do(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        what = request.get("do")
+        if what == "relocalize":
+            if self._localizer is None:
+                raise LocalizingError(f"there is no map to search: {self._refused}")
+            self._forget.set()
+            self._event(notes.INFO, "relocalize", "asked to forget the pose and to search")
+            return {}
+        if what == "map":
+            return self._choose_map(request.get("name"))
+        raise LocalizingError(f"do: {what!r:.40} is not known (known: relocalize, map)")
+
+    def _choose_map(self, name: object) -> Mapping[str, Any]:
+        loading = self._loader.begin(folder_of(self._settings, name))
+        if not loading.taken.wait(_ANSWER_S):
+            return {"map": loading.name, "loading": True}
+        if loading.refused:
+            raise MapError(loading.refused)
+        return {"map": loading.name, "loading": False}
+
+    def _event(self, level: str, name: str, text: str) -> None:
+        note = EventNote(time.time_ns(), "localizer", level, name, text)
+        self._bus.say(notes.EVENT, self._payload_id, note)
+
+
+def _step_aside() -> None:
+    """Lets tracking go before the keyframes' thread, where both want the same core."""
+    for thread in threading.enumerate():
+        number = thread.native_id
+        if number is None or not thread.name.startswith("keyframes"):
+            continue
+        if os.getpriority(os.PRIO_PROCESS, number) < _BESIDE_NICE:
+            os.setpriority(os.PRIO_PROCESS, number, _BESIDE_NICE)

@@ -1,0 +1,113 @@
+"""Maps are chosen by name from the shelf and from nowhere else."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from localizing_stand import SAMPLE, copy_map, until
+
+from ground_station.errors import MapError
+from ground_station.localization.settings import load_preset
+from ground_station.service.localizing import maps
+from ground_station.service.localizing.maps import Loader, folder_of, prepare
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire.config import from_mapping
+from pi_firmware.wire.errors import BlimpError
+
+
+def station(folder: Path, shelf: Path, **values: Any) -> StationSettings:
+    chosen = {"folder": str(folder), "shelf": str(shelf)}
+    return from_mapping({"map": chosen, **values}, StationSettings, where="test")
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Path:
+    shelf = tmp_path / "shelf"
+    (shelf / "hall").mkdir(parents=True)
+    (tmp_path / "secret").mkdir()
+    (shelf / "link").symlink_to(tmp_path / "secret")
+    (shelf / "file").write_text("")
+    return shelf
+
+
+def test_a_map_on_the_shelf_is_found(shelf: Path) -> None:
+    assert folder_of(station(SAMPLE, shelf), "hall") == shelf / "hall"
+
+
+def test_the_configured_map_is_found_wherever_it_lies(shelf: Path) -> None:
+    assert folder_of(station(SAMPLE, shelf), "atrium") == SAMPLE
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "", ".", "..", "../secret", "hall/../../secret", "/etc", "link", "file", "absent", "hall/",
+        "hall\0", "hall\n", "~", "a" * 65, ".hidden", None, 3, ["hall"], {"name": "hall"},
+    ],
+)  # fmt: skip
+def test_no_name_leaves_the_shelf(shelf: Path, name: object) -> None:
+    with pytest.raises(MapError, match=r"^map .*") as refused:
+        folder_of(station(SAMPLE, shelf), name)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_service_finds_its_first_pose_itself_whatever_the_preset(shelf: Path) -> None:
+    """The thesis's preset is told one elsewhere; nobody tells a service."""
+    assert not load_preset("thesis").recovery.relocalize
+    chosen = station(SAMPLE, shelf, localizer={"preset": "thesis"})
+    localizer = prepare(SAMPLE, chosen)
+    assert localizer.settings.recovery.relocalize
+    assert localizer.settings.tracking.features_lag_frames == 0
+    assert localizer.camera == localizer.map.info.camera
+
+
+def test_a_camera_of_the_settings_comes_before_the_maps(shelf: Path, tmp_path: Path) -> None:
+    file = tmp_path / "camera.toml"
+    file.write_text(
+        "width_px = 320\nheight_px = 240\nfx_px = 250\nfy_px = 250\ncx_px = 160\ncy_px = 120\n"
+    )
+    settings = from_mapping(
+        {"map": {"folder": str(SAMPLE), "camera": str(file)}}, StationSettings, where="test"
+    )
+    assert prepare(SAMPLE, settings).camera.width_px == 320
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        ("frame", "sfm", "it is not registered"),
+        ("format", 99, "format 99; this program reads 1"),
+        ("features.name", "superpoint", "was built with 'superpoint'"),
+    ],
+)
+def test_a_map_that_cannot_be_used_is_refused_in_one_line(
+    tmp_path: Path, key: str, value: Any, reason: str
+) -> None:
+    folder = copy_map(tmp_path / "other", **{key: value})
+    with pytest.raises(BlimpError, match=reason) as refused:
+        prepare(folder, station(folder, tmp_path))
+    assert "\n" not in str(refused.value)
+
+
+def test_one_map_is_loaded_at_a_time(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    release = threading.Event()
+
+    def slow(folder: Path, settings: StationSettings) -> Any:
+        release.wait(60)
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(maps, "prepare", slow)
+    loader = Loader(station(SAMPLE, shelf))
+    loading = loader.begin(shelf / "hall")
+    with pytest.raises(MapError, match="the map 'hall' is being loaded"):
+        loader.begin(SAMPLE)
+    assert loader.landed() is None
+    release.set()
+    until(loading.ready.is_set)
+    assert loader.landed() is loading and loader.landed() is None
+    assert loading.localizer is None
+    assert loading.refused == f"{shelf / 'hall'}: MemoryError: no room"
+    loader.begin(SAMPLE)  # the next may come

@@ -1,0 +1,383 @@
+"""The localizer process on its bus: each frame that is told of gets a pose or is counted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from localizing_stand import (
+    LIMIT_S,
+    NAME,
+    PAYLOAD,
+    SAMPLE,
+    Intake,
+    Station,
+    copy_map,
+    localizer,
+    payload,
+    station,
+    until,
+)
+
+from ground_station.localization.localizer import Localizer
+from ground_station.recording.flight import FlightRecording, trajectory_of
+from ground_station.recording.frames import Frame, FrameRange
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.firmware import FirmwareProcess
+from ground_station.service.localizing.process import RESTART, Localizing
+from ground_station.service.notes import EstimateNote
+from ground_station.service.pictures import SLOTS
+
+FLIGHT = SAMPLE / "flight.mcap"
+TRUTH = trajectory_of(FLIGHT)
+
+
+@pytest.fixture(scope="module")
+def flight() -> list[Frame]:
+    return list(FlightRecording(FLIGHT, FrameRange(60, 90)))
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Path:
+    """Maps to choose from: a good one, one that is not registered, and one that is cut."""
+    shelf = tmp_path / "shelf"
+    copy_map(shelf / "hall")
+    copy_map(shelf / "unregistered", frame="sfm")
+    cut = copy_map(shelf / "cut") / "landmarks.safetensors"
+    cut.write_bytes(cut.read_bytes()[:1000])
+    return shelf
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def running(run_folder: Path, shelf: Path) -> Iterator[tuple[Station, subprocess.Popen[str]]]:
+    """A localizer that has loaded its map."""
+    with station(run_folder, shelf=str(shelf)) as told, localizer(run_folder) as process:
+        until(lambda: told.event("map-loaded") is not None, "the map")
+        yield told, process
+
+
+def error_m(note: EstimateNote) -> float:
+    """How far a pose is from the flight's truth at the camera's time."""
+    assert note.position_m is not None
+    return float(np.linalg.norm(TRUTH.at(note.time_ns)[:3, 3] - note.position_m))
+
+
+def localized(told: Station, frame: Frame, **fields: Any) -> EstimateNote:
+    """One frame shown, and what is said of it."""
+    before = len(told.estimates)
+    note = told.show(frame.image, frame.index, frame.time_ns, **fields)
+    until(lambda: len(told.estimates) > before, f"frame {frame.index}'s estimate")
+    estimate = told.estimates[-1]
+    assert estimate.sequence == note.sequence and told.accounted()
+    return estimate
+
+
+def test_the_sample_flight_is_localized_and_every_frame_accounted_for(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    """4 s of the real firmware's video at 30 Hz, however slow the machine."""
+    with (
+        station(run_folder) as told,
+        localizer(run_folder) as process,
+        Intake(told) as intake,
+    ):
+        until(lambda: told.event("map-loaded") is not None, "the map")
+        with FirmwareProcess(payload(intake.receiver.port), tmp_path) as firmware:
+            until(lambda: not firmware.running(), "the stream's end")
+            firmware.check()
+        until(told.accounted, "the last frame")
+        assert process.poll() is None
+        assert told.said == intake.receiver.counters.decoded > 60
+        last = told.estimates[-1]
+        assert last.processed == len(told.estimates) > 10
+        assert last.processed + last.skipped == told.said
+        assert last.localized == sum(note.position_m is not None for note in told.estimates)
+        assert last.localized >= 0.9 * last.processed
+        # As they come: none twice, none out of turn.
+        assert (np.diff([note.sequence for note in told.estimates]) > 0).all()
+        assert max(error_m(note) for note in told.estimates if note.position_m) < 0.1
+        assert all(note.map == "atrium" for note in told.estimates)
+        for note in told.estimates:
+            assert note.capture_ns is not None and note.capture_ns < note.done_ns
+        tracked = [note for note in told.estimates if note.tracked]
+        assert tracked and all(20 <= len(note.points_px) <= 600 for note in tracked)
+        assert any(note.state == "TRACKING" for note in told.estimates)
+        assert told.beats and told.beats[-1].pid == process.pid
+
+
+def test_velocity_and_covariance_are_those_of_the_flight(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, _ = running
+    last = [localized(told, frame) for frame in flight[:20]][-1]
+    assert last.velocity_mps and last.position_sigma_m and last.covariance and last.position_m
+    before, after = TRUTH.at(last.time_ns - 10**8)[:3, 3], TRUTH.at(last.time_ns + 10**8)[:3, 3]
+    assert np.linalg.norm((after - before) / 0.2 - last.velocity_mps) < 0.15
+    view = TRUTH.at(last.time_ns)[:3, 2]
+    assert last.heading_deg == pytest.approx(np.rad2deg(np.arctan2(view[1], view[0])), abs=1.5)
+    assert last.height_m == last.position_m[2]
+    sigma = np.reshape(last.position_sigma_m, (3, 3))
+    assert np.linalg.eigvalsh(sigma).min() > 0
+    own = np.reshape(last.covariance, (6, 6))[3:, 3:]
+    assert np.trace(sigma) == pytest.approx(np.trace(own))
+
+
+@pytest.mark.parametrize("ssrc", [1, 2], ids=["replayed", "restarted"])
+def test_another_stream_begins_anew(
+    ssrc: int, running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    """A payload that was restarted has another SSRC; a replay that begins again goes back."""
+    told, _ = running
+    for frame in flight[10:20]:
+        assert not localized(told, frame, ssrc=1).reason.startswith("refused")
+    at = flight[0] if ssrc == 1 else flight[25]
+    again = localized(told, at, ssrc=ssrc)
+    assert again.relocalized and error_m(again) < 0.1
+    assert not localized(told, flight[26], ssrc=ssrc).relocalized
+
+
+def test_relocalize_forgets_the_pose_and_searches(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, _ = running
+    said = [localized(told, frame) for frame in flight[:5]]
+    assert [note.relocalized for note in said] == [True, False, False, False, False]
+    assert told.bus.ask(NAME, {"do": "relocalize"}) == {"done": True, "reason": ""}
+    assert localized(told, flight[5]).relocalized
+    assert not localized(told, flight[6]).relocalized
+
+
+def test_a_map_is_changed_while_frames_come(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, _ = running
+    assert localized(told, flight[0]).map == "atrium"
+    answer = told.bus.ask(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
+    assert answer["done"] and answer["map"] == "hall"
+    until(lambda: any("'hall' is in use" in event.text for event in told.events), "the map")
+    changed = localized(told, flight[1])
+    assert changed.map == "hall" and changed.relocalized and error_m(changed) < 0.1
+    assert (changed.processed, changed.localized) == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("cut", "landmarks.safetensors"),
+        ("unregistered", "it is not registered"),
+        ("../run", "a plain name is needed"),
+        ("absent", "there is none of that name"),
+        (None, "a plain name is needed"),
+    ],
+)
+def test_a_map_that_is_refused_leaves_the_old_one_in_use(
+    name: Any, reason: str, running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, process = running
+    localized(told, flight[0])
+    answer = told.bus.ask(NAME, {"do": "map", "name": name}, timeout_s=LIMIT_S)
+    assert not answer["done"] and reason in answer["reason"] and "\n" not in answer["reason"]
+    kept = localized(told, flight[1])
+    assert kept.map == "atrium" and kept.position_m and not kept.relocalized
+    assert process.poll() is None
+
+
+@pytest.mark.parametrize("request_", [{}, {"do": "dance"}, {"do": ["map"]}])
+def test_a_question_that_is_not_known_is_refused(
+    request_: dict[str, Any], running: tuple[Station, subprocess.Popen[str]]
+) -> None:
+    told, _ = running
+    answer = told.bus.ask(NAME, request_)
+    assert not answer["done"] and "is not known (known: relocalize, map)" in answer["reason"]
+
+
+def test_without_a_map_it_stays_says_so_and_takes_another(
+    run_folder: Path, shelf: Path, flight: list[Frame]
+) -> None:
+    with (
+        station(run_folder, folder=str(shelf / "cut"), shelf=str(shelf)) as told,
+        localizer(run_folder) as process,
+    ):
+        until(lambda: told.event("map-refused") is not None, "the refusal")
+        refused = told.event("map-refused")
+        assert refused is not None and refused.level == "alarm"
+        assert "landmarks.safetensors" in refused.text and "\n" not in refused.text
+        answer = told.bus.ask(NAME, {"do": "relocalize"})
+        assert not answer["done"] and "there is no map to search" in answer["reason"]
+        said = localized(told, flight[0])
+        assert said.state == "INITIALIZING" and said.reason.startswith("no map: ")
+        assert (said.processed, said.skipped, said.position_m) == (0, 1, None)
+        assert told.bus.ask(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)["done"]
+        until(lambda: told.event("map-loaded") is not None, "the map")
+        found = localized(told, flight[1])
+        assert found.map == "hall" and error_m(found) < 0.1
+        assert (found.processed, found.skipped) == (1, 1)
+        assert process.poll() is None
+
+
+def test_hostile_notes_are_counted_and_nothing_else(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, process = running
+    localized(told, flight[0])
+    frame, session = flight[1], told.bus._session
+    key = f"station/frame/{PAYLOAD}"
+    for raw in (b"", b"\xff\x00", b"[" * 100_000, b"{}", b'{"slot": 1}', b"[1, 2]", b"NaN"):
+        session.put(key, raw)  # no notes: the bus drops them
+    hostile: list[dict[str, Any]] = [
+        {"slot": SLOTS}, {"slot": -1}, {"slot": 1 << 62}, {"slot": "0"}, {"stamp": -2},
+        {"stamp": 999_999}, {"time_ns": None}, {"time_ns": 1 << 80}, {"width_px": 0},
+        {"width_px": 1 << 40, "height_px": 1 << 40}, {"ssrc": {}}, {"sequence": [1]},
+        {"capture_ns": "soon"}, {"clock_ns": 1.5},
+    ]  # fmt: skip
+    for fields in hostile:
+        told.show(frame.image, frame.index, frame.time_ns, **fields)
+    values = json.loads(notes.encode(told.show(frame.image, 1, 1, time_ns=-1)))
+    session.put(key, json.dumps(values | {"time_ns": float("nan")}).encode())
+    told.said += 1
+    until(lambda: told.event("frame-refused") is not None, "the event")
+    # Exposures that cannot be are no exposures, and a time far ahead is one more new stream.
+    for fields in ({"exposure_s": float("inf")}, {"exposure_s": "x"}, {"gain": "x"}):
+        frame = flight[told.said % 10 + 5]
+        assert localized(told, frame, **fields).position_m
+    ahead = localized(told, flight[20], time_ns=1 << 62)
+    assert ahead.time_ns == 1 << 62
+    found = localized(told, flight[21])
+    assert found.relocalized and error_m(found) < 0.1
+    assert found.processed == 6 and found.skipped == len(hostile) + 2
+    refused = told.event("frame-refused")
+    assert refused is not None and refused.text.startswith("a frame that cannot be: ")
+    assert sum(event.name == "frame-refused" for event in told.events) == 1
+    assert process.poll() is None
+
+
+def test_frames_of_another_cameras_size_are_refused_and_it_lives(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, process = running
+    small = np.ascontiguousarray(flight[0].image[::2, ::2])
+    for k in range(12):  # more than may fail
+        before = len(told.estimates)
+        told.show(small, k, flight[0].time_ns + k)
+        until(lambda before=before: len(told.estimates) > before)
+        said = told.estimates[-1]
+        assert said.state == "INITIALIZING" and said.position_m is None
+        assert said.reason == f"frame {k} has 320x240 pixels, the camera 640x480"
+    assert sum(event.name == "frame-refused" for event in told.events) == 1
+    assert localized(told, flight[1]).position_m and process.poll() is None
+
+
+def test_a_picture_that_was_overwritten_is_skipped(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, _ = running
+    localized(told, flight[0])
+    old = told.show(flight[1].image, 1, flight[1].time_ns)
+    until(lambda: len(told.estimates) == 2)
+    for _ in range(SLOTS):
+        told.pictures.write(flight[2].image)
+    told.say(old)
+    said = localized(told, flight[3])
+    assert (said.processed, said.skipped) == (3, 1)
+    assert told.event("frame-refused") is None
+
+
+def test_an_intake_that_comes_back_is_heard_again(
+    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    """It makes its ring anew."""
+    told, _ = running
+    localized(told, flight[0])
+    told.pictures.close()
+    told.pictures = type(told.pictures)(told.folder, PAYLOAD)
+    assert error_m(localized(told, flight[1])) < 0.1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it(
+    number: signal.Signals, running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+) -> None:
+    told, process = running
+    localized(told, flight[0])
+    os.kill(process.pid, number)
+    assert process.wait(LIMIT_S) == 0
+    assert process.stderr is not None and process.stderr.read() == ""
+
+
+def test_bad_input_is_one_line_and_status_2(tmp_path: Path) -> None:
+    for arguments in ((tmp_path / "absent", PAYLOAD), (tmp_path, "../etc"), (tmp_path, PAYLOAD)):
+        with localizer(Path(arguments[0]), str(arguments[1])) as process:
+            _, said = process.communicate(timeout=LIMIT_S)
+            assert process.returncode == 2
+            assert said.startswith("localizer ") and said.count("\n") == 1
+
+
+class _Failing:
+    """Makes the localizer fail while `times` is above 0."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int) -> None:
+        self.times, self.resets = times, 0
+        real, reset = Localizer.process, Localizer.reset
+
+        def process(localizer: Localizer, *arguments: Any) -> Any:
+            if self.times > 0:
+                self.times -= 1
+                raise RuntimeError("made up")
+            return real(localizer, *arguments)
+
+        def counted(localizer: Localizer) -> None:
+            self.resets += 1
+            reset(localizer)
+
+        monkeypatch.setattr(Localizer, "process", process)
+        monkeypatch.setattr(Localizer, "reset", counted)
+
+
+@pytest.mark.parametrize("times", [9, 10])
+def test_failures_are_counted_and_ten_in_a_row_end_it(
+    times: int, run_folder: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = _Failing(monkeypatch, times)
+    ended: list[int] = []
+    stop = threading.Event()
+    with station(run_folder) as told, Bus(run_folder, NAME) as bus:
+        localizing = Localizing(bus, run_folder, PAYLOAD, told.settings)
+        thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
+        thread.start()
+        try:
+            until(lambda: told.event("map-loaded") is not None, "the map")
+            failing.resets = 0
+            for frame in flight[:times]:
+                said = localized(told, frame)
+                assert said.state == "INITIALIZING" and said.position_m is None
+                assert said.reason == "RuntimeError: made up"
+            assert failing.resets == 1
+            failed = [event for event in told.events if event.name == "frame-failed"]
+            assert len(failed) == 1 and "RuntimeError: made up" in failed[0].text
+            if times == 9:
+                assert error_m(localized(told, flight[20])) < 0.1
+                assert told.estimates[-1].processed == 10
+            else:
+                until(lambda: bool(ended), "the end")
+                assert ended == [RESTART]
+                until(lambda: told.event("localizer-failed") is not None, "the event")
+        finally:
+            stop.set()
+            thread.join()
+    assert ended == ([RESTART] if times == 10 else [0])
