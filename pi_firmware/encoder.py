@@ -67,14 +67,15 @@ class Adaptation:
     Bit rate: the loss-based controller of Google congestion control (draft-ietf-rmcat-gcc-02,
     section 6): below 2 % loss 5 % more, above 10 % less by half the loss, between them as it is.
     A round trip above `max_round_trip_s` is a queue that grows: 15 % less, as in the draft's
-    section 5. IDR interval: the shortest at 5 % loss and more, the longest without loss.
+    section 5. IDR interval: the shortest at 5 % loss and more, the `longest` without loss, frames.
     """
 
-    def __init__(self, encoder: EncoderSettings) -> None:
+    def __init__(self, encoder: EncoderSettings, longest: int | None = None) -> None:
         self._settings = encoder
+        self._longest = encoder.gop_frames if longest is None else longest
         self.bitrate_kbps = float(encoder.bitrate_kbps)
         self.ceiling_kbps = encoder.bitrate_kbps
-        self.gop_frames = encoder.gop_frames
+        self.gop_frames = self._longest
 
     def limited(self, kbps: float) -> float:
         """A bit rate within the bounds."""
@@ -93,7 +94,7 @@ class Adaptation:
         if round_trip_s > settings.max_round_trip_s:
             factor = min(factor, 0.85)
         self.bitrate_kbps = self.limited(self.bitrate_kbps * factor)
-        longest = settings.gop_frames
+        longest = self._longest
         shortest = min(settings.min_gop_frames, longest)
         self.gop_frames = round(longest - min(1.0, lost / 0.05) * (longest - shortest))
 
@@ -110,8 +111,8 @@ class Encoder:
         self._video = gstreamer.load_video()
         self._element = element
         self._settings = encoder
-        self._adaptation = Adaptation(encoder)
         self._longest = gop_frames(encoder, rate_hz)
+        self._adaptation = Adaptation(encoder, self._longest)
         self._since_idr = 0
         self._set_kbps = encoder.bitrate_kbps
 

@@ -57,7 +57,7 @@ class GateSettings:
         0.5, "gated when closer to the last one sent; 0: none", unit="grey levels", low=0, high=255
     )
     heartbeat_s: float = key(
-        1.0, "while all is gated, one frame is sent this often; 0: none", unit="s", low=0, high=60
+        1.0, "while all is gated, one frame is sent this often; 0: none", unit="s", low=0, high=10
     )
     idr_after_s: float = key(
         0.5, "after a gap this long an IDR comes first", unit="s", low=0, high=1

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.faults import OPTIONS, Faults
-from pi_firmware.sources.live import LiveSource, caps
+from pi_firmware.sources.live import LiveSource, caps, check_exposure
 from pi_firmware.sources.pattern import PATTERNS
 from pi_firmware.uri import Uri
 
@@ -59,6 +59,7 @@ class ClockSource(LiveSource):
         uri.only("pattern", "duration_s", *OPTIONS)
         uri.choice("pattern", "clock", PATTERNS)
         duration_s = uri.number("duration_s", 0.0, 0.0, 86_400.0)
+        check_exposure(uri, camera)
         self._faults = Faults(uri)
         self._frames = self._faults.frames(duration_s, camera.rate_hz)
         self._stopping = threading.Event()
@@ -72,6 +73,9 @@ class ClockSource(LiveSource):
     def attach(self, pipeline: Any) -> None:
         super().attach(pipeline)
         self._faults.attach(pipeline)
+
+    def told(self) -> tuple[float | None, float | None]:
+        return self._camera.exposure_s or None, self._camera.gain or None
 
     def start(self) -> None:
         self._thread.start()
