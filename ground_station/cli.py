@@ -24,6 +24,7 @@ _COMMANDS = (
         "ground_station.service.doctor.command",
         "check this machine, and say how to mend it",
     ),
+    ("export", "ground_station.service.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
     ("bench", "ground_station.service.bench_command", "measure what each step costs"),
