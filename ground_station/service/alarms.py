@@ -1,0 +1,228 @@
+"""What an operator must not miss: a pure function of the station's state and the alarms before it.
+
+A cause that comes and goes does not make its alarm flicker: an alarm stands for `HOLD_S` after its
+cause was last found, its level falls no sooner, and where a number has a limit the one that ends
+the alarm lies apart from the one that begins it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ground_station.service.notes import ALARM, INFO, STATION, WARNING
+from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
+
+HOLD_S = 3.0
+LOST_S, NO_FRAMES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 10.0
+SILENT_S, RESTARTED_S = 5.0, 30.0
+GONE_FOR_S = 600.0
+DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
+HOT_C, NO_MORE_HOT_C = 80.0, 76.0
+
+MAP_REFUSED, NO_MAP = "map-refused", "no map:"
+"""A localizer's event, and how its reason begins, where it cannot use a map: other features, say."""
+MAP_REFUSED_S = 20.0
+
+_RANK = {INFO: 0, WARNING: 1, ALARM: 2}
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """One alarm; `id` is the same as long as it stands, `payload` is "-" where it is of none."""
+
+    id: str
+    level: str
+    payload: str
+    text: str
+    since_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Standing:
+    """An alarm with the time at which its cause was last found at this level."""
+
+    alarm: Alarm
+    found_ns: int
+
+
+Alarms = Mapping[str, Standing]
+
+
+def judge(state: Mapping[str, Any], now_ns: int, before: Alarms) -> dict[str, Standing]:
+    """The alarms that stand now, by id.
+
+    `state` is the document of GET /api/state, `now_ns` the wall clock, `before` what this function
+    returned last. A clock that is set back makes no alarm stand longer than `HOLD_S` from then on.
+    """
+    result: dict[str, Standing] = {}
+    for alarm in _found(state, now_ns, frozenset(before)):
+        old = before.get(alarm.id)
+        if old is None:
+            result[alarm.id] = Standing(dataclasses.replace(alarm, since_ns=now_ns), now_ns)
+            continue
+        falls = _RANK[alarm.level] < _RANK[old.alarm.level]
+        if falls and _held(old, now_ns):
+            result[alarm.id] = _kept(old, now_ns)
+        else:
+            since_ns = min(old.alarm.since_ns, now_ns)
+            result[alarm.id] = Standing(dataclasses.replace(alarm, since_ns=since_ns), now_ns)
+    for name, old in before.items():
+        if name not in result and _held(old, now_ns):
+            result[name] = _kept(old, now_ns)
+    return result
+
+
+def _held(old: Standing, now_ns: int) -> bool:
+    return now_ns - old.found_ns <= HOLD_S * 1e9
+
+
+def _kept(old: Standing, now_ns: int) -> Standing:
+    return dataclasses.replace(old, found_ns=min(old.found_ns, now_ns))
+
+
+def documents(alarms: Alarms) -> list[dict[str, Any]]:
+    """The alarms as plain values, gravest first, then oldest."""
+    ordered = sorted(
+        (item.alarm for item in alarms.values()),
+        key=lambda alarm: (-_RANK[alarm.level], alarm.since_ns, alarm.id),
+    )
+    return [dataclasses.asdict(alarm) for alarm in ordered]
+
+
+def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> Iterator[Alarm]:
+    yield from _of_recording(state, standing)
+    yield from _of_processes(state)
+    yield from _of_maps(state, now_ns)
+    for payload_id, view in _table(state, "payloads").items():
+        if not isinstance(view, dict):
+            continue
+        if not view.get("alive"):
+            yield from _of_gone(payload_id, view)
+            continue
+        yield from _of_flight(payload_id, view)
+        yield from _of_board(payload_id, view, standing)
+
+
+def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
+    frame_s = _number(_table(view, "age_s").get("frame"))
+    frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
+    if not frames_come:
+        since = "" if frame_s is None else f" for {frame_s:.0f} s"
+        yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, f"no frames{since}")
+    estimate, state_s = _table(view, "estimate"), _number(view.get("state_s"))
+    if estimate.get("state") == "LOST" and state_s is not None and state_s > LOST_S:
+        reason = str(estimate.get("reason") or "")
+        text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
+    age_s = _number(_table(view, "age_s").get("estimate"))
+    if frames_come and age_s is not None and age_s > NO_FRAMES_S:
+        text = f"frames come but none was localized for {age_s:.0f} s"
+        yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)
+    unknown_s = _number(view.get("clock_unknown_s"))
+    if unknown_s is not None and unknown_s > CLOCK_UNKNOWN_S:
+        text = "the payload's clock is not known: poses have no exact time"
+        yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
+
+
+def _of_board(
+    payload_id: str, view: Mapping[str, Any], standing: frozenset[str]
+) -> Iterator[Alarm]:
+    note = _table(view, "payload")
+    battery, health = _table(note, "battery"), _table(note, "health")
+    level = {ALARM_CRITICAL: ALARM, ALARM_LOW: WARNING}.get(str(battery.get("alarm")))
+    if level is not None:
+        text = "battery critical" if level == ALARM else "battery low"
+        voltage, share = _number(battery.get("voltage")), _number(battery.get("percentage"))
+        left_s = _number(battery.get("time_left_s"))
+        parts = [
+            *([f"{voltage:.2f} V"] if voltage is not None else []),
+            *([f"{100 * share:.0f} %"] if share is not None else []),
+            *([f"{left_s / 60:.0f} min left"] if left_s is not None else []),
+        ]
+        text += f": {', '.join(parts)}" if parts else ""
+        yield Alarm(f"battery/{payload_id}", level, payload_id, text)
+    name = f"hot/{payload_id}"
+    celsius = _number(health.get("temperature_C"))
+    if celsius is not None and celsius > (NO_MORE_HOT_C if name in standing else HOT_C):
+        text = f"the payload's processor has {celsius:.0f} °C"
+        yield Alarm(name, WARNING, payload_id, text)
+    name = f"payload-disk/{payload_id}"
+    free_MB = _number(health.get("disk_free_MB"))
+    if health.get("recording") and _below(free_MB, DISK_WARNING_MB, name in standing):
+        text = f"{free_MB:.0f} MB left on the payload's card, which records"
+        yield Alarm(name, WARNING, payload_id, text)
+
+
+def _of_gone(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
+    if not isinstance(view.get("payload"), dict):
+        return
+    seen_s = _number(_table(view, "age_s").get("frame"))
+    if seen_s is not None and seen_s > GONE_FOR_S:
+        return
+    name = f"gone/{payload_id}"
+    if view.get("ended"):
+        yield Alarm(name, INFO, payload_id, "ended in order")
+    else:
+        yield Alarm(name, ALARM, payload_id, "gone: nothing is heard of the payload")
+
+
+def _of_recording(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
+    recording = _table(state, "recording")
+    if recording.get("problem"):
+        yield Alarm("recording", ALARM, STATION, f"recording: {recording['problem']}")
+    free_MB = _number(recording.get("free_MB"))
+    if recording.get("active") and _below(free_MB, 2 * DISK_WARNING_MB, "disk" in standing):
+        yield Alarm("disk", WARNING, STATION, f"{free_MB:.0f} MB left on the recordings' disk")
+
+
+def _of_processes(state: Mapping[str, Any]) -> Iterator[Alarm]:
+    payloads = _table(state, "payloads")
+    for process in state.get("processes") or ():
+        name, age_s = str(process.get("name")), _number(process.get("age_s"))
+        kind, _, payload_id = name.partition("/")
+        payload = payload_id if payload_id in payloads else STATION
+        # A localizer ends with its payload.
+        wanted = not payload_id or bool(_table(payloads, payload_id).get("alive"))
+        if wanted and age_s is not None and age_s > SILENT_S:
+            level = ALARM if kind in ("intake", "localizer") else WARNING
+            text = f"the process {name} is silent for {age_s:.0f} s"
+            yield Alarm(f"silent/{name}", level, payload, text)
+        restarted_s = _number(process.get("restarted_s"))
+        if wanted and restarted_s is not None and restarted_s < RESTARTED_S:
+            yield Alarm(f"restarted/{name}", WARNING, payload, f"the process {name} was restarted")
+
+
+def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
+    refused: dict[str, Alarm] = {}
+    for event in state.get("events") or ():
+        time_ns = _number(event.get("time_ns"))
+        if event.get("name") != MAP_REFUSED or time_ns is None:
+            continue
+        if abs(now_ns - time_ns) < MAP_REFUSED_S * 1e9:
+            payload_id, text = str(event.get("payload")), str(event.get("text"))
+            level = ALARM if event.get("level") == ALARM else WARNING
+            refused[payload_id] = Alarm(f"map/{payload_id}", level, payload_id, text)
+    for payload_id, view in _table(state, "payloads").items():
+        # A localizer without a map says so with its frames.
+        reason = str(_table(view, "estimate").get("reason") or "")
+        if reason.startswith(NO_MAP) and view.get("alive"):
+            refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
+    yield from refused.values()
+
+
+def _below(value: float | None, limit: float, stands: bool) -> bool:
+    return value is not None and value < limit * (DISK_OVER if stands else 1.0)
+
+
+def _table(of: Mapping[str, Any], name: str) -> dict[str, Any]:
+    value = of.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value)

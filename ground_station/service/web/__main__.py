@@ -1,0 +1,76 @@
+"""`python -m ground_station.service.web RUN_FOLDER`: dashboard, API and metrics of one run."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+from pi_firmware.wire.errors import BlimpError
+
+_BAD_INPUT, _FAILED = 2, 1
+_BEAT_S = 0.5
+
+
+class ServerEnded(BlimpError):
+    """The server stopped although nobody asked it to."""
+
+
+def main(arguments: list[str]) -> int:
+    """Serves until it is told to end; 0, or 2 with one line for bad input."""
+    if len(arguments) != 1:
+        print("usage: python -m ground_station.service.web RUN_FOLDER", file=sys.stderr)
+        return _BAD_INPUT
+    # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        asyncio.run(_serve(Path(arguments[0])))
+    except BlimpError as error:
+        print(f"web: {error}", file=sys.stderr, flush=True)
+        return _FAILED if isinstance(error, ServerEnded) else _BAD_INPUT
+    return 0
+
+
+async def _serve(folder: Path) -> None:
+    from ground_station.service import processes
+    from ground_station.service.bus import Bus
+    from ground_station.service.settings import load_run
+    from ground_station.service.web.access import read_token
+    from ground_station.service.web.app import build
+    from ground_station.service.web.server import listen, server
+
+    run = load_run(folder)
+    http = run.station.http
+    token = read_token(http)
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    with listen(http.host, http.port) as socket, Bus(folder, processes.WEB) as bus:
+        web = build(run, folder, bus, token)
+        serving = server(web.guarded)
+        task = asyncio.create_task(serving.serve([socket]))
+        host, port = socket.getsockname()[:2]
+        place = f"[{host}]" if ":" in host else host
+        print(f"dashboard: http://{place}:{port}/", flush=True)
+        while not stop.is_set() and not task.done():
+            bus.beat()  # from this loop: one that hangs is silent
+            try:
+                async with asyncio.timeout(_BEAT_S):
+                    await stop.wait()
+            except TimeoutError:
+                pass
+        web.live.close()
+        serving.should_exit = True
+        await task
+        if not stop.is_set():
+            raise ServerEnded("the server ended by itself")
+
+
+if __name__ == "__main__":
+    status = main(sys.argv[1:])
+    sys.stdout.flush()
+    # Not sys.exit: it waits for threads that may wait for an answer of another process.
+    os._exit(status)

@@ -1,0 +1,149 @@
+"""The application: its rooms put together, and the gate around them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import mimetypes
+import os
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fastapi import FastAPI
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, Response
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from ground_station import __version__
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.notes import EstimateNote
+from ground_station.service.settings import Run
+from ground_station.service.web import control, live, maps, pages, problems, recordings, state
+from ground_station.service.web.access import Access
+from ground_station.service.web.guard import Guard
+from ground_station.service.web.metrics import Metrics
+from ground_station.service.web.snapshot import Snapshot
+from ground_station.service.web.video import Video
+
+STATIC = Path(__file__).with_name("static")
+_DESCRIPTION = """\
+State, control and recordings of a blimp ground station. Times are nanoseconds of the station's wall
+clock, lengths metres in the map's frame (x along the floor plan, z up), poses wTc with quaternions
+x, y, z, w; a covariance's order is rotation, then translation.
+
+An error is {"detail": one line}. Beyond loopback each request needs "Authorization: Bearer TOKEN"
+or a session from /login. A request that changes something must not carry another site's Origin.
+
+Live, over the WebSocket /api/live?payload=ID: text messages {"type": hello, state, estimate, event,
+alarm, recording, gone, selected or pong, …}; binary ones are pictures: a header's length (4 bytes,
+big-endian), the header in JSON, a JPEG. It takes {"type": "select", "payload"}, {"type": "video",
+"on"}, {"type": "shown", "sequence", "shown_ms"} and {"type": "ping", "sent_ms"}.
+"""
+# The system's own table may lack these, and scripts of another type are not run.
+_TYPES = {
+    ".js": "text/javascript", ".mjs": "text/javascript", ".css": "text/css",
+    ".svg": "image/svg+xml", ".json": "application/json", ".woff2": "font/woff2",
+    ".webmanifest": "application/manifest+json",
+}  # fmt: skip
+
+
+@dataclass
+class Web:
+    """The application with what its process drives: `guarded` is what is served."""
+
+    app: FastAPI
+    guarded: ASGIApp
+    live: live.Live
+    snapshot: Snapshot
+    metrics: Metrics
+    access: Access
+    video: Video
+
+
+def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path = STATIC) -> Web:
+    """Puts the application together; it hears the bus while it is served."""
+    settings = run.station
+    snapshot = Snapshot(run, __version__)
+    metrics = Metrics(snapshot)
+    access = Access(settings.http, token)
+
+    def picture(payload_id: str, message: bytes) -> None:
+        with contextlib.suppress(RuntimeError):  # before the loop, or after it
+            loops[0].call_soon_threadsafe(viewers.picture, payload_id, message)
+
+    loops: list[asyncio.AbstractEventLoop] = []
+    video = Video(folder, settings.http.video_rate_hz, settings.http.jpeg_quality, picture)
+    viewers = live.Live(snapshot, metrics, settings.http, video)
+    snapshot.on_evicted(metrics.forget)
+    metrics.viewers = lambda: viewers.viewers
+    metrics.bus_dropped = lambda: bus.dropped + snapshot.dropped
+    metrics.video = lambda: {
+        "encoded": video.encoded,
+        "skipped": video.skipped,
+        "gone": video.gone,
+        "failed": video.failed,
+    }
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        loops[:] = [asyncio.get_running_loop()]
+        snapshot.listen(bus)
+        bus.hear(notes.ESTIMATE, EstimateNote, snapshot.careful(metrics.estimate))
+        viewers.listen(bus, loops[0])
+        ticking = asyncio.create_task(viewers.tick())
+        try:
+            yield
+        finally:
+            ticking.cancel()
+            video.close()
+
+    app = FastAPI(
+        title="Blimp ground station",
+        version=__version__,
+        description=_DESCRIPTION,
+        openapi_url="/api/openapi.json",
+        docs_url=None,  # these would load scripts from elsewhere
+        redoc_url=None,
+        lifespan=lifespan,
+        responses=problems.EVERYWHERE,
+        redirect_slashes=False,
+    )
+    problems.install(app)
+    shelf = maps.Maps(settings.map)
+    recorded = recordings.Recordings(
+        Path(settings.recording.folder), lambda: _active_file(snapshot)
+    )
+    app.include_router(state.router(snapshot, metrics))
+    app.include_router(maps.router(shelf))
+    app.include_router(control.router(control.Control(bus, snapshot), shelf))
+    app.include_router(recordings.router(recorded))
+    app.include_router(live.router(viewers, access.sessions.holds))
+    app.include_router(pages.router(access, settings.name))
+    app.include_router(pages.docs_router(app))
+    _serve_dashboard(app, static)
+    guarded = Guard(app, access, metrics.answers)
+    return Web(app, guarded, viewers, snapshot, metrics, access, video)
+
+
+def _active_file(snapshot: Snapshot) -> str:
+    note = snapshot.recording_note()
+    return os.path.basename(str(note.file)) if note is not None and note.active else ""  # noqa: PTH119
+
+
+def _serve_dashboard(app: FastAPI, static: Path) -> None:
+    """The page and what it loads, all from one folder."""
+    for ending, kind in _TYPES.items():
+        mimetypes.add_type(kind, ending)
+
+    @app.get("/", include_in_schema=False)
+    def dashboard() -> Response:
+        page = static / "index.html"
+        if not page.is_file():
+            raise HTTPException(404, "this installation has no dashboard; see /api/docs")
+        return FileResponse(page, media_type="text/html")
+
+    if static.is_dir():
+        app.mount("/static", StaticFiles(directory=static), name="static")

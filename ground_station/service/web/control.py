@@ -1,0 +1,108 @@
+"""What changes something: commands to payloads, maps, recording. Others carry it out."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from fastapi import APIRouter
+
+from ground_station.service.web.maps import Maps
+from ground_station.service.web.models import (
+    AnswerModel,
+    CommandRequest,
+    MapRequest,
+    PayloadId,
+    RecordingRequest,
+)
+from ground_station.service.web.problems import Busy, NotFound, problems
+from ground_station.service.web.snapshot import Snapshot
+
+_AT_ONCE = 8
+_TIMEOUT_S = 7.0
+INTAKE = "intake"
+
+
+class Asks(Protocol):
+    """The bus, as far as it is needed here."""
+
+    def ask(
+        self, name: str, request: Mapping[str, Any], timeout_s: float = ...
+    ) -> Mapping[str, Any]: ...
+
+
+class Control:
+    """Asks the service's processes, a few at a time."""
+
+    def __init__(self, bus: Asks, snapshot: Snapshot) -> None:
+        self._bus, self._snapshot = bus, snapshot
+        self._free = threading.BoundedSemaphore(_AT_ONCE)
+
+    def ask(self, name: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        """The answer, which may be a refusal with its reason; raises `Busy`."""
+        if not self._free.acquire(blocking=False):
+            raise Busy(f"{_AT_ONCE} requests wait for an answer already")
+        try:
+            answer = self._bus.ask(name, request, timeout_s=_TIMEOUT_S)
+        finally:
+            self._free.release()
+        values = answer.get("values")
+        if not isinstance(values, dict):
+            values = {key: answer[key] for key in answer if key not in ("done", "reason", "values")}
+        return {
+            "done": bool(answer.get("done")),
+            "reason": str(answer.get("reason", ""))[:500],
+            "values": values,
+        }
+
+    def check_payload(self, payload_id: str) -> None:
+        """Raises `NotFound` for one that was never seen."""
+        if payload_id not in self._snapshot.payload_ids():
+            raise NotFound(f"there is no payload {payload_id!r}")
+
+
+def router(control: Control, maps: Maps) -> APIRouter:
+    """Control over HTTP."""
+    result = APIRouter(prefix="/api", tags=["control"])
+
+    @result.post(
+        "/payloads/{payload_id}/command", response_model=AnswerModel, responses=problems(404, 413)
+    )
+    def command(payload_id: PayloadId, request: CommandRequest) -> Any:
+        """Asks a payload to do something."""
+        control.check_payload(payload_id)
+        return control.ask(
+            INTAKE,
+            {
+                "do": "payload-command",
+                "payload": payload_id,
+                "name": request.name,
+                "arguments": request.arguments,
+            },
+        )
+
+    @result.post(
+        "/payloads/{payload_id}/relocalize", response_model=AnswerModel, responses=problems(404)
+    )
+    def relocalize(payload_id: PayloadId) -> Any:
+        """Forgets the pose and searches the whole map."""
+        control.check_payload(payload_id)
+        return control.ask(f"localizer/{payload_id}", {"do": "relocalize"})
+
+    @result.post(
+        "/payloads/{payload_id}/map", response_model=AnswerModel, responses=problems(404, 413)
+    )
+    def choose_map(payload_id: PayloadId, request: MapRequest) -> Any:
+        """Localizes in another map from now on."""
+        control.check_payload(payload_id)
+        if request.name not in maps.names():
+            raise NotFound(f"there is no map {request.name!r}")
+        return control.ask(f"localizer/{payload_id}", {"do": "map", "name": request.name})
+
+    @result.post("/recording", response_model=AnswerModel, responses=problems(413))
+    def recording(request: RecordingRequest) -> Any:
+        """Starts or stops the station's own recording."""
+        return control.ask(INTAKE, {"do": "record-start" if request.active else "record-stop"})
+
+    return result

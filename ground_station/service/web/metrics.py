@@ -1,0 +1,261 @@
+"""The station in Prometheus's terms: counters and gauges of its notes, histograms of its latencies.
+
+Names follow Prometheus's conventions (base units, `_total` for counters). What notes tell is read
+at each scrape; labels are bounded as the snapshot is.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Histogram, disable_created_metrics
+from prometheus_client import Counter as PlainCounter
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+    Metric,
+    SummaryMetricFamily,
+)
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
+from prometheus_client.registry import Collector
+
+from ground_station.localization.estimate import State
+from ground_station.service.notes import EstimateNote
+from ground_station.service.web.snapshot import Snapshot
+
+CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
+_SECONDS = (
+    0.005, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0,
+)  # fmt: skip
+_STAGES = 24
+_LATENCY_LIMIT_S = 60.0
+
+_GAUGES = (
+    # name, of which message, its field, help
+    ("battery_volts", "battery", "voltage", "Battery voltage."),
+    ("battery_amperes", "battery", "current", "Battery current, negative when discharging."),
+    ("battery_ratio", "battery", "percentage", "Battery charge, 0 to 1."),
+    ("battery_left_seconds", "battery", "time_left_s", "Until the battery's critical voltage."),
+    ("payload_temperature_celsius", "health", "temperature_C", "Of the payload's processor."),
+    ("payload_cpu_ratio", "health", "cpu", "Share of all the payload's cores in use."),
+    ("payload_wifi_signal_dbm", "health", "wifi_signal_dBm", "Wi-Fi signal at the payload."),
+)
+
+
+class Metrics:
+    """All metrics of the station, in a registry of their own. Safe from any thread."""
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        disable_created_metrics()  # text format 0.0.4 has no place for them but series of their own
+        self.registry = CollectorRegistry(auto_describe=False)
+        self.answers: Counter[tuple[str, str]] = Counter()
+        """HTTP answers by method and status class."""
+        self.viewers: Callable[[], int] = lambda: 0
+        self.bus_dropped: Callable[[], int] = lambda: 0
+        self.video: Callable[[], Mapping[str, int]] = dict
+        self._snapshot = snapshot
+        self._lock = threading.Lock()
+        self._stages: dict[tuple[str, str], tuple[int, float]] = {}
+        self._to_pose = Histogram(
+            "blimp_capture_to_pose_seconds",
+            "From a frame's capture to its pose, frames with a known capture time only.",
+            ["payload"], buckets=_SECONDS, registry=self.registry,
+        )  # fmt: skip
+        self._to_screen = Histogram(
+            "blimp_capture_to_screen_seconds",
+            "From a frame's capture to its picture on a viewer's screen, as viewers report it.",
+            ["payload"], buckets=_SECONDS, registry=self.registry,
+        )  # fmt: skip
+        self.pictures_sent = PlainCounter(
+            "blimp_viewer_pictures_sent", "Pictures handed to viewers.", registry=self.registry
+        )
+        self.pictures_lost = PlainCounter(
+            "blimp_viewer_pictures_lost",
+            "Pictures that viewers who left were too slow to take.",
+            registry=self.registry,
+        )
+        self.registry.register(_Notes(self))
+
+    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+        """Counts a pose's latency and the time of its stages."""
+        if payload_id not in self._snapshot.payload_ids():
+            return
+        if note.capture_ns is not None and note.position_m is not None:
+            seconds = 1e-9 * (note.done_ns - note.capture_ns)
+            if 0 <= seconds <= _LATENCY_LIMIT_S:  # else a clock was stepped in between
+                self._to_pose.labels(payload_id).observe(seconds)
+        with self._lock:
+            for stage, spent_ms in list(note.stage_ms.items())[:_STAGES]:
+                key = (payload_id, str(stage)[:32])
+                count, sum_s = self._stages.get(key, (0, 0.0))
+                self._stages[key] = (count + 1, sum_s + 1e-3 * spent_ms)
+
+    def shown(self, payload_id: str, seconds: float) -> None:
+        """A viewer saw a picture this long after its capture."""
+        if payload_id in self._snapshot.payload_ids():
+            self._to_screen.labels(payload_id).observe(seconds)
+
+    def forget(self, payload_id: str) -> None:
+        """A payload is forgotten; so are its series."""
+        for histogram in (self._to_pose, self._to_screen):
+            histogram.remove_by_labels({"payload": payload_id})
+        with self._lock:
+            self._stages = {key: of for key, of in self._stages.items() if key[0] != payload_id}
+
+    def text(self) -> bytes:
+        """Everything in Prometheus's text format 0.0.4."""
+        return generate_latest(self.registry)
+
+    def stages(self) -> dict[tuple[str, str], tuple[int, float]]:
+        """Count and sum (s) by payload and stage."""
+        with self._lock:
+            return dict(self._stages)
+
+    def state(self) -> dict[str, Any]:
+        """The station's state, without trails."""
+        return self._snapshot.document(full=False)
+
+
+class _Notes(Collector):
+    """Reads the notes at each scrape."""
+
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
+
+    def describe(self) -> list[Metric]:
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        state = self._metrics.state()
+        yield from _of_station(state)
+        yield from _of_payloads(state["payloads"])
+        yield from _of_processes(state["processes"])
+        stages = SummaryMetricFamily(
+            "blimp_stage_seconds", "Time of the localizer's stages.", labels=["payload", "stage"]
+        )
+        for key, (count, sum_s) in self._metrics.stages().items():
+            stages.add_metric(key, count, sum_s)
+        yield stages
+        yield GaugeMetricFamily(
+            "blimp_viewers", "Live connections.", value=float(self._metrics.viewers())
+        )
+        dropped = CounterMetricFamily(
+            "blimp_bus_dropped", "What this process heard on the bus that was no note."
+        )
+        dropped.add_metric([], self._metrics.bus_dropped())
+        yield dropped
+        pictures = CounterMetricFamily(
+            "blimp_pictures", "Frames that viewers wanted, by what became of them.", labels=["fate"]
+        )
+        for fate, count in self._metrics.video().items():
+            pictures.add_metric([fate], count)
+        yield pictures
+        answers = CounterMetricFamily(
+            "blimp_http_answers", "HTTP answers.", labels=["method", "status"]
+        )
+        for (method, status), count in list(self._metrics.answers.items()):
+            answers.add_metric([method, status], count)
+        yield answers
+
+
+def _of_station(state: Mapping[str, Any]) -> Iterator[Metric]:
+    station = state["station"]
+    info = InfoMetricFamily("blimp_station", "This station.")
+    info.add_metric([], {name: str(station[name]) for name in ("name", "version", "map")})
+    yield info
+    alarms = GaugeMetricFamily(
+        "blimp_alarm", "1 for each alarm that stands.", labels=["alarm", "level", "payload"]
+    )
+    for alarm in state["alarms"]:
+        _add(alarms, [alarm["id"][:64], alarm["level"], alarm["payload"]], 1)
+    yield alarms
+    recording = state["recording"]
+    if recording is None:
+        return
+    gauge = GaugeMetricFamily("blimp_recording_active", "1 while the station records.")
+    _add(gauge, [], bool(recording["active"]))
+    yield gauge
+    gauge = GaugeMetricFamily("blimp_recording_free_bytes", "Free on the recordings' disk.")
+    _add(gauge, [], _scaled(recording["free_MB"], 1e6))
+    yield gauge
+    counter = CounterMetricFamily(
+        "blimp_recording_dropped", "Messages of this recording that a slow disk did not take."
+    )
+    _add(counter, [], recording["dropped"])
+    yield counter
+
+
+def _of_payloads(payloads: Mapping[str, Any]) -> Iterator[Metric]:
+    up = GaugeMetricFamily("blimp_payload_up", "1 while it is heard.", labels=["payload"])
+    frames = CounterMetricFamily(
+        "blimp_frames", "Frames by fate, as payload, receiver and localizer count them.",
+        labels=["payload", "fate"],
+    )  # fmt: skip
+    stream = CounterMetricFamily(
+        "blimp_stream", "The receiver's counters.", labels=["payload", "counter"]
+    )
+    states = GaugeMetricFamily(
+        "blimp_state", "1 for the localizer's state, 0 for the others.", labels=["payload", "state"]
+    )
+    lost = GaugeMetricFamily(
+        "blimp_packets_lost_ratio", "Share of the video's packets lost of late.", labels=["payload"]
+    )
+    rate = GaugeMetricFamily(
+        "blimp_video_bits_per_second", "Video as received.", labels=["payload"]
+    )
+    values = {
+        name: GaugeMetricFamily(f"blimp_{name}", text, labels=["payload"])
+        for name, _, _, text in _GAUGES
+    }
+    for payload_id, view in payloads.items():
+        _add(up, [payload_id], view["alive"])
+        if (estimate := view["estimate"]) is not None:
+            for state in State:
+                _add(states, [payload_id, state.value], estimate["state"] == state.value)
+            for fate in ("processed", "localized", "skipped"):
+                _add(frames, [payload_id, fate], estimate[fate])
+        if (note := view["payload"]) is None:
+            continue
+        for family, table in ((frames, note["frames"]), (stream, note["stream"])):
+            for name, count in list(table.items())[:32] if isinstance(table, dict) else ():
+                _add(family, [payload_id, str(name)[:32]], count)
+        _add(lost, [payload_id], note["lost_share"])
+        _add(rate, [payload_id], _scaled(note["bitrate_kbps"], 1e3))
+        for name, message, field, _ in _GAUGES:
+            if isinstance(note[message], dict) and message not in view["stale"]:
+                _add(values[name], [payload_id], note[message].get(field))
+    yield from (up, states, frames, stream, lost, rate, *values.values())
+
+
+def _of_processes(processes: list[Mapping[str, Any]]) -> Iterator[Metric]:
+    memory = GaugeMetricFamily(
+        "blimp_process_resident_bytes", "Resident memory.", labels=["process"]
+    )
+    cpu = GaugeMetricFamily("blimp_process_cpu_ratio", "Of one core.", labels=["process"])
+    silent = GaugeMetricFamily(
+        "blimp_process_silent_seconds", "Since it last said that it lives.", labels=["process"]
+    )
+    restarts = CounterMetricFamily(
+        "blimp_process_restarts", "Times it was started anew.", labels=["process"]
+    )
+    for process in processes:
+        name = [str(process["name"])[:64]]
+        _add(memory, name, _scaled(process["memory_MB"], 1e6))
+        _add(cpu, name, process["cpu"])
+        _add(silent, name, process["age_s"])
+        _add(restarts, name, process["restarts"])
+    yield from (memory, cpu, silent, restarts)
+
+
+def _add(family: Any, labels: list[str], value: Any) -> None:
+    """Adds a sample where there is a number."""
+    if isinstance(value, int | float):
+        family.add_metric(labels, float(value))
+
+
+def _scaled(value: Any, factor: float) -> float | None:
+    return value * factor if isinstance(value, int | float) else None

@@ -1,0 +1,192 @@
+"""What the HTTP API takes and gives, as its OpenAPI document tells it.
+
+What is taken is checked against these; what is given is built from notes and only described here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import Path
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
+
+from ground_station.service.notes import EstimateNote, PayloadNote, RecordingNote
+
+PAYLOAD_PATTERN = "^[a-z0-9][a-z0-9_-]{0,31}$"
+MAP_PATTERN = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+FILE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.:+-]{0,127}\.mcap$"
+
+PayloadId = Annotated[str, Path(pattern=PAYLOAD_PATTERN, description="As blimp-1.")]
+MapName = Annotated[str, Path(pattern=MAP_PATTERN, description="As atrium.")]
+FileName = Annotated[str, Path(pattern=FILE_PATTERN, description="As GET /api/recordings tells.")]
+
+CommandName = Literal[
+    "record-start", "record-stop", "idr", "bitrate", "exposure", "shutdown", "reboot"
+]
+ArgumentName = Annotated[str, StringConstraints(pattern="^[a-z][a-zA-Z0-9_]{0,31}$")]
+Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12, strict=True)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Problem(BaseModel):
+    """Why a request was not carried out, in one line."""
+
+    detail: str
+
+
+class CommandRequest(_Model):
+    """What a payload is asked for; its numbers by name, as {"kbps": 1500}."""
+
+    name: CommandName
+    arguments: Annotated[dict[ArgumentName, Number], Field(max_length=8)] = {}
+
+
+class MapRequest(_Model):
+    """The map that a payload's poses are to be in."""
+
+    name: Annotated[str, StringConstraints(pattern=MAP_PATTERN)]
+
+
+class RecordingRequest(_Model):
+    """Whether the station records."""
+
+    active: StrictBool
+
+
+class AnswerModel(BaseModel):
+    """What became of it: done, or why not; `values` are what is set now."""
+
+    done: bool
+    reason: str
+    values: dict[str, Any] = {}
+
+
+class Health(BaseModel):
+    """That this process serves."""
+
+    status: Literal["ok"]
+
+
+class StationModel(BaseModel):
+    """Which station this is."""
+
+    name: str
+    version: str
+    uptime_s: float
+    started_ns: int
+    map: str
+    demo: bool
+
+
+class ProcessModel(BaseModel):
+    """A process of the service; `age_s` since it last said that it lives."""
+
+    name: str
+    pid: int
+    memory_MB: float
+    cpu: float
+    uptime_s: float
+    restarts: int
+    age_s: float
+    restarted_s: float | None
+
+
+class PayloadModel(BaseModel):
+    """A payload; what `stale` names is older than it may be to speak of now."""
+
+    payload: PayloadNote | None
+    estimate: EstimateNote | None
+    alive: bool
+    ended: bool
+    age_s: dict[str, float | None]
+    stale: list[str]
+    state_s: float | None
+    clock_unknown_s: float | None
+    trail: list[list[float]] = []
+    trail_breaks: list[int] = []
+
+
+class EventModel(BaseModel):
+    """Something that happened."""
+
+    time_ns: int
+    source: str
+    level: str
+    name: str
+    text: str
+    payload: str
+
+
+class AlarmModel(BaseModel):
+    """An alarm that stands; `payload` is "-" where it is of none."""
+
+    id: str
+    level: Literal["info", "warning", "alarm"]
+    payload: str
+    text: str
+    since_ns: int
+
+
+class StateModel(BaseModel):
+    """The whole station, now."""
+
+    now_ns: int
+    station: StationModel
+    processes: list[ProcessModel]
+    payloads: dict[str, PayloadModel]
+    recording: RecordingNote | None
+    recording_age_s: float | None
+    events: list[EventModel]
+    alarms: list[AlarmModel]
+
+
+class FloorPlanModel(BaseModel):
+    """A floor plan as in ROS map_server: its lower left corner lies at `origin` (x, y, yaw)."""
+
+    resolution_m: float
+    origin: list[float]
+    width_px: int
+    height_px: int
+    url: str
+
+
+class MapModel(BaseModel):
+    """A map on the shelf; `extent_m` is the size of the box of its landmarks."""
+
+    name: str
+    registered: bool
+    landmarks: int
+    extent_m: list[float]
+    floorplan: bool
+
+
+class BoundsModel(BaseModel):
+    """The box of a map's landmarks."""
+
+    min: list[float]
+    max: list[float]
+
+
+class MapDetailsModel(BaseModel):
+    """A map with its floor plan and bounds."""
+
+    name: str
+    registered: bool
+    landmarks: int
+    extent_m: list[float]
+    bounds: BoundsModel
+    features: str
+    floorplan: FloorPlanModel | None
+
+
+class RecordingModel(BaseModel):
+    """A recording of the ground's; the one that is being written is `active`."""
+
+    file: str
+    size_MB: float
+    modified_ns: int
+    duration_s: float | None
+    active: bool

@@ -1,0 +1,221 @@
+"""The ground's recordings: a list, downloads, and trajectories as TUM text."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+from starlette.exceptions import HTTPException
+
+from ground_station.service.web.models import FILE_PATTERN, FileName, RecordingModel
+from ground_station.service.web.problems import Busy, NotFound, problems
+from pi_firmware.wire.errors import BlimpError
+
+_FILES = 500
+_PIECE_BYTES = 256 * 1024
+_NAME = re.compile(FILE_PATTERN)
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+
+
+class Recordings:
+    """The files of one folder; `active` tells which is being written. Safe from any thread."""
+
+    def __init__(self, folder: Path, active: Callable[[], str]) -> None:
+        self._folder, self._active = folder, active
+        self._durations: OrderedDict[str, tuple[tuple[int, int], float | None]] = OrderedDict()
+        self._lock = threading.Lock()
+        self.exporting = threading.BoundedSemaphore(1)
+
+    def list(self) -> list[dict[str, Any]]:
+        """The newest recordings, newest first."""
+        found = []
+        with contextlib.suppress(OSError), os.scandir(self._folder) as entries:
+            for entry in entries:
+                if _NAME.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                    with contextlib.suppress(OSError):
+                        found.append((entry.stat(follow_symlinks=False), entry.name))
+        found.sort(key=lambda item: (-item[0].st_mtime_ns, item[1]))
+        active = self._active()
+        return [
+            {
+                "file": name,
+                "size_MB": round(status.st_size / 1e6, 3),
+                "modified_ns": status.st_mtime_ns,
+                "duration_s": None if name == active else self._duration_s(name, status),
+                "active": name == active,
+            }
+            for status, name in found[:_FILES]
+        ]
+
+    def open(self, name: str) -> tuple[int, int]:
+        """A descriptor of a recording and its size now; raises `NotFound`.
+
+        It is a regular file that lies in the folder itself: no link, no path.
+        """
+        if _NAME.fullmatch(name):
+            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            with contextlib.suppress(OSError):
+                descriptor = os.open(self._folder / name, flags)
+                status = os.fstat(descriptor)
+                if stat.S_ISREG(status.st_mode):
+                    return descriptor, status.st_size
+                os.close(descriptor)
+        raise NotFound(f"there is no recording {name[:128]!r}")
+
+    def trajectory(self, name: str) -> Iterator[str]:
+        """Poses of a recording as TUM lines; raises a `BlimpError` before the first of them."""
+        from ground_station.service.export import tum_lines
+
+        descriptor, _ = self.open(name)
+        os.close(descriptor)
+        if not self.exporting.acquire(blocking=False):
+            raise Busy("another trajectory is being read; try again then")
+        try:
+            lines = iter(tum_lines(self._folder / name))
+            first = next(lines, "")
+        except BaseException:
+            self.exporting.release()
+            raise
+        return self._rest(first, lines)
+
+    def _rest(self, first: str, lines: Iterator[str]) -> Iterator[str]:
+        try:
+            yield _line(first)
+            for line in lines:
+                yield _line(line)
+        finally:
+            self.exporting.release()
+
+    def _duration_s(self, name: str, status: os.stat_result) -> float | None:
+        """From the file's own summary; None where it has none, as after a cut."""
+        identity = (status.st_size, status.st_mtime_ns)
+        with self._lock:
+            kept = self._durations.get(name)
+            if kept is not None and kept[0] == identity:
+                return kept[1]
+        duration_s = _summed_up_s(self._folder / name)
+        with self._lock:
+            self._durations[name] = (identity, duration_s)
+            while len(self._durations) > 2 * _FILES:
+                self._durations.popitem(last=False)
+        return duration_s
+
+
+def _line(text: str) -> str:
+    return text if not text or text.endswith("\n") else text + "\n"
+
+
+def _summed_up_s(path: Path) -> float | None:
+    from mcap.reader import SeekingReader
+
+    try:
+        with path.open("rb") as file:
+            summary = SeekingReader(file, record_size_limit=64 << 20).get_summary()
+    except Exception:  # a cut or foreign file: whatever its reader stumbles over
+        return None
+    figures = summary.statistics if summary else None
+    if figures is None or not figures.message_count:
+        return None
+    return round(1e-9 * (figures.message_end_time - figures.message_start_time), 3)
+
+
+def _pieces(descriptor: int, begin: int, end: int) -> Iterator[bytes]:
+    """The bytes from begin to end, as far as they are there; the file may have grown since."""
+    try:
+        while begin < end:
+            piece = os.pread(descriptor, min(_PIECE_BYTES, end - begin), begin)
+            if not piece:
+                return
+            begin += len(piece)
+            yield piece
+    finally:
+        os.close(descriptor)
+
+
+def _portion(header: str | None, size: int) -> tuple[int, int] | None:
+    """What a Range header asks for, as begin and end; None for all (RFC 9110, section 14).
+
+    Raises an `HTTPException` where there is no such part. Several parts at once give all.
+    """
+    found = _RANGE.fullmatch(header.strip()) if header else None
+    if found is None or found.groups() == ("", ""):
+        return None
+    first, last = found.groups()
+    begin, end = int(first or 0), min(size, int(last) + 1) if last else size
+    if not first:
+        begin, end = max(0, size - int(last)), size
+    elif last and int(last) < begin:
+        return None
+    if begin >= end:
+        raise HTTPException(
+            416, f"the file has {size} bytes", headers={"content-range": f"bytes */{size}"}
+        )
+    return begin, end
+
+
+def router(recordings: Recordings) -> APIRouter:
+    """Recordings over HTTP."""
+    result = APIRouter(prefix="/api/recordings", tags=["recordings"])
+
+    @result.get("", response_model=list[RecordingModel])
+    def all_recordings() -> Any:
+        """The newest recordings, newest first."""
+        return recordings.list()
+
+    @result.get(
+        "/{file}",
+        response_class=Response,
+        responses={
+            200: {"content": {"application/octet-stream": {}}},
+            206: {"content": {"application/octet-stream": {}}, "description": "The range."},
+            **problems(404, 416),
+        },
+    )
+    def download(file: FileName, request: Request) -> Response:
+        """A recording's bytes as they are now, or a range of them."""
+        descriptor, size = recordings.open(file)
+        try:
+            part = _portion(request.headers.get("range"), size)
+        except HTTPException:
+            os.close(descriptor)
+            raise
+        begin, end = part or (0, size)
+        headers = {
+            "content-length": str(end - begin),
+            "content-disposition": f'attachment; filename="{file}"',
+            "accept-ranges": "bytes",
+        }
+        if part:
+            headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
+        return StreamingResponse(
+            _pieces(descriptor, begin, end),
+            206 if part else 200,
+            headers,
+            media_type="application/octet-stream",
+        )
+
+    @result.get(
+        "/{file}/trajectory.txt",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {}}}, **problems(404, 409)},
+    )
+    def trajectory(file: FileName) -> Response:
+        """The estimated poses, as TUM text: timestamp tx ty tz qx qy qz qw."""
+        try:
+            lines = recordings.trajectory(file)
+        except BlimpError:
+            raise
+        except OSError as error:
+            raise NotFound(f"{file}: {error.strerror or error}") from None
+        return StreamingResponse(lines, media_type="text/plain")
+
+    return result

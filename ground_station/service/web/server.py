@@ -1,0 +1,92 @@
+"""HTTP and WebSocket connections, bounded: uvicorn with limits that it lacks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from ground_station.errors import GroundStationError
+
+CONNECTIONS = 256
+_REQUEST_S = 10.0
+_MESSAGE_BYTES = 8192
+
+
+class ListenError(GroundStationError):
+    """An address that cannot be listened on."""
+
+
+class _Http(H11Protocol):
+    """Closes a connection whose first request does not come, and one too many."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        if len(self.connections) > CONNECTIONS:
+            transport.abort()
+            return
+        self.loop.call_later(_REQUEST_S, self._check)
+
+    def _check(self) -> None:
+        upgraded = self.transport.get_protocol() is not self
+        if self.cycle is None and not upgraded:
+            self.transport.abort()
+
+
+class _WebSocket(WebSocketsSansIOProtocol):
+    """Gives the application a way to end a connection that takes nothing: `scope["abort"]`."""
+
+    async def run_asgi(self) -> None:
+        scope: Any = self.scope
+        scope["abort"] = self.transport.abort
+        await super().run_asgi()
+
+
+class Server(uvicorn.Server):
+    """A server that leaves signals to its process."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def server(app: ASGIApp) -> Server:
+    """A server of an application, for a socket of `listen`."""
+    return Server(
+        uvicorn.Config(
+            app,
+            http=_Http,
+            ws=_WebSocket,
+            ws_max_size=_MESSAGE_BYTES,
+            ws_ping_interval=20.0,
+            ws_ping_timeout=20.0,
+            ws_per_message_deflate=False,  # pictures are compressed already
+            h11_max_incomplete_event_size=32 * 1024,
+            timeout_keep_alive=10,
+            timeout_graceful_shutdown=1,
+            proxy_headers=False,  # nobody tells us another address than the connection's
+            server_header=False,
+            access_log=False,
+            log_config=None,
+            log_level="warning",
+            lifespan="on",
+        )
+    )
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; raises `ListenError` with one line, as when the port is in use."""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = found[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ListenError(f"http {host}:{port}: {reason}") from None

@@ -1,0 +1,173 @@
+"""A station for tests of the web process: the test says its notes, on a real bus or on none."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground_station.service import notes
+from ground_station.service.notes import (
+    EstimateNote,
+    EventNote,
+    FrameNote,
+    PayloadNote,
+    ProcessNote,
+    RecordingNote,
+)
+from ground_station.service.pictures import PictureWriter
+from ground_station.service.settings import (
+    HttpSettings,
+    MapSettings,
+    RecordingSettings,
+    Run,
+    StationSettings,
+)
+
+ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
+TOKEN = "a-token-of-more-than-20-characters"
+PAYLOAD = "blimp-1"
+WIDTH, HEIGHT = 64, 48
+
+
+@dataclass
+class SilentBus:
+    """A bus on which `put` says what others would, and `ask` gives the answer that was set."""
+
+    dropped: int = 0
+    asked: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    answer: Mapping[str, Any] = field(default_factory=lambda: {"done": True, "reason": ""})
+    said: list[tuple[str, str, notes.Note]] = field(default_factory=list)
+    _takes: dict[str, list[Callable[[str, Any], None]]] = field(default_factory=dict)
+
+    def hear(self, kind: str, _: type, take: Callable[[str, Any], None]) -> None:
+        self._takes.setdefault(kind, []).append(take)
+
+    def say(self, kind: str, payload_id: str, note: notes.Note) -> None:
+        self.said.append((kind, payload_id, note))
+
+    def put(self, kind: str, payload_id: str, note: notes.Note) -> None:
+        for take in self._takes.get(kind, ()):
+            take(payload_id, note)
+
+    def ask(self, name: str, request: Mapping[str, Any], timeout_s: float = 5.0) -> Any:
+        self.asked.append((name, dict(request)))
+        return self.answer
+
+
+def run_of(folder: Path, **http: Any) -> Run:
+    """Settings with the sample map, whose recordings lie in folder/recordings."""
+    (folder / "recordings").mkdir(exist_ok=True)
+    station = StationSettings(
+        map=MapSettings(folder=str(ATRIUM), shelf=str(ATRIUM.parent)),
+        recording=RecordingSettings(folder=str(folder / "recordings")),
+        http=HttpSettings(**{"port": 0, **http}),
+    )
+    return Run(station, started_ns=time.time_ns())
+
+
+def frame(slot: int = 0, stamp: int = 2, sequence: int = 1, **values: Any) -> FrameNote:
+    now_ns = time.time_ns()
+    note = FrameNote(
+        slot, stamp, sequence, time_ns=now_ns, clock_ns=now_ns, arrival_ns=now_ns,
+        width_px=WIDTH, height_px=HEIGHT, ssrc=7, capture_ns=now_ns,
+    )  # fmt: skip
+    return replace(note, **values)
+
+
+def estimate(sequence: int = 1, **values: Any) -> EstimateNote:
+    now_ns = time.time_ns()
+    note = EstimateNote(
+        sequence, now_ns, now_ns, done_ns=now_ns, state="TRACKING", capture_ns=now_ns - 40_000_000,
+        position_m=[1.0, 2.0, 1.5], quaternion_xyzw=[0.0, 0.0, 0.0, 1.0], covariance=[0.01] * 36,
+        position_sigma_m=[0.01] * 9, velocity_mps=[0.1, 0.0, 0.0], heading_deg=12.0, speed_mps=0.1,
+        height_m=1.5, inliers=90, expected=120, points_px=[10.0, 20.0, 30.0, 40.0],
+        stage_ms={"track": 5.0, "pose": 2.5}, map="atrium", processed=9, localized=8, skipped=1,
+    )  # fmt: skip
+    return replace(note, **values)
+
+
+def payload(**values: Any) -> PayloadNote:
+    now_ns = time.time_ns()
+    note = PayloadNote(
+        alive=True, seen_ns=now_ns, ssrc=7, frames={"captured": 100, "received": 90, "lost": 1},
+        stream={"packets": 1000, "packets_lost": 10}, rate_hz=29.9, bitrate_kbps=1500.0,
+        clock={"offset_ns": 5, "uncertainty_ns": 100_000}, round_trip_s=0.01,
+        battery={"time_ns": now_ns, "voltage": 3.9, "percentage": 0.8, "current": -0.4,
+                 "time_left_s": 900.0, "alarm": ""},
+        health={"time_ns": now_ns, "temperature_C": 51.0, "cpu": 0.4, "wifi_signal_dBm": -55.0},
+    )  # fmt: skip
+    return replace(note, **values)
+
+
+def event(**values: Any) -> EventNote:
+    return replace(EventNote(time.time_ns(), "station", notes.INFO, "hello", "a text"), **values)
+
+
+def recording(**values: Any) -> RecordingNote:
+    return replace(RecordingNote(active=False, free_MB=50_000.0), **values)
+
+
+def process(name: str = "intake", pid: int = 100, **values: Any) -> ProcessNote:
+    return replace(ProcessNote(name, pid, memory_MB=80.0, cpu=0.2, uptime_s=5.0), **values)
+
+
+def say_all(put: Callable[[str, str, notes.Note], None]) -> None:
+    """One note of each kind, as a station with a payload that flies says them."""
+    put(notes.PROCESS, notes.STATION, process())
+    put(notes.RECORDING, notes.STATION, recording())
+    put(notes.PAYLOAD, PAYLOAD, payload())
+    put(notes.FRAME, PAYLOAD, frame())
+    put(notes.ESTIMATE, PAYLOAD, estimate())
+    put(notes.EVENT, PAYLOAD, event())
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+
+
+def write_token(folder: Path, text: str = TOKEN, mode: int = 0o600) -> Path:
+    path = folder / "token"
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def ring(folder: Path) -> PictureWriter:
+    return PictureWriter(folder, PAYLOAD)
+
+
+def until(condition: Callable[[], Any], limit_s: float = 20.0) -> Any:
+    """What the condition gives as soon as it is true."""
+    deadline_s = time.monotonic() + limit_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline_s, "it did not happen in time"
+        time.sleep(0.02)
+    return found
+
+
+@contextlib.contextmanager
+def web_process(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """The real process on the run in a folder, with its port."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ground_station.service.web", str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("dashboard: http://"), (line, process.stderr and process.poll())
+        yield process, int(line.rstrip("/\n").rpartition(":")[2])
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
