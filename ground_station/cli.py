@@ -17,6 +17,7 @@ _COMMANDS = (
     ("map", "ground_station.mapping.command", "build, register and inspect maps"),
     ("localize", "ground_station.localization.command", "find the camera in a map, frame by frame"),
     ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
+    ("record", "ground_station.service.record_command", "record payloads without the service"),
     ("command", "ground_station.stream.command", "ask a payload to do something"),
     ("serve", "ground_station.service.serve_command", "run the ground station and its dashboard"),
     (

@@ -11,7 +11,7 @@ import itertools
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from ground_station.stream import rtp
@@ -115,9 +115,9 @@ class Stream:
             if closing:
                 return
 
-    def _give(self, frames: object) -> None:
+    def _give(self, frames: Iterable[ReceivedFrame]) -> None:
         try:
-            for frame in frames:  # type: ignore[attr-defined]
+            for frame in frames:
                 self._on_frame(self.payload_id, frame)
         except Exception as error:  # one payload's trouble is not to end its stream
             self.failure = f"{type(error).__name__}: {error}"

@@ -31,7 +31,7 @@ class Recorder:
     `stop`.
     """
 
-    run_type: type[Run] = Run
+    run_type: Callable[..., Run] = Run
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class Recorder:
             self._force_idr()
         return name
 
-    def stop(self) -> str:
+    def stop(self, limit_s: float | None = None) -> str:
         """Ends the recording within some seconds; the last file's name, "" when there was none.
 
         The file is whole and on the card then. A disk that does not answer is left to itself, which
@@ -113,19 +113,18 @@ class Recorder:
         """
         with self._commands:
             run, self._run = self._run, None
-            if run is not None and not run.end(_STOP_LIMIT_S):
+            limit_s = _STOP_LIMIT_S if limit_s is None else limit_s
+            if run is not None and not run.end(limit_s):
                 run.give_up()
                 self._hung = run
-                self._tell(
-                    messages.EVENT_RECORDING_ENDED,
-                    f"{run.name}: the disk did not take its end within {_STOP_LIMIT_S:g} s",
-                )
+                run.reason = f"the disk did not take its end within {limit_s:g} s"
+                self._tell(messages.EVENT_RECORDING_ENDED, f"{run.name}: {run.reason}")
             return self._latest.name if self._latest else ""
 
-    def close(self) -> None:
+    def close(self, limit_s: float | None = None) -> None:
         """Stops for good."""
         self._closed = True
-        self.stop()
+        self.stop(limit_s)
 
     def _begun(self) -> Run:
         def told(goes_on: bool, text: str) -> None:

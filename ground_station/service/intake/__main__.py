@@ -1,0 +1,73 @@
+"""`python -m ground_station.service.intake RUN_FOLDER`: the intake as a process of the service."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first imported
+
+from ground_station.geometry.camera import Camera, load_camera
+from ground_station.mapping.store import load_info
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.intake.process import Intake
+from ground_station.service.notes import EstimateNote, EventNote
+from ground_station.service.settings import MapSettings, load_run
+from pi_firmware.wire.errors import BlimpError
+
+_STEP_S = 0.1
+
+
+def camera_of(settings: MapSettings) -> Camera:
+    """The payloads' camera: the one given, or the map's."""
+    return load_camera(settings.camera) if settings.camera else load_info(settings.folder).camera
+
+
+def serve(folder: Path, stop: threading.Event) -> None:
+    """Runs until `stop` is set; raises a `BlimpError` with one line when it cannot."""
+    settings = load_run(folder).station
+    camera = camera_of(settings.map)
+    with (
+        Bus(folder, "intake") as bus,
+        Intake(settings, bus.say, folder=folder, camera=camera) as intake,
+    ):
+        bus.serve("intake", intake.ask)
+        bus.hear(notes.ESTIMATE, EstimateNote, intake.estimated)
+        bus.hear(notes.EVENT, EventNote, intake.heard_event)
+        if settings.recording.at_start:
+            # A disk that hangs, or is full, does not hold up the video.
+            threading.Thread(target=_record, args=(intake,), daemon=True).start()
+        while not stop.wait(_STEP_S):
+            intake.step()
+            bus.beat()
+
+
+def _record(intake: Intake) -> None:
+    try:
+        intake.recorder.start()
+    except BlimpError as error:
+        intake.refuse(str(error))
+
+
+def main() -> int:
+    """The exit status: 0 after a signal, 2 for bad input, 3 where only a new process can mend it."""
+    if len(sys.argv) != 2:
+        print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        serve(Path(sys.argv[1]), stop)
+    except BlimpError as error:
+        print(f"intake: {error}", file=sys.stderr)
+        return 3 if error.restart else 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

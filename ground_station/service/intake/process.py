@@ -1,0 +1,271 @@
+"""The intake put together: video and telemetry in, pictures, notes and recordings out."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import GroundStationError
+from ground_station.geometry.camera import Camera
+from ground_station.service import notes
+from ground_station.service.intake import poses, questions
+from ground_station.service.intake.announced import Announced
+from ground_station.service.intake.payloads import Payload, Say
+from ground_station.service.intake.recording import GroundRecorder
+from ground_station.service.intake.roster import Roster
+from ground_station.service.notes import EstimateNote, EventNote, Note
+from ground_station.service.pose_feed import PoseFeed
+from ground_station.service.settings import StationSettings
+from ground_station.stream import commands
+from ground_station.stream.assembly import ReceivedFrame
+from ground_station.stream.feedback import Feedback
+from ground_station.stream.several import SeveralReceiver
+from ground_station.stream.srtp import load_keys
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.errors import BlimpError, TelemetryError
+
+_PAYLOADS_S, _RECORDING_S = 0.5, 1.0
+_STOP_S = 3.5
+_IDR_S = 1.0
+
+_LEVELS = {
+    messages.EVENT_FAILED: notes.ALARM,
+    messages.EVENT_BATTERY_CRITICAL: notes.ALARM,
+    messages.EVENT_BATTERY_LOW: notes.WARNING,
+    messages.EVENT_GAUGE_FAILED: notes.WARNING,
+    messages.EVENT_CAMERA_RESTARTED: notes.WARNING,
+    messages.EVENT_ENCODER_RESTARTED: notes.WARNING,
+    messages.EVENT_RADIO_RESTARTED: notes.WARNING,
+    messages.EVENT_RADIO_FAILED: notes.WARNING,
+    messages.EVENT_SOURCE_CUT: notes.WARNING,
+}
+_MESSAGES: dict[str, type[messages.Message]] = {
+    keys.BATTERY: messages.Battery,
+    keys.GATE: messages.Gate,
+    keys.EVENT: messages.Event,
+    keys.AUTOPILOT: messages.Autopilot,
+    keys.HEALTH: messages.Health,
+}
+
+
+class IntakeError(GroundStationError):
+    """The intake cannot go on; a new process may."""
+
+    restart = True
+
+
+class Intake:
+    """Takes up payloads from its start until `close`; `step` it several times a second.
+
+    `say` tells all processes, `folder` is where pictures go (None: none are shown). Raises a
+    `BlimpError` with one line when a port is in use or a folder of certificates is not one.
+    """
+
+    def __init__(
+        self,
+        settings: StationSettings,
+        say: Say,
+        *,
+        folder: Path | None = None,
+        camera: Camera | None = None,
+    ) -> None:
+        self._say_note, self._folder = say, folder
+        self._announced = Announced()
+        self._roster = Roster(settings.payloads, self._announced, self._make)
+        self._told: dict[str, str] = {}
+        self._due_s = {"payloads": 0.0, "recording": 0.0}
+        self._stack = contextlib.ExitStack()
+        self.recorder = GroundRecorder(
+            settings.recording, self._recorder_said, camera=camera, force_idr=self._force_idrs
+        )
+        self._stack.callback(self.recorder.close, _STOP_S)
+        try:
+            self._open(settings)
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def _open(self, settings: StationSettings) -> None:
+        certificates = settings.telemetry.certificates
+        srtp_keys = load_keys(certificates) if certificates else None
+        self._listener = TelemetryListener(
+            settings.telemetry.listen,
+            connect=settings.telemetry.connect,
+            certificates=certificates,
+            discoverable=settings.telemetry.discoverable,
+            on_event=self._payload_said,
+        )
+        self._stack.callback(self._listener.close)
+        self._feed = PoseFeed(self._listener.session)
+        self._subscriber = self._listener.session.zenoh.declare_subscriber(
+            keys.every_payload("*"), self._heard
+        )
+        self.video = SeveralReceiver(
+            settings.video.port,
+            settings.video.host,
+            owner=self._roster.owner,
+            on_frame=self._take,
+            most=settings.payloads.most,
+            srtp_keys=srtp_keys,
+        )
+        feedback = Feedback(self._listener, self.video.stream_of)
+        # In this order at the end: what has come is decoded and recorded, then all is let go of.
+        self._stack.callback(self.recorder.close, _STOP_S)
+        self._stack.callback(self.video.close)
+        self._stack.callback(feedback.close)
+
+    def __enter__(self) -> Intake:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the recording within some seconds, and everything else."""
+        self._stack.close()
+        for payload in self._roster.all():
+            payload.close()
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Where telemetry is listened to."""
+        return self._listener.endpoints
+
+    def step(self) -> None:
+        """Says how payloads and recording are, when it is time to.
+
+        Raises `IntakeError` when nothing can be received any more.
+        """
+        if self.video.failure:
+            raise IntakeError(self.video.failure)
+        now_s = time.monotonic()
+        if now_s >= self._due_s["payloads"]:
+            self._due_s["payloads"] = now_s + _PAYLOADS_S
+            self._follow()
+        if now_s >= self._due_s["recording"]:
+            self._due_s["recording"] = now_s + _RECORDING_S
+            self._say(notes.RECORDING, notes.STATION, self.recorder.state())
+
+    def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Answers a question of the bus; raises a `BlimpError` for what cannot be done."""
+        return questions.answer(request, self.recorder, self._listener.session)
+
+    def estimated(self, payload_id: str, note: EstimateNote) -> None:
+        """Takes a pose: it goes to its payload, and into the recording."""
+        with contextlib.suppress(ValueError, TypeError, BlimpError):
+            poses.publish(self._feed, payload_id, note)
+        self.recorder.estimate(payload_id, note)
+
+    def refuse(self, reason: str) -> None:
+        """Says why no recording could begin."""
+        self._event("intake", notes.ALARM, messages.EVENT_RECORDING_ENDED, reason, notes.STATION)
+
+    def heard_event(self, payload_id: str, note: EventNote) -> None:
+        """Takes another process's event, for the recording."""
+        if note.source not in ("intake", "payload"):
+            self.recorder.note(notes.EVENT, payload_id, note)
+
+    def _make(self, payload_id: str) -> Payload:
+        payload = Payload(payload_id, self._folder, self._say, self.recorder)
+        payload.clock = lambda: self._listener.clock(payload_id)
+        return payload
+
+    def _take(self, payload_id: str, frame: ReceivedFrame) -> None:
+        payload = self._roster.take_up(payload_id)
+        if payload is not None:
+            if payload.stream is None or payload.stream.ssrc != frame.ssrc:
+                payload.follow(self.video.stream_of(payload_id))
+            payload.take(frame)
+
+    def _heard(self, sample: Any) -> None:
+        """A message of a payload, on a thread of the session."""
+        payload_id = keys.payload_of(str(sample.key_expr))
+        kind = str(sample.key_expr).rpartition("/")[2]
+        of = _MESSAGES.get(kind)
+        if payload_id is None or of is None:
+            return
+        try:
+            message = messages.decode(of, sample.payload.to_bytes())
+        except TelemetryError:
+            return  # the listener counts it
+        if isinstance(message, messages.Gate):
+            self._announced.said(payload_id, message.ssrc)
+        payload = self._roster.get(payload_id)
+        if payload is not None:
+            payload.seen_ns = time.time_ns()
+            self.recorder.message(payload_id, kind, message)
+
+    def _payload_said(self, payload_id: str, event: messages.Event) -> None:
+        if "ssrc" in event.values:
+            self._announced.said(payload_id, event.values["ssrc"])
+        if self._roster.take_up(payload_id) is not None:
+            self._event(
+                "payload", _LEVELS.get(event.name, notes.INFO), event.name, event.text, payload_id
+            )
+
+    def _follow(self) -> None:
+        """Looks after each payload, and says how it is."""
+        living = set(self._listener.living())
+        for payload_id in living:
+            self._roster.take_up(payload_id)
+        for payload in self._roster.all():
+            was_alive, payload.alive = payload.alive, payload.id in living or payload.streaming
+            if payload.alive and not was_alive:
+                text = f"{payload.id} is here"
+                self._event("intake", notes.INFO, "payload-appeared", text, payload.id)
+            elif was_alive and not payload.alive:
+                text = f"{payload.id} is gone"
+                self._event("intake", notes.WARNING, "payload-gone", text, payload.id)
+            payload.follow(self.video.stream_of(payload.id))
+            stream = payload.stream
+            self._tell(payload.id, "stream-problem", stream.problem if stream else "")
+            disputed = self._announced.disputed(payload.id)
+            text = "two payloads call themselves so; the first one's video is kept"
+            self._tell(payload.id, "payload-twice", text if disputed else "")
+            note = payload.note(
+                self._listener.state(payload.id), self._listener, encrypted=self.video.encrypted
+            )
+            self._say(notes.PAYLOAD, payload.id, note)
+            self.recorder.note(notes.PAYLOAD, payload.id, note)
+        refused = ", ".join(sorted(self._roster.refused))
+        text = f"no place for {refused[:100]}: payloads.most" if refused else ""
+        self._tell(notes.STATION, "payloads-too-many", text)
+
+    def _tell(self, payload_id: str, name: str, problem: str) -> None:
+        """Says a problem once, and once that it is over."""
+        key = f"{payload_id} {name}"
+        before = self._told.get(key, "")
+        if problem == before:
+            return
+        self._told[key] = problem
+        level = notes.WARNING if problem else notes.INFO
+        self._event("intake", level, name, problem or "is over", payload_id)
+
+    def _recorder_said(self, name: str, level: str, text: str) -> None:
+        self._event("intake", level, name, text, notes.STATION)
+        self._due_s["recording"] = 0.0
+
+    def _event(self, source: str, level: str, name: str, text: str, payload_id: str) -> None:
+        note = EventNote(time.time_ns(), source, level, name, text)
+        self._say(notes.EVENT, payload_id, note)
+        self.recorder.note(notes.EVENT, payload_id, note)
+
+    def _say(self, kind: str, payload_id: str, note: Note) -> None:
+        with contextlib.suppress(Exception):  # a bus that is gone comes back, or all end
+            self._say_note(kind, payload_id, note)
+
+    def _force_idrs(self) -> None:
+        """Asks all that live for an IDR, without waiting for any of them."""
+
+        def ask(payload_id: str) -> None:
+            with contextlib.suppress(Exception):
+                commands.ask(self._listener.session, payload_id, "idr", timeout_s=_IDR_S)
+
+        for payload_id in self._listener.living():
+            if self._roster.get(payload_id) is not None:
+                threading.Thread(target=ask, args=(payload_id,), name="idr", daemon=True).start()

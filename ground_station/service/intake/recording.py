@@ -1,0 +1,135 @@
+"""Starts and stops the ground's recordings, and takes what belongs in them without waiting."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import threading
+import time
+from collections.abc import Callable
+
+from ground_station.geometry.camera import Camera
+from ground_station.service import notes
+from ground_station.service.intake.files import Estimated, GroundRun, Said
+from ground_station.service.notes import EstimateNote, Note, RecordingNote
+from ground_station.service.settings import RecordingSettings
+from ground_station.stream.assembly import ReceivedFrame
+from pi_firmware.wire import keys, messages, sei
+from pi_firmware.wire.recorder.recorder import Recorder
+
+STATION_TOPIC = "/station"
+_FREE_PERIOD_S = 2.0
+
+
+class GroundRecorder(Recorder):
+    """Records all payloads; its methods never wait for the disk, save `start` and `stop`.
+
+    `announce` gets events with their level; `force_idr` asks all payloads for an IDR.
+    """
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        announce: Callable[[str, str, str], None],
+        *,
+        camera: Camera | None = None,
+        force_idr: Callable[[], object] = lambda: None,
+    ) -> None:
+        super().__init__(
+            settings, lambda name, text: announce(name, self._level(), text), force_idr=force_idr
+        )
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self.run_type = functools.partial(
+            GroundRun, camera=camera, max_file_s=settings.max_file_s, sizes=self._sizes
+        )
+        self._started_s = 0.0
+        self._free_MB: float | None = None
+        self._free = threading.Event()
+        # A disk that hangs holds up this thread and nobody else.
+        threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
+
+    def start(self) -> str:
+        """As `Recorder.start`."""
+        if not self.file:
+            self._started_s = time.monotonic()
+        return super().start()
+
+    def frame(self, payload_id: str, frame: ReceivedFrame, log_ns: int) -> None:
+        """Records a frame as it came; `log_ns` is when it was captured, by this machine's clock."""
+        active = self._run
+        if active is None:
+            return
+        height, width = frame.image.shape[:2]
+        self._sizes[payload_id] = (width, height)
+        info = sei.FrameInfo(
+            sequence=frame.sequence,
+            time_ns=frame.time_ns,
+            clock_ns=frame.clock_ns,
+            entropy_bits=frame.entropy_bits,
+            sharpness=frame.sharpness,
+            exposure_s=frame.exposure_s,
+            gain=frame.gain,
+            heartbeat=frame.heartbeat,
+        )
+        active.queue.unit(info, frame.access_unit, payload_id, log_ns)
+
+    def message(self, payload_id: str, kind: str, message: messages.Message) -> None:
+        """Records a telemetry message as it was said."""
+        active = self._run
+        if active is None:
+            return
+        with contextlib.suppress(Exception):
+            text = messages.encode(message)
+            topic = "/" + keys.key(payload_id, kind)
+            active.queue.put(Said(topic, message.SCHEMA, time.time_ns(), text))
+
+    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+        """Records a pose, or that there is none."""
+        active = self._run
+        if active is not None:
+            log_ns = note.done_ns if note.capture_ns is None else note.capture_ns
+            active.queue.put(Estimated(payload_id, note, log_ns))
+
+    def note(self, kind: str, payload_id: str, note: Note) -> None:
+        """Records what the service says: events, and how it sees its payloads."""
+        active = self._run
+        if active is not None:
+            place = "" if payload_id == notes.STATION else f"/{payload_id}"
+            topic = f"{STATION_TOPIC}{place}/{kind}"
+            text = notes.encode(note)
+            active.queue.put(Said(topic, f"blimp.station.{kind}", time.time_ns(), text))
+
+    def state(self) -> RecordingNote:
+        """How it goes."""
+        file = self.file
+        return RecordingNote(
+            active=bool(file),
+            file=file,
+            size_MB=round(self.size_MB, 3),
+            duration_s=round(time.monotonic() - self._started_s, 1) if file else 0.0,
+            dropped=self.dropped,
+            free_MB=self._free_MB,
+            problem=self.problem,
+        )
+
+    def close(self, limit_s: float | None = None) -> None:
+        """Stops for good."""
+        self._free.set()
+        super().close(limit_s)
+
+    def _level(self) -> str:
+        return notes.ALARM if self.problem else notes.INFO
+
+    def _watch_disk(self) -> None:
+        folder = self._settings.folder
+        while True:
+            free_MB = None
+            for place in (folder, os.path.dirname(os.path.abspath(folder))):  # noqa: PTH100, PTH120
+                with contextlib.suppress(OSError):
+                    disk = os.statvfs(place)
+                    free_MB = round(disk.f_bavail * disk.f_frsize / 1e6, 1)
+                    break
+            self._free_MB = free_MB
+            if self._free.wait(_FREE_PERIOD_S):
+                return

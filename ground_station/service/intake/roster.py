@@ -1,0 +1,86 @@
+"""Which payloads are taken up, and which stream is whose."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from ground_station.service.intake.announced import Announced
+from ground_station.service.intake.payloads import Payload
+from ground_station.service.settings import PayloadSettings
+
+GRACE_S = 3.0
+"""How long a stream comes before it is taken although nobody announced it."""
+_REFUSED = 64
+
+
+class Roster:
+    """The payloads that are taken up: those named, at most so many. Safe from any thread.
+
+    One that is gone gives its place to one that comes.
+    """
+
+    def __init__(
+        self, settings: PayloadSettings, announced: Announced, make: Callable[[str], Payload]
+    ) -> None:
+        self._settings, self._announced, self._make = settings, announced, make
+        self._payloads: dict[str, Payload] = {}
+        self._lock = threading.Lock()
+        self.refused: set[str] = set()
+        """Those for whom there was no place."""
+
+    def all(self) -> list[Payload]:
+        """Those taken up, in the order in which they came."""
+        with self._lock:
+            return list(self._payloads.values())
+
+    def get(self, payload_id: str) -> Payload | None:
+        """One of them."""
+        return self._payloads.get(payload_id)
+
+    def take_up(self, payload_id: str) -> Payload | None:
+        """A payload, taken up if it was not yet; None: it is not wanted, or has no place."""
+        known = self._payloads.get(payload_id)
+        if known is not None:
+            return known
+        if self._settings.ids and payload_id not in self._settings.ids:
+            return None
+        left: Payload | None = None
+        with self._lock:
+            if payload_id not in self._payloads:
+                if len(self._payloads) >= self._settings.most:
+                    gone = [p for p in self._payloads.values() if not p.alive and not p.streaming]
+                    if not gone:
+                        if len(self.refused) < _REFUSED:
+                            self.refused.add(payload_id)
+                        return None
+                    left = min(gone, key=lambda payload: payload.seen_ns)
+                    del self._payloads[left.id]
+                self._payloads[payload_id] = self._make(payload_id)
+                self.refused.discard(payload_id)
+            taken = self._payloads[payload_id]
+        if left is not None:
+            left.close()
+        return taken
+
+    def owner(self, ssrc: int, key_owner: str | None, age_s: float) -> str | None:
+        """Whose a stream is, as `several.Owner`.
+
+        A payload says so in telemetry. A stream that nobody announces is taken after a moment if
+        there is no doubt: by its key, when that payload announced no other (what it sent in an
+        earlier flight is authentic, too); without keys when nobody announces anything.
+        """
+        payload_id = self._announced.by(ssrc, key_owner)
+        if payload_id is None:
+            if age_s < GRACE_S:
+                return None
+            if key_owner is not None:
+                if self._announced.ssrc(key_owner) is not None:
+                    return None
+                payload_id = key_owner
+            elif self._announced.anyone():
+                return None
+            else:
+                ids = self._settings.ids
+                payload_id = ids[0] if len(ids) == 1 else f"stream-{ssrc:08x}"
+        return payload_id if self.take_up(payload_id) is not None else None

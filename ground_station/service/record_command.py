@@ -1,0 +1,95 @@
+"""`blimp record`: receives and records payloads, without the rest of the service."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ground_station.service.notes import Note
+
+_EPILOG = """\
+examples:
+  blimp record --out recordings
+  blimp record --out recordings --seconds 60 --camera camera.toml
+  blimp record --config station.toml --set telemetry.listen='["tls/0.0.0.0:7447"]'
+
+It takes the place of `blimp serve` and listens where that would: one of the two can run. A file
+ends at the configuration's recording.max_file_MB or max_file_s, and the next begins. The exit
+status is 1 when nothing was recorded, or the recording ended by itself."""
+
+_STEP_S = 0.1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = _EPILOG
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the recordings (recording.folder)"
+    )
+    parser.add_argument("--port", type=int, metavar="P", help="the video's UDP port (video.port)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end by itself after so long")
+    parser.add_argument(
+        "--camera", metavar="CAMERA.toml", help="calibration that is put into the recordings"
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="as of `blimp serve`")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Records until a signal or the given time; raises a `BlimpError` when it cannot start."""
+    from ground_station.errors import InputError
+    from ground_station.geometry.camera import load_camera
+    from ground_station.service import settings
+    from ground_station.service.intake.process import Intake
+
+    if args.seconds is not None and not (math.isfinite(args.seconds) and args.seconds > 0):
+        raise InputError(f"--seconds is {args.seconds:g}; it must be more than 0")
+    overrides = [*args.set]
+    if args.port is not None:
+        overrides.append(f"video.port={args.port}")
+    loaded = settings.load(args.config, overrides)
+    if args.out is not None:
+        recording = dataclasses.replace(loaded.recording, folder=str(args.out))
+        loaded = dataclasses.replace(loaded, recording=recording)
+    path = args.camera or loaded.map.camera
+    camera = load_camera(path) if path else None
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    report = _Report()
+    with Intake(loaded, report.take, camera=camera) as intake:
+        intake.recorder.start()
+        until_s = math.inf if args.seconds is None else time.monotonic() + args.seconds
+        while not stop.wait(_STEP_S) and time.monotonic() < until_s and intake.recorder.file:
+            intake.step()
+    state = intake.recorder.state()
+    for payload_id, frames in sorted(report.frames.items()):
+        print(f"{payload_id}: " + ", ".join(f"{n} {name}" for name, n in sorted(frames.items())))
+    return 1 if state.problem or not report.frames else 0
+
+
+class _Report:
+    """What is worth a line, as it happens."""
+
+    def __init__(self) -> None:
+        self.frames: dict[str, dict[str, int]] = {}
+
+    def take(self, kind: str, payload_id: str, note: Note) -> None:
+        """Prints events, and keeps each payload's newest account."""
+        from ground_station.service.notes import STATION, EventNote, PayloadNote
+
+        if isinstance(note, EventNote):
+            who = "" if payload_id == STATION else f"{payload_id}: "
+            text = "".join(c if c.isprintable() else " " for c in note.text)[:300]
+            print(f"{who}{note.name}: {text}", flush=True)
+        elif isinstance(note, PayloadNote) and note.stream.get("packets"):
+            self.frames[payload_id] = note.frames
