@@ -10,7 +10,7 @@ import importlib.util
 import re
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from packaging.markers import Marker
@@ -21,17 +21,20 @@ ROOT = Path(__file__).parents[3]
 _PINNED = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)==([^\s;\\]+)\s*(?:;([^\\\n]*))?")
 
 
-def blocks(lock: str) -> dict[str, tuple[str, str]]:
-    """Version and whole text (with its hashes) of each package that is locked for this Python."""
-    found: dict[str, tuple[str, str]] = {}
-    for block in re.split(r"^(?=[A-Za-z0-9])", lock, flags=re.M):
-        match = _PINNED.match(block)
-        if match is None:
-            continue
-        marker = (match[3] or "").strip()
-        if not marker or Marker(marker).evaluate():
-            found[canonicalize_name(match[1])] = (match[2], block)
-    return found
+def versions(lock: str) -> dict[str, str]:
+    """The version of each package that is locked for this Python."""
+    return {
+        name: version
+        for name, version, marker, _ in _entries(lock)
+        if not marker or Marker(marker).evaluate()
+    }
+
+
+def _entries(lock: str) -> Iterator[tuple[str, str, str, str]]:
+    """Name, version, marker and whole text, hashes and all, of each entry, for any Python."""
+    for text in re.split(r"^(?=[A-Za-z0-9])", lock, flags=re.M):
+        if (match := _PINNED.match(text)) is not None:
+            yield str(canonicalize_name(match[1])), match[2], (match[3] or "").strip(), text
 
 
 def direct(project: str) -> list[Requirement]:
@@ -86,10 +89,10 @@ def _origin(module: str) -> str | None:
 
 
 def main() -> int:
-    """Prints the part of the lock that the programs need here, hashes and all."""
+    """Prints the part of the lock that the programs need, markers and hashes and all."""
     wanted = closure(direct((ROOT / "pyproject.toml").read_text()))
-    locked = blocks((ROOT / "requirements.lock").read_text())
-    print("".join(text for name, (_, text) in sorted(locked.items()) if name in wanted), end="")
+    lock = (ROOT / "requirements.lock").read_text()
+    print("".join(text for name, _, _, text in _entries(lock) if name in wanted), end="")
     return 0
 
 

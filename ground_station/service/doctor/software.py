@@ -54,7 +54,7 @@ def packages(root: Path) -> Finding:
     from ground_station.service.doctor import locked
 
     try:
-        lock = locked.blocks((root / "requirements.lock").read_text())
+        lock = locked.versions((root / "requirements.lock").read_text())
         direct = locked.direct((root / "pyproject.toml").read_text())
     except OSError as error:
         said = f"{error.filename}: {error.strerror}"
@@ -62,9 +62,9 @@ def packages(root: Path) -> Finding:
     installed = {name: _version(name) for name in locked.closure(direct) if name in lock}
     missing = sorted(name for name, version in installed.items() if version is None)
     other = sorted(
-        f"{name} {version}, locked {lock[name][0]}"
+        f"{name} {version}, locked {lock[name]}"
         for name, version in installed.items()
-        if version is not None and version != lock[name][0]
+        if version is not None and version != lock[name]
     )
     if missing:
         return problem("packages", f"missing: {_some(missing)}", _SETUP)
