@@ -1,0 +1,73 @@
+// @ts-check
+/** The station's HTTP API. A refusal is an answer with its reason, as a broken network is. */
+
+const LIMIT_MS = 8000;
+
+/** @param {string} path @param {unknown} [body] posts it as JSON @returns {Promise<Response>} */
+function ask(path, body) {
+  const post = body === undefined ? {} : {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(body),
+  };
+  return fetch(path, { ...post, cache: "no-store", credentials: "same-origin", signal: AbortSignal.timeout(LIMIT_MS) });
+}
+
+/** @param {Response} response @returns {Promise<string>} */
+async function reasonOf(response) {
+  try {
+    const detail = await response.json();
+    const text = detail.reason ?? detail.detail;
+    if (typeof text === "string") return text;
+    if (Array.isArray(text) && typeof text[0]?.msg === "string") return text[0].msg;
+  } catch {
+    // An answer without JSON: its status says enough.
+  }
+  return `the station answered ${response.status} ${response.statusText}`.trim();
+}
+
+/** @param {unknown} error @returns {string} */
+function failure(error) {
+  if (error instanceof DOMException && error.name === "TimeoutError") return `no answer within ${LIMIT_MS / 1000} s`;
+  return "the station cannot be reached";
+}
+
+/** @param {string} path @returns {Promise<any>} raises an Error with one line */
+export async function get(path) {
+  let response;
+  try {
+    response = await ask(path);
+  } catch (error) {
+    throw new Error(failure(error));
+  }
+  if (!response.ok) throw new Error(await reasonOf(response));
+  return response.json();
+}
+
+/** @param {string} path @returns {Promise<ArrayBuffer>} raises an Error with one line */
+export async function getBytes(path) {
+  const response = await ask(path);
+  if (!response.ok) throw new Error(await reasonOf(response));
+  return response.arrayBuffer();
+}
+
+/** @param {string} path @param {unknown} body @returns {Promise<import("./types.js").Answer>} */
+export async function post(path, body) {
+  try {
+    const response = await ask(path, body);
+    if (!response.ok) return { done: false, reason: await reasonOf(response) };
+    const answer = await response.json();
+    return { ...answer, done: answer.done !== false, reason: String(answer.reason ?? "") };
+  } catch (error) {
+    return { done: false, reason: failure(error) };
+  }
+}
+
+const payload = (/** @type {string} */ id) => `/api/payloads/${encodeURIComponent(id)}`;
+
+export const record = (/** @type {boolean} */ active) => post("/api/recording", { active });
+export const relocalize = (/** @type {string} */ id) => post(`${payload(id)}/relocalize`, {});
+export const chooseMap = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/map`, { name });
+export const command = (/** @type {string} */ id, /** @type {string} */ name, /** @type {Record<string, number>} */ values = {}) =>
+  post(`${payload(id)}/command`, { name, arguments: values });
+export const mapPath = (/** @type {string} */ name) => `/api/maps/${encodeURIComponent(name)}`;

@@ -1,0 +1,146 @@
+// @ts-check
+/** Puts the page together: messages go to the store, the store tells the loop, the loop draws. */
+import { Actions } from "./actions.js";
+import { Alarms } from "./alarms.js";
+import * as api from "./api.js";
+import { Board } from "./board.js";
+import { StationClock } from "./clock.js";
+import { Connection } from "./connection.js";
+import { MapDialog, PowerDialog } from "./dialogs.js";
+import { byId, setText } from "./dom.js";
+import { Events } from "./events.js";
+import { Flight } from "./flight.js";
+import { Keyboard } from "./keyboard.js";
+import { Loop } from "./loop.js";
+import { Maps } from "./maps.js";
+import { Plan } from "./plan.js";
+import { body } from "./protocol.js";
+import { Scene } from "./scene.js";
+import { Status } from "./status.js";
+import { Store } from "./store.js";
+import { Theme } from "./theme.js";
+import { Timing } from "./timing.js";
+import { Video } from "./video.js";
+
+const TICK_MS = 250;
+const SAMPLE_MS = 500;
+
+const loop = new Loop();
+const clock = new StationClock();
+const store = new Store(clock, (topic) => loop.mark(topic));
+const theme = new Theme(() => {
+  plan.recolour();
+  scene.setMap(plan.map, plan.bitmap);
+});
+
+/** @param {Record<string, any>} message */
+function send(message) {
+  return connection.send(message);
+}
+
+/** @param {string} id */
+function choose(id) {
+  if (!store.payloads.has(id) || id === store.selected) return;
+  store.select(id);
+  send({ type: "select", payload: id });
+}
+
+const plan = new Plan(store, loop, theme);
+const scene = new Scene(store, loop, theme);
+const video = new Video(store, loop, theme, send);
+const board = new Board(store, loop, theme);
+const timing = new Timing(store, loop, theme, video);
+const alarms = new Alarms(store, loop);
+const mapDialog = new MapDialog(store);
+const powerDialog = new PowerDialog(store);
+const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
+new Flight(store, loop);
+new Events(store, loop);
+new Status(store, loop, choose);
+
+mapDialog.chosen = (name) => actions.ofPayload("map", `Map ${name}`, (id) => api.chooseMap(id, name));
+powerDialog.confirmed = (id, command) =>
+  actions.run("power", `${command === "reboot" ? "Restart" : "Shut down"} ${id}`, () => api.command(id, command));
+
+const maps = new Maps((map, problem) => {
+  plan.setMap(map, problem);
+  scene.setMap(map, plan.bitmap);
+  const facts = map ? `${map.name} · ${map.landmarks.length / 3} landmarks` : "";
+  setText(byId("map-name"), facts);
+});
+loop.add(["estimate", "station", "selection"], () => maps.want(store.current?.estimate?.map || store.station.map || ""), 250);
+loop.add(["selection"], () => {
+  video.clear();
+  board.clear();
+  timing.clear();
+});
+
+/** @type {Record<string, (message: Record<string, any>) => void>} */
+const takes = {
+  hello: (message) => {
+    clock.hello(message.now_ns);
+    store.take(body(message, "state"));
+    if (!store.selected && message.payload) store.select(message.payload);
+    if (store.selected && store.selected !== message.payload) send({ type: "select", payload: store.selected });
+    video.ask();
+    maps.again();
+  },
+  state: (message) => store.take(body(message)),
+  estimate: (message) => store.takeEstimate(message.payload, body(message)),
+  event: (message) => store.takeEvents([body(message)]),
+  recording: (message) => store.takeRecording(body(message)),
+  gone: (message) => store.takeGone(message.payload),
+  selected: (message) => message.payload && store.select(message.payload),
+  pong: (message) => clock.pong(message.sent_ms, message.now_ns),
+  alarm: (message) => {
+    const others = store.alarms.filter((alarm) => alarm.id !== message.alarm?.id);
+    store.takeAlarms(message.active ? [...others, message.alarm] : others);
+  },
+};
+
+const connection = new Connection({
+  url: () => {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const query = store.selected ? `?payload=${encodeURIComponent(store.selected)}` : "";
+    return `${scheme}://${location.host}/api/live${query}`;
+  },
+  message: (message) => takes[message.type]?.(message),
+  video: (header, jpeg) => video.take(header, jpeg),
+  status: (status) => {
+    store.link = status;
+    if (status.phase === "refused") location.assign("/login");
+    loop.mark("connection");
+    loop.mark("payload");
+  },
+});
+byId("retry").addEventListener("click", () => connection.retryNow());
+
+new Keyboard(
+  [
+    { key: "r", does: "Start or stop recording on the ground station", act: () => actions.buttons.record.node.click() },
+    { key: "p", does: "Start or stop recording on the payload", act: () => actions.buttons["payload-record"].node.click() },
+    { key: "l", does: "Relocalize", act: () => actions.buttons.relocalize.node.click() },
+    { key: "m", does: "Choose a map", act: () => actions.buttons.map.node.click() },
+    { key: "i", does: "Refresh the picture (key frame)", act: () => actions.buttons.idr.node.click() },
+    { key: "a", does: "Acknowledge all alarms", act: () => alarms.acknowledgeAll() },
+    { key: "s", does: "Alarm sound on or off", act: () => alarms.turnSound() },
+    { key: "v", does: "Live video on or off", act: () => video.turn(!video.is_on) },
+    { key: "f", does: "Follow the blimp on the floor plan", act: () => plan.follow(!plan.is_following) },
+    { key: "+", does: "Zoom in on the floor plan", act: () => plan.zoomBy(1.4) },
+    { key: "-", does: "Zoom out", act: () => plan.zoomBy(1 / 1.4) },
+    { key: "0", does: "Show the whole map", act: () => plan.fit() },
+    { key: "↑ ↓ ← →", does: "Move a view that has the focus, in 3D: turn" },
+  ],
+  (digit) => choose([...store.payloads.keys()][digit - 1] ?? ""),
+);
+
+setInterval(() => {
+  loop.mark("tick");
+  if (!store.isLive(store.current)) loop.mark("stale");
+}, TICK_MS);
+setInterval(() => {
+  board.sample();
+  timing.sample();
+  loop.mark("sample");
+}, SAMPLE_MS);
+connection.open();

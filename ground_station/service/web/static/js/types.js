@@ -1,0 +1,120 @@
+// @ts-check
+/**
+ * What the station sends, as types for the other modules; nothing runs here.
+ *
+ * Times that end in `_ns` are the station's wall clock. They exceed 2^53, so they are exact to a
+ * quarter of a microsecond only, which is enough for a page.
+ *
+ * @typedef {object} Estimate a frame's pose, or why there is none
+ * @property {number} sequence
+ * @property {number} done_ns
+ * @property {string} state INITIALIZING, TRACKING, DEGRADED or LOST
+ * @property {number|null} [capture_ns]
+ * @property {string} [reason]
+ * @property {number[]|null} [position_m] wTc's translation
+ * @property {number[]|null} [quaternion_xyzw] wTc's rotation
+ * @property {number[]|null} [position_sigma_m] the covariance (3, 3) in world axes, m²
+ * @property {number[]|null} [velocity_mps]
+ * @property {number|null} [heading_deg] from the map's x axis towards y
+ * @property {number|null} [speed_mps]
+ * @property {number|null} [height_m]
+ * @property {boolean} [relocalized]
+ * @property {number} [inliers]
+ * @property {number} [expected]
+ * @property {number[]} [points_px] u, v by turns
+ * @property {Record<string, number>} [stage_ms]
+ * @property {string} [map]
+ * @property {number} [processed]
+ * @property {number} [localized]
+ * @property {number} [skipped]
+ *
+ * @typedef {object} PayloadNote a payload as the intake sees it
+ * @property {boolean} alive
+ * @property {number} seen_ns
+ * @property {boolean} [encrypted]
+ * @property {Record<string, number>} [frames]
+ * @property {number} [rate_hz]
+ * @property {number} [bitrate_kbps]
+ * @property {number} [lost_share]
+ * @property {{offset_ns: number, uncertainty_ns: number}|null} [clock]
+ * @property {number|null} [round_trip_s]
+ * @property {Record<string, any>|null} [battery]
+ * @property {Record<string, any>|null} [health]
+ * @property {Record<string, any>|null} [autopilot]
+ * @property {string} [recording]
+ *
+ * @typedef {object} Event
+ * @property {number} time_ns
+ * @property {string} source
+ * @property {string} level info, warning or alarm
+ * @property {string} name
+ * @property {string} text
+ * @property {string} [payload]
+ *
+ * @typedef {object} Alarm
+ * @property {string} id
+ * @property {string} level info, warning or alarm
+ * @property {string} payload "-" where it is the station's
+ * @property {string} text
+ * @property {number} since_ns
+ *
+ * @typedef {object} RecordingNote
+ * @property {boolean} active
+ * @property {string} [file]
+ * @property {number} [size_MB]
+ * @property {number} [duration_s]
+ * @property {number} [dropped]
+ * @property {number|null} [free_MB]
+ * @property {string} [problem]
+ *
+ * @typedef {object} Station
+ * @property {string} [name]
+ * @property {string} [version]
+ * @property {number} [uptime_s]
+ * @property {string} [map]
+ * @property {boolean} [demo]
+ *
+ * @typedef {object} PayloadEntry
+ * @property {PayloadNote|null} [payload]
+ * @property {Estimate|null} [estimate] without its points in a `state`
+ * @property {number[][]} [trail] oldest first, metres
+ * @property {number[]} [trail_breaks] where a new stretch begins
+ * @property {boolean} [alive]
+ * @property {Record<string, number|null>} [age_s] of payload, estimate, frame, battery, health, autopilot
+ * @property {string[]} [stale] those of `age_s` that are too old to be believed
+ * @property {number|null} [state_s] since when the estimate's state stands
+ *
+ * @typedef {object} Snapshot
+ * What `GET /api/state` gives, and parts of it what `state` does
+ * @property {Station} [station]
+ * @property {object[]} [processes]
+ * @property {Record<string, PayloadEntry>} [payloads]
+ * @property {RecordingNote|null} [recording]
+ * @property {Event[]} [events]
+ * @property {Alarm[]} [alarms]
+ *
+ * @typedef {object} VideoHeader
+ * @property {string} payload
+ * @property {number} sequence
+ * @property {number|null} capture_ns
+ * @property {number} width_px of the camera's picture, which `points_px` are of
+ * @property {number} height_px
+ *
+ * @typedef {object} MapSummary
+ * @property {string} name
+ * @property {boolean} registered
+ * @property {number} landmarks
+ * @property {number[]} [extent_m]
+ * @property {boolean} floorplan
+ *
+ * @typedef {object} MapDetails
+ * @property {string} name
+ * @property {{resolution_m: number, origin: number[], width_px: number, height_px: number, url: string}|null} [floorplan]
+ * @property {{min: number[], max: number[]}|null} [bounds] metres
+ *
+ * @typedef {object} Answer of a command
+ * @property {boolean} done
+ * @property {string} reason
+ * @property {Record<string, number>} [values]
+ */
+export {};
