@@ -14,6 +14,7 @@ from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.messages import LinkReport
 
 _SILENT_S = 5.0
+_IDR_GAP_S = 0.1  # an IDR is a few frames' size: no ground station gets more than ten a second
 _LOWEST_PORT, _HIGHEST_PORT = 1, 65_535
 
 
@@ -53,6 +54,7 @@ class Ground:
         self._lock = threading.Lock()
         self._followed = ""
         self._followed_s = 0.0
+        self._idr_s = float("-inf")
         self._seen: Seen | None = None
 
     @property
@@ -72,8 +74,15 @@ class Ground:
                 self._follow(report, now_s)
             if report.ssrc != self._ssrc:
                 return
+            if report.wants_idr:
+                wanted = now_s - self._idr_s >= _IDR_GAP_S
+                self._idr_s = now_s if wanted else self._idr_s
             trip_s = report.round_trip_s
             self._seen = Seen(report.ground, report.lost, trip_s, now_s)
+        if report.wants_idr:  # no report of its own: those come each second
+            if wanted:
+                self._capture.force_idr()
+            return
         self._capture.link_report(report.lost, 0.0 if trip_s is None else trip_s)
 
     def _follow(self, report: LinkReport, now_s: float) -> None:

@@ -11,6 +11,7 @@ import time
 from pi_firmware import encoder, link, orders
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
+from pi_firmware.battery.gauges import Gauge
 from pi_firmware.capture import Capture, Hopeless
 from pi_firmware.commands import Commands
 from pi_firmware.ground import Ground
@@ -54,19 +55,22 @@ class Payload:
         self._telemetry = Telemetry(
             settings.payload_id, settings.telemetry, tap=self._recorder.message
         )
+        try:
+            self._build(gauge)
+        except BaseException:  # threads of a session that stays open would keep the process
+            self._close_telemetry()
+            raise
+
+    def _build(self, gauge: Gauge) -> None:
+        settings = self.settings
         self._reporter = Reporter(settings, self.ssrc, self._telemetry)
         announce = self._reporter.announce
         self._supervision = Supervision(settings, announce)
         if self._supervision.begin():
             announce(messages.EVENT_FAILED, "no frames from several processes: rebooting the board")
-            self._close_telemetry()
             _run_last(settings.supervision.reboot_command)
             raise Hopeless("no frames from several processes in a row")
-        try:
-            self._capture = Capture(settings, self._reporter.gate, self._leave, announce)
-        except BaseException:
-            self._close_telemetry()
-            raise
+        self._capture = Capture(settings, self._reporter.gate, self._leave, announce)
         self._reporter.counters = self._capture.counters
         self._ground = Ground(
             settings.link,

@@ -195,11 +195,12 @@ class TelemetrySettings:
     discover: str = key("", "interface to find the ground station on, by scouting; empty: none")
 
     def __post_init__(self) -> None:
-        for endpoint in (*self.connect, *self.listen):
-            try:
-                check_endpoint(endpoint, certified=bool(self.certificates))
-            except TelemetryError as error:
-                raise ValueError(str(error)) from None
+        for name in ("connect", "listen"):
+            for endpoint in getattr(self, name):
+                try:
+                    check_endpoint(endpoint, certified=bool(self.certificates))
+                except TelemetryError as error:
+                    raise ValueError(f"'telemetry.{name}': {error}") from None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""What the ground station says back of the video: once a second, to each payload that lives."""
+"""What the ground station says back of the video: once a second, to each payload that lives.
+
+And at once when a loss keeps frames from being shown: the next IDR then comes after a round trip
+and not at the end of its interval.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ground_station.stream.counters import Counters
@@ -15,6 +19,8 @@ from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import keys, messages
 
 PERIOD_S = 1.0
+_LOOK_S = 0.02
+_IDR_GAP_S = 0.1
 WINDOW_S = 2.0
 
 
@@ -119,6 +125,7 @@ class Feedback:
         self._video_of = video_of
         self._period_s = period_s
         self._accounts: dict[str, StreamAccount] = {}
+        self._withheld: dict[str, tuple[int, float]] = {}
         self._publishers: dict[str, Any] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
@@ -138,13 +145,35 @@ class Feedback:
     def _run(self) -> None:
         import zenoh
 
-        while not self._closing.wait(self._period_s):
+        due_s = time.monotonic() + self._period_s
+        while not self._closing.wait(min(_LOOK_S, self._period_s)):
+            now_s = time.monotonic()
+            is_due = now_s >= due_s
+            if is_due:
+                due_s = max(due_s + self._period_s, now_s)
             for payload_id in self._listener.living():
                 video = self._video_of(payload_id)
-                if video is not None:
-                    # A link that just went takes no report; the next one may be back.
-                    with contextlib.suppress(zenoh.ZError):
+                if video is None:
+                    continue
+                wants_idr = self._wants_idr(payload_id, video, now_s)
+                # A link that just went takes no report; the next one may be back.
+                with contextlib.suppress(zenoh.ZError):
+                    if is_due:
                         self._publish(payload_id, self._report(payload_id, video))
+                    if wants_idr:
+                        wish = replace(self._report(payload_id, video), wants_idr=True)
+                        self._publish(payload_id, wish)
+
+    def _wants_idr(self, payload_id: str, video: Video, now_s: float) -> bool:
+        """Whether frames came since the last look that only an IDR lets be shown again."""
+        withheld = video.counters.withheld
+        before, asked_s = self._withheld.get(payload_id, (withheld, float("-inf")))
+        wanted = withheld > before and now_s - asked_s >= _IDR_GAP_S
+        if wanted or withheld < before:
+            self._withheld[payload_id] = (withheld, now_s if wanted else asked_s)
+        elif payload_id not in self._withheld:
+            self._withheld[payload_id] = (withheld, asked_s)
+        return wanted
 
     def _report(self, payload_id: str, video: Video) -> messages.LinkReport:
         state = self._listener.state(payload_id)

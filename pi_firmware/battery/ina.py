@@ -74,6 +74,7 @@ class Ina219(_Ina):
             raise _refused(self.counts, "ina219: the current is beyond the calibrated range")
         if abs(drop) >= round(_INA219_RANGES_V[self._gain] / 10e-6):
             raise _refused(self.counts, "ina219: the shunt's voltage is beyond the range")
+        _check_agreement(self.counts, current, drop * self._calibration / 4096)
         # The chip measures at IN-, behind the shunt; the cell is before it while discharging.
         voltage = ina219_bus_voltage(bus)
         if self._shunt.discharge_positive:
@@ -119,6 +120,7 @@ class Ina226(_Ina):
         _check_reset(self, self._configuration, self._calibration)
         if drop in (-0x8000, 0x7FFF):
             raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
+        _check_agreement(self.counts, current, drop * self._calibration / 2048)
         return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
 
     def _prepare(self) -> None:
@@ -172,6 +174,16 @@ def _check_reset(gauge: Ina219 | Ina226, configuration: int, calibration: int) -
         gauge._ready = False
         gauge.counts.resets += 1
         raise _refused(gauge.counts, "the gauge has lost its settings; it is set up again")
+
+
+def _check_agreement(counts: Counts, current: int, expected: float) -> None:
+    """Refuses a current that is not the shunt's voltage times the calibration.
+
+    The chip computes the one from the other, so one of both was misread; or the load changed
+    between the two reads, and the next reading is good.
+    """
+    if abs(current - expected) > max(0.1 * abs(expected), 64):
+        raise _refused(counts, "the current contradicts the shunt's voltage")
 
 
 def _refused(counts: Counts, reason: str) -> GaugeError:

@@ -198,9 +198,11 @@ class LinkReport(Message):
     """What a ground station sees of a payload's video, once a second; `time_ns` is its own clock.
 
     `packets` and `packets_lost` count since it first saw the stream, `lost` is the share of late.
+    One with `wants_idr` comes between these, at once when frames can't be shown for a loss.
     """
 
     SCHEMA: ClassVar[str] = "blimp.link"
+    MINOR: ClassVar[int] = 1
 
     ground: str  # its name
     video_port: int  # where it takes the video
@@ -209,6 +211,7 @@ class LinkReport(Message):
     packets_lost: int = 0
     lost: float = 0.0
     round_trip_s: float | None = None
+    wants_idr: bool = False
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ GAUGES = {
     "good": "i2c:ina219@fake:0x40",
     "absent": "i2c:ina219@fake:0x40?absent=1",
     "failing": "i2c:ina219@fake:0x40?fail_every=3",
+    "ina219-nonsense": "i2c:ina219@fake:0x40?nonsense_every=7&nonsense=65535",
+    "ina219-zeros": "i2c:ina219@fake:0x40?nonsense_every=9&nonsense=0",
+    "ina226-nonsense": "i2c:ina226@fake:0x40?nonsense_every=11&nonsense=65535",
     "max17048-nonsense": "i2c:max17048@fake:0x36?nonsense_every=5&nonsense=65535",
 }
 

@@ -35,6 +35,8 @@ MEANINGS: dict[str, list[Any]] = {
     "camera.width_px": [641],
     "camera.height_px": [481],
     "encoder.min_bitrate_kbps": [2001],
+    "telemetry.connect": [["tcp/192.0.2.1:7447"], ["udp/127.0.0.1:1"], ["tcp/127.0.0.1:99999"]],
+    "telemetry.listen": [["tcp/0.0.0.0:7447"], ["127.0.0.1"], ["tls/127.0.0.1:1"]],
     "battery.uri": ["", "i2c:", "i2c:bq27441@1:0x55", "i2c:ina219@1:0x36", "fake:?minutes=0"],
     "battery.critical_percentage": [0.25],
     "autopilot.uri": ["", "udp:1", "serial:", "serial:/dev/tty?baud=0"],

@@ -22,9 +22,13 @@ class Link:
 class Capture:
     def __init__(self) -> None:
         self.reports: list[tuple[float, float]] = []
+        self.idrs = 0
 
     def link_report(self, lost: float, round_trip_s: float) -> None:
         self.reports.append((lost, round_trip_s))
+
+    def force_idr(self) -> None:
+        self.idrs += 1
 
 
 class Telemetry:
@@ -100,3 +104,14 @@ def test_video_goes_to_the_first_ground_station_and_on_to_another_once_it_is_sil
     following.now_s += 2
     following.report("spare", video_port=5700)
     assert following.link.to[-1] == ("10.0.0.6", 5700)
+
+
+def test_a_ground_that_cannot_show_frames_gets_an_idr_but_not_a_flood_of_them() -> None:
+    following = Following("127.0.0.1")
+    for _ in range(100):
+        following.report(wants_idr=True, lost=0.5)
+        following.now_s += 0.01
+    assert following.capture.idrs == 10
+    assert following.capture.reports == []  # the bit rate follows the report of each second
+    following.report(ssrc=SSRC + 1, wants_idr=True)
+    assert following.capture.idrs == 10

@@ -202,3 +202,23 @@ def test_a_question_without_an_answer_took_at_least_so_long(
     follower.close()
     told = follower.round_trip_s("one")
     assert told is not None and told >= 0.05
+
+
+def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryListener) -> None:
+    ear = Ear(listener, "one")
+    video = Video(ssrc=5, counters=Counters(packets=10))
+    with Feedback(listener, lambda _: video, period_s=1000.0):
+        assert listener.wait("one", lambda state: state.alive, LIMIT_S)
+        time.sleep(0.2)
+        assert ear.reports == []
+        video.counters = Counters(packets=20, packets_lost=1, withheld=1)
+        asked = ear.wait(lambda report: report.wants_idr)
+        assert asked is not None and asked.ssrc == 5
+        time.sleep(0.3)
+        assert len(ear.reports) == 1  # nothing more was withheld since
+        for withheld in range(2, 60):
+            video.counters = Counters(packets=20 + withheld, packets_lost=1, withheld=withheld)
+            time.sleep(0.01)
+        time.sleep(0.2)
+        assert 3 <= len(ear.reports) <= 12  # ten a second at most
+    ear.close()
