@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from payload_process import PayloadProcess
 from witness import Witness
 
+from ground_station.stream.feedback import Feedback
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.telemetry import TelemetryListener
 
@@ -70,8 +71,11 @@ def memory_MB(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def fly(duration_s: float, loss: float, camera: str) -> Flown:
-    """The flight, with nothing kept of a frame but its number and its times."""
+def fly(duration_s: float, loss: float, camera: str, *, reports: bool) -> Flown:
+    """The flight, with nothing kept of a frame but its number and its times.
+
+    `reports`: the payload hears how its video arrives, as from a real ground station.
+    """
     witness = Witness()
     memory: list[tuple[float, float]] = []
     latency: list[tuple[float, float]] = []
@@ -90,6 +94,8 @@ def fly(duration_s: float, loss: float, camera: str) -> Flown:
                 f"telemetry.connect={json.dumps(listener.endpoints)}",
             )
         )
+        if reports:
+            stack.enter_context(Feedback(listener, lambda _: receiver))
         start_s = sampled_s = time.monotonic()
         lossy = False
         while (now_s := time.monotonic()) < start_s + duration_s and payload.running:
@@ -233,12 +239,13 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--loss", type=float, default=0.02, help="share of packets, 0 to 1")
     parser.add_argument("--camera", default="test:", help="camera.uri (default: test:)")
+    parser.add_argument("--silent", action="store_true", help="a ground that reports nothing")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the figures as JSON")
     arguments = parser.parse_args()
     if not (2 <= arguments.minutes <= 10_000 and 0 <= arguments.loss < 1):
         parser.error("--minutes: 2 to 10000; --loss: 0 to 1")
     duration_s = 60 * arguments.minutes
-    flown = fly(duration_s, arguments.loss, arguments.camera)
+    flown = fly(duration_s, arguments.loss, arguments.camera, reports=not arguments.silent)
     table = rows(flown, duration_s)
     print(f"\n{arguments.minutes:g} minutes at {RATE_HZ:g} Hz, {100 * arguments.loss:g} % loss")
     for row in table:
