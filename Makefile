@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo test check bench lock sample virtual-camera
+.PHONY: help setup demo serve test check bench soak lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -13,6 +13,9 @@ setup:  ## Install system packages (root or sudo for these only) and the locked 
 demo: setup  ## Map the sample atrium, stream the sample flight, localize it live: out/demo/report.html
 	@$(BLIMP) replay --demo --out out/demo
 
+serve: setup  ## Run the ground station with the sample flight: http://127.0.0.1:8080/
+	@$(BLIMP) serve --demo
+
 test: setup  ## Run the tests of every room
 	@.venv/bin/python -m pytest -q tests
 
@@ -21,9 +24,14 @@ check: setup  ## Lint, formatting and types
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
 
-bench: setup  ## Measure what each step of the localizer costs, beside the preset thesis
+bench: setup  ## Measure what each step of localizer and payload costs, in ratios of one run
 	@mkdir -p out
 	@$(BLIMP) bench localize --json out/bench.json
+	@$(BLIMP) bench payload --json out/bench-payload.json
+
+soak: setup  ## Fly the firmware 30 minutes over a lossy link: memory, clock, every frame's account
+	@mkdir -p out
+	@.venv/bin/python tests/faults/soak.py --minutes 30 --loss 0.02 --out out/soak.json
 
 sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed seeds (about 10 minutes)
 	@$(BLIMP) simulate --sample maps/atrium
