@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from localizing_stand import (
     LIMIT_S,
     NAME,
     PAYLOAD,
+    ROOT,
     SAMPLE,
     Intake,
     Station,
@@ -275,7 +277,7 @@ def test_frames_of_another_cameras_size_are_refused_and_it_lives(
     for k in range(12):  # more than may fail
         before = len(told.estimates)
         told.show(small, k, flight[0].time_ns + k)
-        until(lambda before=before: len(told.estimates) > before)
+        until(lambda count=before: len(told.estimates) > count)
         said = told.estimates[-1]
         assert said.state == "INITIALIZING" and said.position_m is None
         assert said.reason == f"frame {k} has 320x240 pixels, the camera 640x480"
@@ -318,6 +320,23 @@ def test_a_signal_ends_it(
     os.kill(process.pid, number)
     assert process.wait(LIMIT_S) == 0
     assert process.stderr is not None and process.stderr.read() == ""
+
+
+def test_what_does_not_end_by_itself_is_ended() -> None:
+    """As a search in a large map, which nobody waits for."""
+    code = (
+        "import time; from ground_station.service.localizing.__main__ import _ending; _ending();"
+        "print('ready', flush=True); time.sleep(3600)"
+    )
+    command = [sys.executable, "-c", code]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.terminate()
+    try:
+        assert process.wait(LIMIT_S) == 0
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_bad_input_is_one_line_and_status_2(tmp_path: Path) -> None:

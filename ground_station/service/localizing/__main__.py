@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from pathlib import Path
 
 from pi_firmware.wire.errors import BlimpError
@@ -44,7 +45,7 @@ def main(arguments: list[str]) -> int:
 
     from ground_station.service import processes, settings
     from ground_station.service.bus import Bus
-    from ground_station.service.localizing.process import Localizing
+    from ground_station.service.localizing.process import RESTART, Localizing
     from pi_firmware.wire.keys import check_payload_id
 
     cv2.setNumThreads(1)
@@ -57,6 +58,9 @@ def main(arguments: list[str]) -> int:
     except BlimpError as error:
         print(f"localizer {payload_id}: {error}", file=sys.stderr, flush=True)
         return _BAD_INPUT
+    except Exception:  # the supervisor starts a new one, and its log says why
+        traceback.print_exc()
+        return RESTART
 
 
 if __name__ == "__main__":
