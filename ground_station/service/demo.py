@@ -21,9 +21,9 @@ from ground_station.recording.frames import FrameRange
 from ground_station.recording.open import open_input
 from ground_station.service import flight_report
 from ground_station.service.replay import replay, settings_for
+from ground_station.service.serve import SAMPLE
 from pi_firmware.wire.recording import RecordingReader
 
-SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 QUEUE_FRAMES = 1024
 """More than the flight has: a machine that cannot keep up shows a longer latency, and every frame
 still counts."""

@@ -15,17 +15,17 @@ from pathlib import Path
 import tomli_w
 
 from ground_station.errors import InputError
-from ground_station.mapping import store
-from ground_station.recording.flight import camera_of
 from ground_station.service import notes, processes
 from ground_station.service.bus import Bus, Router
 from ground_station.service.notes import EventNote, PayloadNote, ProcessNote
 from ground_station.service.processes import Children
 from ground_station.service.settings import Run, StationSettings, write_run
+from pi_firmware.wire import config
 from pi_firmware.wire.recording import RecordingReader
 from pi_firmware.wire.systemd import Notifier
 
 DEMO_PAYLOAD = "demo"
+SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 _STEP_S = 0.1
 _GONE_S = 60.0
 _FEED_S = 2.0
@@ -40,11 +40,11 @@ def serve(settings: StationSettings, stop: threading.Event, *, demo: Path | None
     notifier = Notifier()
     with _run_folder() as folder:
         write_run(folder, Run(settings, demo=demo is not None, started_ns=time.time_ns()))
-        config = _demo_config(folder, settings, demo) if demo else None
+        payload = _demo_config(folder, settings, demo) if demo else None
         router = Router(folder)
         try:
             with Bus(folder, "station") as bus:
-                parent = _Parent(folder, settings, bus, config)
+                parent = _Parent(folder, settings, bus, payload)
                 try:
                     parent.run(stop, notifier)
                 finally:
@@ -129,22 +129,27 @@ def _run_folder() -> Iterator[Path]:
 
 
 def _check_map(folder: Path) -> None:
-    """Raises `MapError` or `InputError` for what no localizer could use."""
-    if not store.load(folder).info.registered:
+    """Raises a `BlimpError` for what no localizer could use.
+
+    The localizers read the map itself: this process stays small for as long as the service runs.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such map")
+    if config.read(folder / "map.toml").get("frame") != "world":
         raise InputError(f"{folder}: it is not registered to a floor plan; see blimp map register")
 
 
 def _demo_config(folder: Path, settings: StationSettings, recording: Path) -> Path:
     """The configuration of a payload that plays a recording to this station."""
-    camera = camera_of(RecordingReader(recording))
+    camera = RecordingReader(recording).calibration()
     if camera is None:
         raise InputError(f"{recording}: it carries no camera calibration")
     document = {
         "payload_id": DEMO_PAYLOAD,
         "camera": {
             "uri": f"replay:{recording.resolve()}?loop=1",
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
+            "width_px": camera.width,
+            "height_px": camera.height,
             "rate_hz": 30.0,
         },
         "link": {"port": settings.video.port},

@@ -34,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serves until a signal; raises a `BlimpError` with one line when it cannot start."""
     from ground_station.service import settings
-    from ground_station.service.demo import SAMPLE
-    from ground_station.service.serve import serve
+    from ground_station.service.serve import SAMPLE, serve
 
     loaded = settings.load(args.config, args.set)
     if args.map is not None:
