@@ -288,3 +288,4 @@ uninstall_service() {
 }
 
 "${action}_service"
+exit  # what a checkout changes in this file meanwhile is not read
