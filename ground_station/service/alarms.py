@@ -23,7 +23,7 @@ DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
 HOT_C, NO_MORE_HOT_C = 80.0, 76.0
 
 MAP_REFUSED, NO_MAP = "map-refused", "no map:"
-"""A localizer's event, and how its reason begins, where it cannot use a map: other features, say."""
+"""A localizer's event, and how its reason begins, where a map does not fit its features, say."""
 MAP_REFUSED_S = 20.0
 
 _RANK = {INFO: 0, WARNING: 1, ALARM: 2}
@@ -208,7 +208,7 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     for payload_id, view in _table(state, "payloads").items():
         # A localizer without a map says so with its frames.
         reason = str(_table(view, "estimate").get("reason") or "")
-        if reason.startswith(NO_MAP) and view.get("alive"):
+        if reason.startswith(NO_MAP) and isinstance(view, dict) and view.get("alive"):
             refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
     yield from refused.values()
 
@@ -217,8 +217,8 @@ def _below(value: float | None, limit: float, stands: bool) -> bool:
     return value is not None and value < limit * (DISK_OVER if stands else 1.0)
 
 
-def _table(of: Mapping[str, Any], name: str) -> dict[str, Any]:
-    value = of.get(name)
+def _table(of: Any, name: str) -> dict[str, Any]:
+    value = of.get(name) if isinstance(of, Mapping) else None
     return value if isinstance(value, dict) else {}
 
 

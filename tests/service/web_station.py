@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,6 +32,10 @@ from ground_station.service.settings import (
     Run,
     StationSettings,
 )
+
+with warnings.catch_warnings():  # of a client that starlette would rather have
+    warnings.simplefilter("ignore")
+    from starlette.testclient import TestClient as TestClient
 
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
 TOKEN = "a-token-of-more-than-20-characters"

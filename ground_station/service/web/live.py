@@ -197,6 +197,8 @@ class Live:
             asyncio.create_task(self._receive(socket, viewer)),
             asyncio.create_task(_watch(viewer, authorized)),
         ]
+        for task in tasks:
+            task.add_done_callback(lambda _: viewer.end(GONE, ""))
         try:
             code, reason = await viewer.ended
         finally:
@@ -205,7 +207,7 @@ class Live:
             self._metrics.pictures_lost.inc(viewer.outbox.pictures_lost)
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.wait(tasks)
         await _close(socket, code, reason)
 
     def close(self) -> None:

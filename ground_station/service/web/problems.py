@@ -16,6 +16,7 @@ from ground_station.service.web.models import Problem
 from pi_firmware.wire.errors import BlimpError
 
 _TEXT = {
+    400: "The body is no JSON.",
     401: "A token is needed, or the one given is wrong.",
     403: "The Host or Origin is another's.",
     404: "There is none of that name.",
@@ -41,7 +42,7 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"model": Problem, "description": _TEXT[status]} for status in statuses}
 
 
-EVERYWHERE = problems(401, 403, 422, 429)
+EVERYWHERE = problems(400, 401, 403, 422, 429)
 
 
 def install(app: FastAPI) -> None:

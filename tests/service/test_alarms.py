@@ -1,0 +1,255 @@
+"""Alarms: each comes with its cause, stays while the cause flickers, and goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import web_station as station
+
+from ground_station.service import alarms, notes
+from ground_station.service.web.snapshot import Snapshot
+
+S = 1_000_000_000
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.ns = 1000 * S
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+@pytest.fixture
+def told(tmp_path):
+    """A station that flies, its clock, and what its alarms are after some time."""
+    clock = Clock()
+    snapshot = Snapshot(station.run_of(tmp_path), "0", clock)
+    say: dict[str, Callable[[str, Any], None]] = {
+        notes.FRAME: snapshot.frame, notes.ESTIMATE: snapshot.estimate,
+        notes.PAYLOAD: snapshot.payload, notes.EVENT: snapshot.event,
+        notes.RECORDING: snapshot.recording, notes.PROCESS: snapshot.process,
+    }  # fmt: skip
+    station.say_all(lambda kind, name, note: say[kind](name, note))
+    return snapshot, clock
+
+
+def ids(snapshot: Snapshot) -> dict[str, str]:
+    """The alarms that are found now, with their levels."""
+    judged = alarms.judge(snapshot.document(), time.time_ns(), {})
+    return {name: item.alarm.level for name, item in judged.items()}
+
+
+P = station.PAYLOAD
+
+
+def test_a_station_that_flies_has_none(told):
+    assert ids(told[0]) == {}
+
+
+@pytest.mark.parametrize(
+    ("battery", "found"),
+    [
+        ({"alarm": "low", "voltage": 3.5}, {f"battery/{P}": "warning"}),
+        ({"alarm": "critical", "voltage": 3.3, "percentage": 0.04}, {f"battery/{P}": "alarm"}),
+        ({"alarm": ""}, {}),
+        ({"alarm": "of a newer payload"}, {}),
+        ({"alarm": "low", "voltage": None, "percentage": "x"}, {f"battery/{P}": "warning"}),
+    ],
+)
+def test_a_battery(told, battery, found):
+    told[0].payload(P, station.payload(battery={"time_ns": 1, **battery}))
+    assert ids(told[0]) == found
+
+
+def test_a_critical_battery_tells_its_figures(told):
+    battery = {"time_ns": 1, "alarm": "critical", "voltage": 3.3, "percentage": 0.04,
+               "time_left_s": 130.0}  # fmt: skip
+    told[0].payload(P, station.payload(battery=battery))
+    (item,) = alarms.judge(told[0].document(), 0, {}).values()
+    assert item.alarm.text == "battery critical: 3.30 V, 4 %, 2 min left"
+
+
+@pytest.mark.parametrize(("after_s", "found"), [(1.5, False), (2.5, True)])
+def test_lost_for_more_than_two_seconds(told, after_s, found):
+    snapshot, clock = told
+    snapshot.estimate(P, station.estimate(state="LOST", reason="nothing matched", position_m=None))
+    clock.ns += int(after_s * S)
+    for _ in range(2):  # told again, it is LOST since the first
+        snapshot.estimate(P, station.estimate(state="LOST", reason="nothing matched"))
+    snapshot.frame(P, station.frame())
+    snapshot.payload(P, station.payload())
+    assert (f"lost/{P}" in ids(snapshot)) == found
+
+
+@pytest.mark.parametrize(("after_s", "found"), [(1.5, False), (2.5, True)])
+def test_no_frames_from_a_living_payload(told, after_s, found):
+    snapshot, clock = told
+    clock.ns += int(after_s * S)
+    snapshot.payload(P, station.payload())
+    assert ids(snapshot) == ({f"no-frames/{P}": "alarm"} if found else {})
+
+
+def test_frames_without_poses(told):
+    snapshot, clock = told
+    clock.ns += 4 * S
+    snapshot.payload(P, station.payload())
+    snapshot.frame(P, station.frame())
+    assert ids(snapshot) == {f"no-poses/{P}": "alarm"}
+
+
+@pytest.mark.parametrize("how", ["not alive", "silent", "ended"])
+def test_a_payload_that_is_gone(told, how):
+    snapshot, clock = told
+    if how == "silent":
+        clock.ns += 6 * S
+        snapshot.process("-", station.process())
+    else:
+        if how == "ended":
+            snapshot.event(P, station.event(source="payload", name="stopped"))
+        snapshot.payload(P, station.payload(alive=False))
+    assert ids(snapshot) == {f"gone/{P}": "info" if how == "ended" else "alarm"}
+
+
+def test_a_payload_gone_for_long_is_no_alarm_any_more(told):
+    snapshot, clock = told
+    clock.ns += 11 * 60 * S
+    assert ids(snapshot) == {}
+
+
+def test_an_unknown_clock(told):
+    snapshot, clock = told
+    for after_s, found in ((0, {}), (11, {f"clock/{P}": "warning"})):
+        clock.ns += after_s * S
+        snapshot.payload(P, station.payload(clock=None))
+        snapshot.frame(P, station.frame())
+        snapshot.estimate(P, station.estimate())
+        snapshot.process("-", station.process())
+        assert ids(snapshot) == found
+    snapshot.payload(P, station.payload())
+    assert ids(snapshot) == {}
+
+
+@pytest.mark.parametrize(
+    ("recording", "found"),
+    [
+        ({"problem": "the disk is full"}, {"recording": "alarm"}),
+        ({"active": True, "free_MB": 900.0}, {"disk": "warning"}),
+        ({"active": False, "free_MB": 900.0}, {}),
+        ({"active": True, "free_MB": None}, {}),
+    ],
+)
+def test_the_recording(told, recording, found):
+    told[0].recording("-", station.recording(**recording))
+    assert ids(told[0]) == found
+
+
+def test_a_process_restarted_or_silent(told):
+    snapshot, clock = told
+    snapshot.process("-", station.process(pid=101))
+    assert ids(snapshot) == {"restarted/intake": "warning"}
+    clock.ns += 40 * S
+    snapshot.payload(P, station.payload(alive=False))
+    assert ids(snapshot)["silent/intake"] == "alarm"
+    assert "restarted/intake" not in ids(snapshot)
+
+
+def test_the_localizer_of_a_payload_that_is_gone_may_be_silent(told):
+    snapshot, clock = told
+    snapshot.process("-", station.process(f"localizer/{P}", 7))
+    clock.ns += 6 * S
+    snapshot.process("-", station.process())
+    assert set(ids(snapshot)) == {f"gone/{P}"}
+    snapshot.payload(P, station.payload())
+    snapshot.frame(P, station.frame())
+    assert f"silent/localizer/{P}" in ids(snapshot)
+
+
+def test_a_map_of_other_features(told):
+    snapshot, _ = told
+    refused = station.event(source="localizer", level="alarm", name="map-refused", text="other")
+    snapshot.event(P, refused)
+    assert ids(snapshot) == {f"map/{P}": "alarm"}
+    state, later_ns = snapshot.document(), time.time_ns() + 60 * S
+    assert alarms.judge(state, later_ns, {}) == {}
+    # It has none at all, and says so with its frames for as long as that is so.
+    snapshot.estimate(P, station.estimate(state="INITIALIZING", reason="no map: other features"))
+    assert alarms.judge(snapshot.document(), later_ns, {})[f"map/{P}"].alarm.level == "alarm"
+
+
+def test_what_flickers_stands_and_keeps_its_beginning(told):
+    snapshot, _ = told
+    good = snapshot.document()
+    snapshot.recording("-", station.recording(problem="slow disk"))
+    bad = snapshot.document()
+    now_ns, standing = 50 * S, {}
+    for k in range(40):  # there and gone by turns, four times a second
+        standing = alarms.judge(bad if k % 2 == 0 else good, now_ns + k * S // 4, standing)
+        assert standing["recording"].alarm.since_ns == now_ns
+    gone_ns = now_ns + 39 * S // 4
+    assert "recording" in alarms.judge(good, gone_ns + 2 * S, standing)
+    assert alarms.judge(good, gone_ns + 4 * S, standing) == {}
+
+
+def test_a_level_rises_at_once_and_falls_late(told):
+    snapshot, _ = told
+    state = {}
+    for alarm in ("low", "critical"):
+        snapshot.payload(P, station.payload(battery={"time_ns": 1, "alarm": alarm}))
+        state[alarm] = snapshot.document()
+    name = f"battery/{P}"
+    standing = alarms.judge(state["low"], 10 * S, {})
+    standing = alarms.judge(state["critical"], 11 * S, standing)
+    assert standing[name].alarm.level == "alarm"
+    standing = alarms.judge(state["low"], 12 * S, standing)
+    assert standing[name].alarm.level == "alarm"
+    standing = alarms.judge(state["low"], 15 * S, standing)
+    assert (standing[name].alarm.level, standing[name].alarm.since_ns) == ("warning", 10 * S)
+
+
+def test_a_limit_for_the_end_lies_apart_from_the_one_for_the_beginning(told):
+    snapshot, _ = told
+
+    def at(celsius: float, standing: dict) -> bool:
+        health = {"time_ns": 1, "temperature_C": celsius}
+        snapshot.payload(P, station.payload(health=health))
+        return f"hot/{P}" in alarms.judge(snapshot.document(), 100 * S, standing)
+
+    assert not at(79.0, {})
+    assert at(81.0, {})
+    hot = alarms.judge(snapshot.document(), 0, {})
+    assert at(77.0, hot)
+    assert not at(75.0, hot)
+
+
+def test_a_clock_set_back_makes_no_alarm_eternal(told):
+    snapshot, _ = told
+    good = snapshot.document()
+    snapshot.recording("-", station.recording(problem="slow disk"))
+    standing = alarms.judge(snapshot.document(), 5000 * S, {})
+    standing = alarms.judge(good, 100 * S, standing)
+    assert alarms.judge(good, 104 * S, standing) == {}
+
+
+def test_the_gravest_come_first(told):
+    snapshot, _ = told
+    snapshot.payload(P, station.payload(battery={"time_ns": 1, "alarm": "low"}))
+    snapshot.recording("-", station.recording(problem="slow disk"))
+    documents = alarms.documents(alarms.judge(snapshot.document(), 0, {}))
+    assert [item["level"] for item in documents] == ["alarm", "warning"]
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {},
+        {"payloads": None, "processes": None, "events": None, "recording": 5},
+        {"payloads": {"x": None}, "processes": [{}], "events": [{}]},
+        {"payloads": {"x": {"alive": True, "payload": 3, "age_s": [], "estimate": "no"}}},
+    ],
+)
+def test_a_state_of_another_shape_raises_nothing(state):
+    alarms.judge(state, 0, {})
