@@ -1,0 +1,66 @@
+"""`python -m ground_station.service.foxglove RUN_FOLDER`: the live channel for other programs."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from pi_firmware.wire.errors import BlimpError
+
+_BAD_INPUT = 2
+_END_S = 1.5
+
+
+def _ending() -> threading.Event:
+    """Is set by SIGTERM or SIGINT; an end that takes too long is not waited for."""
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        if not stop.is_set():
+            stop.set()
+            limit = threading.Timer(_END_S, os._exit, (0,))
+            limit.daemon = True
+            limit.start()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    return stop
+
+
+def main(arguments: list[str]) -> int:
+    """Serves until it is told to end; 0, or 2 for bad input."""
+    if len(arguments) != 1:
+        print("usage: python -m ground_station.service.foxglove RUN_FOLDER", file=sys.stderr)
+        return _BAD_INPUT
+    stop = _ending()
+    # The SDK tells each client that comes with another protocol, as any web page may: not news.
+    logging.getLogger("foxglove").setLevel(logging.ERROR)
+
+    from ground_station.service import processes, settings
+    from ground_station.service.bus import Bus
+    from ground_station.service.foxglove.process import Publishing
+
+    folder = Path(arguments[0])
+    try:
+        run = settings.load_run(folder)
+        with Bus(folder, processes.FOXGLOVE) as bus:
+            publishing = Publishing(bus, folder, run.station)
+            with contextlib.closing(publishing):
+                chosen = run.station.foxglove
+                print(f"foxglove: ws://{chosen.host}:{publishing.server.port}", flush=True)
+                publishing.run(stop)
+    except BlimpError as error:
+        print(f"foxglove: {error}", file=sys.stderr, flush=True)
+        return _BAD_INPUT
+    return 0
+
+
+if __name__ == "__main__":
+    status = main(sys.argv[1:])
+    sys.stdout.flush()
+    os._exit(status)  # not waiting for a map that is being read

@@ -1,0 +1,69 @@
+"""From the project's conventions to ROS's: axes, covariance order, stamps. Pure functions."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+
+Array = npt.NDArray[np.float64]
+
+MAP = "map"
+OPTICAL_IN_CAMERA = poses.pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""cTo: optical axes (x right, y down, z forward) in a body's (x forward, y left, z up), REP 103."""
+
+ELLIPSOID_SIGMAS = 2.7955
+"""An ellipsoid of so many standard deviations holds 95 % of a normal distribution in space: the
+square root of chi-square's quantile at 0.95 with three degrees of freedom, 7.8147."""
+_LEAST_M = 1e-3
+
+
+def camera_frame(payload_id: str) -> str:
+    """The camera's frame with a body's axes: x forward, y left, z up."""
+    return f"{payload_id}/camera"
+
+
+def optical_frame(payload_id: str) -> str:
+    """The camera's frame with the picture's axes: x right, y down, z forward."""
+    return f"{payload_id}/camera_optical"
+
+
+def body_pose(wTo: npt.ArrayLike) -> Array:
+    """The pose (4, 4) of a camera's body axes from that of its optical axes (4, 4)."""
+    return np.asarray(wTo) @ poses.inverse(OPTICAL_IN_CAMERA)
+
+
+def ros_covariance(wTc: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
+    """A covariance (6, 6) in the order and axes of `geometry_msgs/PoseWithCovariance`.
+
+    In: of the right tangent ξ = (ω, v) of wTc (4, 4), wTc·exp(ξ), rad and metres, camera axes. Out:
+    position x, y, z, then the rotation about the map's fixed x, y, z. With wTc = (R, p) it is
+    exp(Rω)·R for the rotation and p + R·v for the position, to first order in ω (Barfoot 2017,
+    section 7.1.5: adjoint, less the part that moves the map's origin): J·Σ·Jᵀ, J = [0 R; R 0].
+    A rotation about fixed axes is the same for any axes of the camera, optical or body's. These
+    are small rotations, not differences of roll, pitch and yaw, which differ away from the level.
+    """
+    R = np.asarray(wTc, dtype=np.float64)[:3, :3]
+    J = np.zeros((6, 6))
+    J[:3, 3:] = J[3:, :3] = R
+    turned = J @ np.asarray(covariance, dtype=np.float64).reshape(6, 6) @ J.T
+    return np.asarray((turned + turned.T) / 2)
+
+
+def ellipsoid(covariance: npt.ArrayLike) -> tuple[Array, Array]:
+    """The 95 % ellipsoid of a position's covariance (3, 3), m².
+
+    Returns its diameters (3,), metres, and the quaternion x, y, z, w (4,) of its axes.
+    """
+    variances, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    diameters = 2 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    turned = poses.to_quaternion(poses.pose(axes, [0, 0, 0]))
+    return np.maximum(diameters, _LEAST_M), turned
+
+
+def seconds(time_ns: int) -> tuple[int, int]:
+    """Seconds and nanoseconds."""
+    return divmod(time_ns, 1_000_000_000)

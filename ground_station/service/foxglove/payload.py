@@ -1,0 +1,172 @@
+"""The topics of one payload."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from foxglove import Context
+from foxglove.channels import (
+    CameraCalibrationChannel,
+    CompressedImageChannel,
+    ImageAnnotationsChannel,
+    PoseInFrameChannel,
+    SceneUpdateChannel,
+)
+
+from ground_station.geometry.camera import Camera
+from ground_station.service.foxglove import checks, documents, drawing
+from ground_station.service.foxglove.checks import Solved
+from ground_station.service.foxglove.topics import Make, Topic, json_topic
+from ground_station.service.localizing import frames
+from ground_station.service.notes import EstimateNote, FrameNote, PayloadNote
+from ground_station.service.pictures import PictureReader
+from ground_station.service.settings import HttpSettings
+from ground_station.service.web.trail import Trail
+
+_TRAIL_PERIOD_S = 1.0
+_EARLY = 0.25
+"""A frame may come this share of a period early: cameras and networks are not regular."""
+
+Message = tuple[dict[str, Any], int]
+
+
+class Payload:
+    """What is known of a payload, and its topics; `tf` is everyone's."""
+
+    def __init__(
+        self,
+        payload_id: str,
+        context: Context,
+        folder: Path,
+        tf: Topic,
+        camera: Callable[[], Camera | None],
+        http: HttpSettings,
+    ) -> None:
+        self._id, self._tf, self._camera = payload_id, tf, camera
+        self._period_s, self._quality = 1.0 / http.video_rate_hz, http.jpeg_quality
+        self._pictures = PictureReader(folder, payload_id)
+        self._size = (0, 0)
+        self._due_s = self._trail_s = 0.0
+        self._trail = Trail()
+        self._last: tuple[Solved, int] | None = None
+        self._state = ""
+        self._was_solved = self._alive = False
+        self._told: dict[str, Message] = {}
+        root = f"/{payload_id}"
+
+        def recall(name: str) -> Callable[[], Iterator[tuple[Make, int]]]:
+            return lambda: self._recall(name)
+
+        self._image = Topic(CompressedImageChannel(f"{root}/camera/image", context=context))
+        self._points = Topic(ImageAnnotationsChannel(f"{root}/camera/points", context=context))
+        self._calibration = Topic(
+            CameraCalibrationChannel(f"{root}/camera/calibration", context=context),
+            self._calibrated,
+        )
+        self._pose = Topic(PoseInFrameChannel(f"{root}/pose", context=context))
+        self._scene = Topic(SceneUpdateChannel(f"{root}/scene", context=context), self._drawn)
+        self._estimate = json_topic(f"{root}/estimate", documents.estimate_schema(), context)
+        self._messages = {
+            name: json_topic(f"{root}/{name}", schema, context, recall(name))
+            for name, schema in {
+                "battery": documents.battery_schema(),
+                "health": documents.health_schema(),
+                "status": documents.status_schema(),
+            }.items()
+        }
+        self.topics = (
+            self._image, self._points, self._calibration, self._pose, self._scene, self._estimate,
+            *self._messages.values(),
+        )  # fmt: skip
+
+    def wants(self, note: FrameNote) -> bool:
+        """Whether a frame is of use, from any thread: someone looks, or its size is another."""
+        return self._image.wanted or (note.width_px, note.height_px) != self._size
+
+    def frame(self, note: FrameNote) -> None:
+        """A received frame; its picture is encoded for those who look, as often as is allowed."""
+        size = (note.width_px, note.height_px)
+        if size != self._size:
+            self._size = size
+            for make, log_ns in self._calibrated():
+                self._calibration.say(make, log_ns)
+        now_s = time.monotonic()
+        if not self._image.wanted or now_s < self._due_s - _EARLY * self._period_s:
+            return
+        taken = frames.take(self._pictures, note)
+        if isinstance(taken, str):  # overwritten meanwhile: the next one comes
+            return
+        self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s
+        time_ns = checks.stamp_ns(note)
+        self._image.say(lambda: self._encoded(taken, time_ns), time_ns)
+
+    def estimate(self, note: EstimateNote) -> None:
+        """A frame's pose, or why there is none."""
+        time_ns, pose = checks.stamp_ns(note), checks.solved(note)
+        self._state, self._alive = str(note.state)[:32], True
+        if pose is not None:
+            begins = not self._was_solved or note.relocalized is True
+            self._trail.add(time_ns, pose.position_m, begins=begins)
+            self._last = (pose, time_ns)
+            self._pose.say(lambda: drawing.pose_in_map(pose, time_ns), time_ns)
+            self._tf.say(lambda: drawing.transforms(self._id, pose, time_ns), time_ns)
+        self._was_solved = pose is not None
+        self._estimate.say(lambda: documents.estimate(self._id, note, pose), time_ns)
+        self._points.say(lambda: drawing.tracked(checks.points(note), time_ns), time_ns)
+        if self._last is not None:
+            self._scene.say(lambda: self._marker(time_ns), time_ns)
+            now_s = time.monotonic()
+            if now_s - self._trail_s >= _TRAIL_PERIOD_S:
+                self._trail_s = now_s
+                self._scene.say(lambda: self._line(time_ns), time_ns)
+
+    def status(self, note: PayloadNote) -> None:
+        """What the intake says of it; its messages when they are new."""
+        now_ns = time.time_ns()
+        told = {"battery": note.battery, "health": note.health, "status": documents.status(note)}
+        for name, document in told.items():
+            if isinstance(document, dict) and document != self._told.get(name, ({}, 0))[0]:
+                self._told[name] = (document, now_ns)
+                for make, log_ns in self._recall(name):
+                    self._messages[name].say(make, log_ns)
+        if self._alive and note.alive is False:
+            self._scene.say(lambda: drawing.gone(now_ns), now_ns)
+            self._was_solved = False
+        self._alive = note.alive is True
+
+    def _recall(self, name: str) -> Iterator[tuple[Make, int]]:
+        if name in self._told:
+            document, log_ns = self._told[name]
+            yield lambda: document, log_ns
+
+    def _calibrated(self) -> Iterator[tuple[Make, int]]:
+        """Where the camera is known and of the size that the pictures have."""
+        camera = self._camera()
+        if camera is not None and (camera.width_px, camera.height_px) == self._size:
+            now_ns = time.time_ns()
+            yield lambda: drawing.calibration(self._id, camera, now_ns), now_ns
+
+    def _drawn(self) -> Iterator[tuple[Make, int]]:
+        if self._last is not None:
+            _, time_ns = self._last
+            yield lambda: self._line(time_ns), time_ns
+            if self._alive:
+                yield lambda: self._marker(time_ns), time_ns
+
+    def _marker(self, time_ns: int) -> Any:
+        assert self._last is not None
+        pose, _ = self._last
+        return drawing.scene(self._id, self._state, pose, time_ns, fresh=self._was_solved)
+
+    def _line(self, time_ns: int) -> Any:
+        return drawing.trail(*self._trail.document(), time_ns)
+
+    def _encoded(self, taken: frames.Taken, time_ns: int) -> Any:
+        import cv2
+
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self._quality]
+        _, jpeg = cv2.imencode(".jpg", taken.image, quality)
+        return drawing.picture(self._id, jpeg.tobytes(), time_ns)

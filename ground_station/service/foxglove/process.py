@@ -1,0 +1,255 @@
+"""The process's loop: what the bus says, to those who listen."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import foxglove
+from foxglove import Context
+from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, PointCloudChannel
+
+from ground_station.errors import GroundStationError
+from ground_station.geometry.camera import Camera, load_camera
+from ground_station.mapping import store
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.foxglove import checks, documents, drawing, world
+from ground_station.service.foxglove.inbox import Inbox
+from ground_station.service.foxglove.payload import Payload
+from ground_station.service.foxglove.topics import Make, Topic, json_topic
+from ground_station.service.foxglove.world import World
+from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.notes import (
+    EstimateNote,
+    EventNote,
+    FrameNote,
+    PayloadNote,
+    RecordingNote,
+)
+from ground_station.service.settings import FoxgloveSettings, StationSettings
+from pi_firmware.wire.errors import BlimpError, TelemetryError
+from pi_firmware.wire.keys import check_payload_id
+
+PAYLOADS, EVENTS = 32, 100
+_POLL_S = 0.2
+_BACKLOG = 256
+"""Messages that may wait for one client; beyond it the oldest are dropped."""
+
+
+class FoxgloveError(GroundStationError):
+    """A server that cannot start."""
+
+
+class _Named(Protocol):
+    id: int
+
+
+class Publishing:
+    """The server and its topics. Raises `FoxgloveError` where it cannot listen."""
+
+    def __init__(self, bus: Bus, folder: Path, settings: StationSettings) -> None:
+        self._bus, self._folder, self._settings = bus, folder, settings
+        self._inbox = Inbox()
+        self._complain = Seldom(_print)
+        self._context = Context()
+        self._payloads: dict[str, Payload] = {}
+        self._flown: dict[str, str] = {}  # the map that each payload flies in
+        self._events: deque[tuple[str, EventNote, int]] = deque(maxlen=EVENTS)
+        self._recording: tuple[RecordingNote, int] | None = None
+        self._reader = world.Reader(settings.map, self._take_world)
+
+        context = self._context
+        self._tf = Topic(FrameTransformsChannel("/tf", context=context))
+        self._plan = Topic(GridChannel("/map/floorplan", context=context))
+        self._landmarks = Topic(PointCloudChannel("/map/landmarks", context=context))
+        self._event = json_topic("/events", documents.event_schema(), context, self._happened)
+        self._log = Topic(LogChannel("/log", context=context), self._logged)
+        self._recorded = json_topic(
+            "/recording", documents.recording_schema(), context, self._recalled
+        )
+        topics = (self._tf, self._event, self._log, self._recorded)
+        self._topics = {topic.id: topic for topic in topics}
+        self._of_map = (self._plan.id, self._landmarks.id)
+
+        self.server = _listen(settings, context, self)
+        bus.hear(notes.FRAME, FrameNote, self._hear_frame)
+        bus.hear(notes.ESTIMATE, EstimateNote, self._later(self._take_estimate))
+        bus.hear(notes.PAYLOAD, PayloadNote, self._later(self._take_status))
+        bus.hear(notes.EVENT, EventNote, self._later(self._take_event))
+        bus.hear(notes.RECORDING, RecordingNote, self._later(self._take_recording))
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop` is set."""
+        while not stop.is_set():
+            self._bus.beat()
+            tasks, frames = self._inbox.take(_POLL_S)
+            for task in tasks:
+                self._do(task)
+            for payload_id, note in frames.items():
+                self._do(functools.partial(self._take_frame, payload_id, note))
+
+    def close(self) -> None:
+        """Ends the server."""
+        self.server.stop()
+
+    def _do(self, task: Callable[[], object]) -> None:
+        """A note that cannot be shown ends nothing."""
+        try:
+            task()
+        except Exception as error:
+            if self._complain("failed", f"not shown: {type(error).__name__}: {error}"):
+                traceback.print_exc(file=sys.stderr)
+
+    # Notes
+
+    def _later(self, take: Callable[[str, Any], None]) -> Callable[[str, Any], None]:
+        return lambda payload_id, note: self._inbox.put(functools.partial(take, payload_id, note))
+
+    def _hear_frame(self, payload_id: str, note: FrameNote) -> None:
+        known = self._payloads.get(payload_id)
+        if known is None or known.wants(note):
+            self._inbox.frame(payload_id, note)
+
+    def _take_frame(self, payload_id: str, note: FrameNote) -> None:
+        if payload := self._payload(payload_id):
+            payload.frame(note)
+
+    def _take_estimate(self, payload_id: str, note: EstimateNote) -> None:
+        if payload := self._payload(payload_id):
+            payload.estimate(note)
+            self._follow(payload_id, note.map)
+
+    def _take_status(self, payload_id: str, note: PayloadNote) -> None:
+        if payload := self._payload(payload_id):
+            payload.status(note)
+
+    def _take_event(self, payload_id: str, note: EventNote) -> None:
+        time_ns = note.time_ns if checks.is_time(note.time_ns) else time.time_ns()
+        self._events.append((payload_id, note, time_ns))
+        self._event.say(lambda: documents.event(payload_id, note), time_ns)
+        self._log.say(lambda: drawing.log(payload_id, note, time_ns), time_ns)
+
+    def _take_recording(self, _: str, note: RecordingNote) -> None:
+        self._recording = (note, time.time_ns())
+        for make, log_ns in self._recalled():
+            self._recorded.say(make, log_ns)
+
+    def _payload(self, payload_id: str) -> Payload | None:
+        known = self._payloads.get(payload_id)
+        if known is not None:
+            return known
+        try:
+            check_payload_id(payload_id)
+        except TelemetryError:
+            return None
+        if len(self._payloads) >= PAYLOADS:
+            self._complain("payloads", f"{payload_id}: more than {PAYLOADS} payloads")
+            return None
+        made = self._payloads[payload_id] = Payload(
+            payload_id, self._context, self._folder, self._tf, self._camera, self._settings.http
+        )
+        self._topics |= {topic.id: topic for topic in made.topics}
+        return made
+
+    @functools.cached_property
+    def _calibrated(self) -> Camera | None:
+        try:
+            chosen = self._settings.map
+            if chosen.camera:
+                return load_camera(chosen.camera)
+            return store.load_info(chosen.folder).camera
+        except BlimpError as error:
+            self._complain("camera", f"no calibration: {error}")
+            return None
+
+    def _camera(self) -> Camera | None:
+        return self._calibrated
+
+    # What a new subscriber is told
+
+    def on_subscribe(self, client: _Named, channel: _Named) -> None:
+        """On a thread of the server. A client's id is the number of its sink, too."""
+        self._inbox.put(functools.partial(self._greet, client.id, channel.id))
+
+    def on_unsubscribe(self, client: _Named, channel: _Named) -> None:
+        """Nothing to do: `Topic.wanted` asks the server."""
+
+    def _greet(self, client: int, channel: int) -> None:
+        if channel in self._of_map:
+            self._reader.ask(self._shown, (client, channel))
+        elif topic := self._topics.get(channel):
+            topic.greet(client)
+
+    def _happened(self) -> Iterator[tuple[Make, int]]:
+        for payload_id, note, time_ns in self._events:
+            yield functools.partial(documents.event, payload_id, note), time_ns
+
+    def _logged(self) -> Iterator[tuple[Make, int]]:
+        for payload_id, note, time_ns in self._events:
+            yield functools.partial(drawing.log, payload_id, note, time_ns), time_ns
+
+    def _recalled(self) -> Iterator[tuple[Make, int]]:
+        if self._recording is not None:
+            note, log_ns = self._recording
+            yield functools.partial(notes.as_document, note), log_ns
+
+    # The map
+
+    @property
+    def _shown(self) -> str:
+        """The first payload's map, in the order of their names; the configured one without any."""
+        if self._flown:
+            return self._flown[min(self._flown)]
+        return Path(self._settings.map.folder).resolve().name
+
+    def _follow(self, payload_id: str, name: str) -> None:
+        """Shows another map where the first payload flies in another."""
+        if not isinstance(name, str) or not name or self._flown.get(payload_id) == name:
+            return
+        before = self._shown
+        self._flown[payload_id] = name
+        if self._shown != before and (self._plan.wanted or self._landmarks.wanted):
+            self._reader.ask(self._shown, (None, None))
+
+    def _take_world(self, read: World, whom: Any) -> None:
+        self._inbox.put(functools.partial(self._show, read, *whom))
+
+    def _show(self, read: World, client: int | None, channel: int | None) -> None:
+        now_ns = time.time_ns()
+        if read.problem:
+            self._complain("map", f"no map to show: {read.problem}")
+            return
+        plan = read.plan
+        if plan is not None and channel in (None, self._plan.id):
+            self._plan.say(lambda: world.grid(plan, now_ns), now_ns, client)
+        if channel in (None, self._landmarks.id):
+            self._landmarks.say(lambda: world.cloud(read.landmarks, now_ns), now_ns, client)
+
+
+def _listen(settings: StationSettings, context: Context, listener: Publishing) -> Any:
+    chosen: FoxgloveSettings = settings.foxglove
+    try:
+        return foxglove.start_server(
+            name=f"blimp {settings.name}",
+            host=chosen.host,
+            port=chosen.port,
+            context=context,
+            server_listener=listener,  # type: ignore[arg-type]
+            message_backlog_size=_BACKLOG,
+        )
+    except Exception as error:
+        reason = str(error).removeprefix("FoxgloveError: ").splitlines()[0][:160]
+        where = f"foxglove.host {chosen.host}, foxglove.port {chosen.port}"
+        raise FoxgloveError(f"{where}: {reason}") from None
+
+
+def _print(_: str, text: str) -> None:
+    print(f"foxglove: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,197 @@
+"""What stands around the Foxglove process in its tests: a station's voice, and a client."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pool, message_factory
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from ground_station.service import notes, settings
+from ground_station.service.bus import Bus, Router
+from ground_station.service.notes import EstimateNote, FrameNote, ProcessNote
+from ground_station.service.pictures import PictureWriter
+from ground_station.service.settings import Run
+from pi_firmware.wire.config import from_mapping
+
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "maps" / "atrium"
+PAYLOAD = "blimp-1"
+LIMIT_S = 60.0
+CAPTURE_NS = 1_790_000_000_123_456_789
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s, f"{what} did not come"
+        time.sleep(0.02)
+
+
+def estimate(sequence: int = 7, **fields: Any) -> EstimateNote:
+    """A solved frame's."""
+    values: dict[str, Any] = {
+        "sequence": sequence,
+        "time_ns": 5,
+        "clock_ns": 6,
+        "done_ns": CAPTURE_NS + 50_000_000,
+        "capture_ns": CAPTURE_NS,
+        "state": "TRACKING",
+        "position_m": [3.0, 4.0, 2.5],
+        # It looks along the map's x axis: right is -y, down is -z.
+        "quaternion_xyzw": [-0.5, 0.5, -0.5, 0.5],
+        "covariance": np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4]).ravel().tolist(),
+        "points_px": [10.0, 20.0, 30.5, 40.5],
+        "inliers": 40,
+        "map": "atrium",
+    }
+    return EstimateNote(**(values | fields))
+
+
+class Station:
+    """The bus with what the process says on it, and the voices of intake and localizer."""
+
+    def __init__(self, folder: Path, **foxglove: Any) -> None:
+        self.folder = folder
+        station = {
+            "map": {"folder": str(SAMPLE), "shelf": str(SAMPLE.parent)},
+            "foxglove": {"port": 0, **foxglove},
+        }
+        settings.write_run(folder, from_mapping({"station": station}, Run, where="test"))
+        self.pictures = PictureWriter(folder, PAYLOAD)
+        self.open()
+
+    def open(self) -> None:
+        self.beats: list[ProcessNote] = []
+        self.router = Router(self.folder)
+        self.bus = Bus(self.folder, "station")
+        self.bus.hear(notes.PROCESS, ProcessNote, lambda _, note: self.beats.append(note))
+
+    def close(self) -> None:
+        self.bus.close()
+        self.router.close()
+
+    def say(self, note: EstimateNote, payload_id: str = PAYLOAD) -> None:
+        self.bus.say(notes.ESTIMATE, payload_id, note)
+
+    def show(self, image: Any, sequence: int, **fields: Any) -> None:
+        slot, stamp = self.pictures.write(image)
+        values: dict[str, Any] = {
+            "slot": slot,
+            "stamp": stamp,
+            "sequence": sequence,
+            "time_ns": 5,
+            "clock_ns": 6,
+            "capture_ns": CAPTURE_NS,
+            "arrival_ns": CAPTURE_NS + 9_000_000,
+            "width_px": image.shape[1],
+            "height_px": image.shape[0],
+            "ssrc": 1,
+        }
+        self.bus.say(notes.FRAME, PAYLOAD, FrameNote(**(values | fields)))
+
+
+@contextmanager
+def server(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """The process, as the service starts it, and its port."""
+    command = [sys.executable, "-m", "ground_station.service.foxglove", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("foxglove: ws://"), line
+        yield process, int(line.rpartition(":")[2])
+    finally:
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+class Client:
+    """A client that knows nothing but the protocol: it decodes by the schemas it is told."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = connect(
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[Subprotocol("foxglove.sdk.v1")],
+            max_size=None,
+        )
+        self.info: dict[str, Any] = {}
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.received: dict[str, list[tuple[int, Any]]] = {}
+        self._topics: dict[int, str] = {}
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+    def subscribe(self, *topics: str) -> None:
+        """Waits until they are told of, and subscribes."""
+        self.until(lambda: all(topic in self.channels for topic in topics), f"{topics}")
+        asked = []
+        for topic in topics:
+            number = self.channels[topic]["id"]
+            self._topics[number] = topic
+            self.received[topic] = []
+            asked.append({"id": number, "channelId": number})
+        self.socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+
+    def until(
+        self, condition: Callable[[], bool], what: str, again: Callable[[], object] | None = None
+    ) -> None:
+        """Receives until something holds; does something `again` meanwhile."""
+        deadline_s = time.monotonic() + LIMIT_S
+        while not condition():
+            assert time.monotonic() < deadline_s, f"{what} did not come"
+            if again is not None:
+                again()
+            self.receive(0.1)
+
+    def first(self, topic: str, again: Callable[[], object] | None = None) -> tuple[int, Any]:
+        """The first message on a topic: its log time, ns, and what it says."""
+        self.until(lambda: bool(self.received[topic]), topic, again)
+        return self.received[topic][0]
+
+    def receive(self, timeout_s: float) -> None:
+        """Takes one message, if one comes."""
+        try:
+            data = self.socket.recv(timeout=timeout_s)
+        except TimeoutError:
+            return
+        if isinstance(data, bytes):
+            kind, number, log_ns = struct.unpack_from("<BIQ", data)
+            assert kind == 1
+            topic = self._topics[number]
+            self.received[topic].append((log_ns, self._decode(topic, data[13:])))
+            return
+        said = json.loads(data)
+        if said["op"] == "serverInfo":
+            self.info = said
+        elif said["op"] == "advertise":
+            self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+
+    def _decode(self, topic: str, data: bytes) -> Any:
+        channel = self.channels[topic]
+        if channel["encoding"] == "json":
+            return json.loads(data)
+        pool = descriptor_pool.DescriptorPool()
+        for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+            pool.Add(file)
+        found = pool.FindMessageTypeByName(channel["schemaName"])
+        return message_factory.GetMessageClass(found).FromString(data)
