@@ -16,7 +16,7 @@ from ground_station.service.notes import ALARM, INFO, STATION, WARNING
 from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
 
 HOLD_S = 3.0
-LOST_S, NO_FRAMES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 10.0
+LOST_S, NO_FRAMES_S, NO_POSES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 4.0, 10.0
 SILENT_S, RESTARTED_S = 5.0, 30.0
 GONE_FOR_S = 600.0
 DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
@@ -107,19 +107,21 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
 
 
 def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    frame_s = _number(_table(view, "age_s").get("frame"))
+    alive_s = _number(view.get("alive_s")) or 0.0
+    age_s = _table(view, "age_s")
+    frame_s, estimate_s = _number(age_s.get("frame")), _number(age_s.get("estimate"))
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
-    if not frames_come:
-        since = "" if frame_s is None else f" for {frame_s:.0f} s"
-        yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, f"no frames{since}")
-    estimate, state_s = _table(view, "estimate"), _number(view.get("state_s"))
-    if estimate.get("state") == "LOST" and state_s is not None and state_s > LOST_S:
+    if not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
+        since_s = alive_s if frame_s is None else min(frame_s, alive_s)
+        yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, f"no frames for {since_s:.0f} s")
+    estimates_come = estimate_s is not None and estimate_s <= NO_FRAMES_S
+    estimate, state_s = _table(view, "estimate"), _number(view.get("state_s")) or 0.0
+    if estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:
         reason = str(estimate.get("reason") or "")
         text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
         yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
-    age_s = _number(_table(view, "age_s").get("estimate"))
-    if frames_come and age_s is not None and age_s > NO_FRAMES_S:
-        text = f"frames come but none was localized for {age_s:.0f} s"
+    if frames_come and estimate_s is not None and min(estimate_s, alive_s) > NO_POSES_S:
+        text = f"frames come, but none was localized for {estimate_s:.0f} s"
         yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)
     unknown_s = _number(view.get("clock_unknown_s"))
     if unknown_s is not None and unknown_s > CLOCK_UNKNOWN_S:

@@ -93,11 +93,24 @@ def test_no_frames_from_a_living_payload(told, after_s, found):
     assert ids(snapshot) == ({f"no-frames/{P}": "alarm"} if found else {})
 
 
+def test_a_payload_that_came_just_now_gets_a_moment_for_its_first_frame(told):
+    snapshot, clock = told
+    for name in ("new", P):  # P comes back after a while
+        clock.ns += 60 * S
+        snapshot.process("-", station.process())
+        snapshot.payload(name, station.payload())
+        assert not any(name in found for found in ids(snapshot))
+        clock.ns += 5 * S // 2
+        snapshot.payload(name, station.payload())
+        assert f"no-frames/{name}" in ids(snapshot)
+
+
 def test_frames_without_poses(told):
     snapshot, clock = told
-    clock.ns += 4 * S
-    snapshot.payload(P, station.payload())
-    snapshot.frame(P, station.frame())
+    for _ in range(5):
+        clock.ns += S
+        snapshot.payload(P, station.payload())
+        snapshot.frame(P, station.frame())
     assert ids(snapshot) == {f"no-poses/{P}": "alarm"}
 
 

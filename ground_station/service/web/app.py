@@ -61,6 +61,11 @@ class Web:
     metrics: Metrics
     access: Access
     video: Video
+    loops: list[asyncio.AbstractEventLoop]
+
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The loop that it is served on."""
+        return self.loops[0]
 
 
 def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path = STATIC) -> Web:
@@ -125,7 +130,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     app.include_router(pages.docs_router(app))
     _serve_dashboard(app, static)
     guarded = Guard(app, access, metrics.answers)
-    return Web(app, guarded, viewers, snapshot, metrics, access, video)
+    return Web(app, guarded, viewers, snapshot, metrics, access, video, loops)
 
 
 def _active_file(snapshot: Snapshot) -> str:

@@ -308,6 +308,9 @@ async def _close(socket: WebSocket, code: int, reason: str) -> None:
         async with asyncio.timeout(_CLOSE_S):
             if code != GONE:
                 await socket.close(code, reason)
+        if code == NOT_OBEYED and (abort := socket.scope.get("abort")):
+            # It may go on sending; a moment for it to read why.
+            asyncio.get_running_loop().call_later(_CLOSE_S, abort)
     except TimeoutError:
         hard = True
     except (RuntimeError, OSError):

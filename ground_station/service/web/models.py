@@ -100,6 +100,7 @@ class PayloadModel(BaseModel):
     payload: PayloadNote | None
     estimate: EstimateNote | None
     alive: bool
+    alive_s: float | None
     ended: bool
     age_s: dict[str, float | None]
     stale: list[str]

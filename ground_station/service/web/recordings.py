@@ -18,7 +18,6 @@ from starlette.exceptions import HTTPException
 
 from ground_station.service.web.models import FILE_PATTERN, FileName, RecordingModel
 from ground_station.service.web.problems import Busy, NotFound, problems
-from pi_firmware.wire.errors import BlimpError
 
 _FILES = 500
 _PIECE_BYTES = 256 * 1024
@@ -33,7 +32,7 @@ class Recordings:
         self._folder, self._active = folder, active
         self._durations: OrderedDict[str, tuple[tuple[int, int], float | None]] = OrderedDict()
         self._lock = threading.Lock()
-        self.exporting = threading.BoundedSemaphore(1)
+        self._exporting = threading.BoundedSemaphore(1)
 
     def list(self) -> list[dict[str, Any]]:
         """The newest recordings, newest first."""
@@ -71,29 +70,23 @@ class Recordings:
                 os.close(descriptor)
         raise NotFound(f"there is no recording {name[:128]!r}")
 
-    def trajectory(self, name: str) -> Iterator[str]:
-        """Poses of a recording as TUM lines; raises a `BlimpError` before the first of them."""
+    def trajectory(self, name: str) -> str:
+        """Poses of a recording as TUM text; raises a `BlimpError` with one line.
+
+        One at a time, and whole before it is sent: who takes it slowly holds up nobody.
+        """
         from ground_station.service.export import tum_lines
 
         descriptor, _ = self.open(name)
         os.close(descriptor)
-        if not self.exporting.acquire(blocking=False):
+        if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
-            lines = iter(tum_lines(self._folder / name))
-            first = next(lines, "")
-        except BaseException:
-            self.exporting.release()
-            raise
-        return self._rest(first, lines)
-
-    def _rest(self, first: str, lines: Iterator[str]) -> Iterator[str]:
-        try:
-            yield _line(first)
-            for line in lines:
-                yield _line(line)
+            return "".join(tum_lines(self._folder / name))
+        except OSError as error:
+            raise NotFound(f"{name}: {error.strerror or error}") from None
         finally:
-            self.exporting.release()
+            self._exporting.release()
 
     def _duration_s(self, name: str, status: os.stat_result) -> float | None:
         """From the file's own summary; None where it has none, as after a cut."""
@@ -108,10 +101,6 @@ class Recordings:
             while len(self._durations) > 2 * _FILES:
                 self._durations.popitem(last=False)
         return duration_s
-
-
-def _line(text: str) -> str:
-    return text if not text or text.endswith("\n") else text + "\n"
 
 
 def _summed_up_s(path: Path) -> float | None:
@@ -210,12 +199,6 @@ def router(recordings: Recordings) -> APIRouter:
     )
     def trajectory(file: FileName) -> Response:
         """The estimated poses, as TUM text: timestamp tx ty tz qx qy qz qw."""
-        try:
-            lines = recordings.trajectory(file)
-        except BlimpError:
-            raise
-        except OSError as error:
-            raise NotFound(f"{file}: {error.strerror or error}") from None
-        return StreamingResponse(lines, media_type="text/plain")
+        return Response(recordings.trajectory(file), media_type="text/plain")
 
     return result

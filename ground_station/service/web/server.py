@@ -25,7 +25,9 @@ class ListenError(GroundStationError):
 
 
 class _Http(H11Protocol):
-    """Closes a connection whose first request does not come, and one too many."""
+    """Closes a connection whose next request does not come whole in time, and one too many."""
+
+    _answered: Any = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -35,9 +37,13 @@ class _Http(H11Protocol):
         self.loop.call_later(_REQUEST_S, self._check)
 
     def _check(self) -> None:
-        upgraded = self.transport.get_protocol() is not self
-        if self.cycle is None and not upgraded:
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:
+            return
+        if self.cycle is self._answered:  # none since the last look
             self.transport.abort()
+            return
+        self._answered = self.cycle if self.cycle.response_complete else None
+        self.loop.call_later(_REQUEST_S, self._check)
 
 
 class _WebSocket(WebSocketsSansIOProtocol):

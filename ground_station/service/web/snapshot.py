@@ -61,6 +61,7 @@ class _Payload:
     state_ns: int = 0
     clock_ns: int | None = None  # since when the payload's clock is not known
     ended: bool = False
+    alive_ns: int | None = None  # since when it is heard
     trail: Trail = field(default_factory=Trail)
 
 
@@ -148,8 +149,10 @@ class Snapshot:
             if item is None:
                 return
             now_ns = self._clock_ns()
-            if note.alive and (item.payload is None or not item.payload.alive):
-                item.ended = False
+            if not note.alive:
+                item.alive_ns = None
+            elif not self._alive(item, now_ns):
+                item.alive_ns, item.ended = now_ns, False
             if note.clock is not None:
                 item.clock_ns = None
             elif item.clock_ns is None:
@@ -267,6 +270,7 @@ class Snapshot:
             "payload": None if item.payload is None else notes.as_document(item.payload),
             "estimate": None if estimate is None else notes.as_document(estimate),
             "alive": self._alive(item, now_ns),
+            "alive_s": _age_s(now_ns, item.alive_ns) if self._alive(item, now_ns) else None,
             "ended": item.ended,
             "age_s": age_s,
             "stale": [name for name, age in age_s.items() if age and age > STALE_S[name]],

@@ -1,0 +1,110 @@
+"""The process itself, on a real bus: starts, beats, serves, refuses in one line, and ends."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import httpx
+import pytest
+import web_station as station
+
+from ground_station.service import notes
+from ground_station.service.bus import Bus, Router
+from ground_station.service.notes import EventNote, ProcessNote
+from ground_station.service.settings import write_run
+
+P = station.PAYLOAD
+
+
+@pytest.fixture
+def folder(tmp_path):
+    router = Router(tmp_path)
+    yield tmp_path
+    router.close()
+
+
+def refused(folder) -> str:
+    """What it says when it cannot start: one line, exit status 2."""
+    ended = subprocess.run(
+        [sys.executable, "-m", "ground_station.service.web", str(folder)],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("web: ") and ended.stderr.count("\n") == 1
+    return ended.stderr
+
+
+def test_it_serves_what_the_bus_says_beats_and_ends(folder):
+    write_run(folder, station.run_of(folder))
+    with Bus(folder, "test") as bus, station.web_process(folder) as (process, port):
+        beats: list[ProcessNote] = []
+        bus.hear(notes.PROCESS, ProcessNote, lambda _, note: beats.append(note))
+        events: list[EventNote] = []
+        bus.hear(notes.EVENT, EventNote, lambda _, note: events.append(note))
+        bus.serve("intake", lambda request: {"values": {"asked": len(request)}})
+
+        def flies():
+            station.say_all(bus.say)
+            state = httpx.get(f"http://127.0.0.1:{port}/api/state").json()
+            return state["payloads"].get(P, {}).get("estimate")
+
+        assert station.until(flies)["state"] == "TRACKING"
+        station.until(lambda: any(note.name == "web" for note in beats))
+        assert next(note.pid for note in beats if note.name == "web") == process.pid
+        answer = httpx.post(f"http://127.0.0.1:{port}/api/recording", json={"active": True})
+        assert answer.json() == {"done": True, "reason": "", "values": {"asked": 1}}
+        bus.say(notes.RECORDING, notes.STATION, station.recording(problem="the disk is full"))
+        station.until(lambda: any(note.name == "alarm-begins" for note in events))
+        begin_s = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20.0) == 0
+        # Asked for are 3 s; a shared machine gets more.
+        assert time.monotonic() - begin_s < 10.0
+        assert process.stderr is not None and process.stderr.read() == ""
+
+
+def test_nobody_answers_is_said_in_time(folder):
+    write_run(folder, station.run_of(folder))
+    with station.web_process(folder) as (_, port):
+        answer = httpx.post(
+            f"http://127.0.0.1:{port}/api/recording", json={"active": True}, timeout=30.0
+        ).json()
+        assert not answer["done"] and "intake" in answer["reason"]
+
+
+def test_a_port_in_use_is_one_line(folder):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        write_run(folder, station.run_of(folder, port=port))
+        assert re.search(rf"127\.0\.0\.1:{port}: .*in use", refused(folder))
+
+
+def test_beyond_loopback_without_a_token_it_does_not_start(folder):
+    write_run(folder, station.run_of(folder, host="0.0.0.0"))
+    assert "http.token_file" in refused(folder)
+    token = station.write_token(folder, mode=0o644)
+    write_run(folder, station.run_of(folder, host="0.0.0.0", token_file=str(token)))
+    assert "0644" in refused(folder)
+
+
+def test_a_folder_that_is_no_run_or_has_no_bus(tmp_path):
+    assert "station.json" in refused(tmp_path)
+
+
+def test_beyond_loopback_with_a_token_it_asks_for_it(folder):
+    token = station.write_token(folder)
+    write_run(folder, station.run_of(folder, host="0.0.0.0", token_file=str(token)))
+    with station.web_process(folder) as (_, port):
+        here = f"http://127.0.0.1:{port}"
+        assert httpx.get(f"{here}/api/state").status_code == 401
+        bearer = {"authorization": f"Bearer {station.TOKEN}"}
+        assert httpx.get(f"{here}/api/state", headers=bearer).status_code == 200
+        with httpx.Client(base_url=here, headers={"origin": here}) as browser:
+            answer = browser.post("/login", data={"token": station.TOKEN})
+            assert answer.status_code == 303
+            assert browser.get("/api/state").status_code == 200
