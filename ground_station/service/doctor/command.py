@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ground_station.service.doctor.findings import Check
+    from ground_station.service.doctor.findings import Check, Finding
     from ground_station.service.settings import StationSettings
 
 _EPILOG = """\
@@ -39,15 +40,15 @@ def run(args: argparse.Namespace) -> int:
     from pi_firmware.wire.errors import ConfigError
 
     name = str(args.config or "defaults")
+    todo = of_machine()
     try:
         loaded = settings.load(args.config, args.set)
         first = findings.ok("settings", name)
+        todo += of_settings(loaded)
     except ConfigError as error:
-        # What does not depend on it is still worth looking at, with the defaults.
-        loaded = settings.StationSettings()
-        mend = f"mend {name}; the checks below are of the defaults"
+        mend = f"mend {name}; what depends on it is not checked"
         first = findings.problem("settings", str(error), mend)
-    found = findings.examine([Check("settings", lambda: first), *checks(loaded)])
+    found = findings.examine([Check("settings", lambda: first), *todo])
     colour = sys.stdout.isatty() and "NO_COLOR" not in os.environ
     print(findings.text(found, colour=colour))
     if args.json is not None:
@@ -55,26 +56,46 @@ def run(args: argparse.Namespace) -> int:
     return 1 if findings.count(found, findings.PROBLEM) else 0
 
 
-def checks(settings: StationSettings) -> list[Check]:
-    """All checks of a configuration, in the order in which they are told."""
-    from ground_station.service.doctor import machine, network, running, software, world
+def of_machine() -> list[Check]:
+    """The checks that need no configuration, in the order in which they are told."""
+    from ground_station.service.doctor import ROOT, machine, network, running, software
     from ground_station.service.doctor.findings import Check
-    from ground_station.service.doctor.locked import ROOT
 
     return [
         Check("python", software.python),
         Check("packages", lambda: software.packages(ROOT)),
         Check("gstreamer", software.video),
-        Check("ports", lambda: list(network.ports(settings))),
         Check("receive buffer", network.receive_buffer),
+        Check("clock", machine.clock),
+        Check("service", running.unit),
+    ]
+
+
+def of_settings(settings: StationSettings) -> list[Check]:
+    """The checks of what a configuration names."""
+    from ground_station.service.doctor import machine, network, running, world
+    from ground_station.service.doctor.findings import Check, Finding
+
+    looked = threading.Event()
+
+    def ports() -> list[Finding]:
+        try:
+            return list(network.ports(settings))
+        finally:
+            looked.set()
+
+    def payloads() -> Finding:
+        looked.wait()  # it takes a port that would be found in use
+        return running.payloads(settings)
+
+    return [
+        Check("ports", ports),
         Check("firewall", lambda: network.firewall_rules(settings)),
         Check("discovery", lambda: network.discovery(settings)),
-        Check("token", lambda: network.access(settings.http)),
+        Check("token", lambda: network.token(settings.http)),
         Check("certificate", lambda: world.certificate(settings)),
         Check("map", lambda: list(world.maps(settings.map, settings.localizer.preset))),
-        Check("clock", machine.clock),
         Check("memory", lambda: machine.memory(settings.payloads.most)),
         Check("disk", lambda: machine.disk(settings.recording)),
-        Check("service", running.unit),
-        Check("payloads", lambda: running.payloads(settings)),
+        Check("payloads", payloads),
     ]

@@ -95,8 +95,8 @@ def text(findings: Sequence[Finding], *, colour: bool, width: int | None = None)
         lines += [" " * indent + line for line in found[1:]]
         if finding.mend:
             mend = _wrapped(finding.mend, columns - indent - 3)
-            lines.append(f"{' ' * indent}→ {mend[0]}")
-            lines += [" " * (indent + 2) + line for line in mend[1:]]
+            lines.append(f"{' ' * indent}-> {mend[0]}")
+            lines += [" " * (indent + 3) + line for line in mend[1:]]
     return "\n".join([*lines, "", _summary(findings)])
 
 

@@ -18,7 +18,8 @@ _TIMESYNC = Path("/run/systemd/timesync/synchronized")
 _TRIAL_MB = 4
 _SLOWEST_MB_S = 5.0
 """Four payloads at 2 Mbit/s, with their pictures' poses, are 1 MB/s; this leaves bursts room."""
-_LITTLE_MB, _LEAST_MB = 1500, 600
+_BASE_MB, _LOCALIZER_MB = 550, 320
+"""Resident with the sample map: intake, web and their parent together 500 MB, a localizer 300."""
 _MEBI = 2**20
 
 
@@ -52,19 +53,23 @@ def _adjtimex() -> tuple[int | None, float | None]:
     return state, buffer[3] / 1000
 
 
-def memory(settings_most: int, meminfo: Path = Path("/proc/meminfo")) -> Finding:
-    """Room for the service's processes, of which each payload has one."""
+def memory(most: int, meminfo: Path = Path("/proc/meminfo")) -> Finding:
+    """Room for the service's processes, of which each of `most` payloads has one, and two cores."""
     fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
-    total, free = (int(fields[name].split()[0]) // 1024 for name in ("MemTotal", "MemAvailable"))
+    total, free = (
+        int(fields[name].split()[0]) * 1024 // 10**6 for name in ("MemTotal", "MemAvailable")
+    )
     cores = len(os.sched_getaffinity(0))
-    found = f"{free} of {total} MiB free, {cores} core{'s' if cores > 1 else ''}"
-    if free < _LEAST_MB:
-        return problem("memory", found, f"end other programs: {_LEAST_MB} MiB are needed")
-    if free < _LITTLE_MB:
-        return warning("memory", found, "end other programs, or set payloads.most lower")
+    found = f"{free} of {total} MB free, {cores} core{'s' if cores > 1 else ''}"
+    one, all_ = (_BASE_MB + number * _LOCALIZER_MB for number in (1, most))
+    if free < one:
+        return problem("memory", found, f"end other programs: one payload needs {one} MB")
+    if free < all_:
+        mend = f"payloads.most = {most} needs {all_} MB: set it lower, or end other programs"
+        return warning("memory", found, mend)
     if cores < 2:
         return warning("memory", found, "two cores are needed to keep up with 30 Hz")
-    return ok("memory", f"{found}, for up to {settings_most} payloads")
+    return ok("memory", f"{found}, for up to {most} payloads")
 
 
 def disk(recording: RecordingSettings) -> Finding:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import stat
 import struct
 import subprocess
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from pathlib import Path
 from ground_station.service.doctor import firewall, sockets
 from ground_station.service.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import HttpSettings, StationSettings
+from ground_station.service.web import access
 from pi_firmware.wire import scouting
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import check_endpoint
@@ -23,7 +23,6 @@ _RECEIVE_BYTES = 4 << 20
 """What the receiver asks for: a second of video that a busy machine leaves waiting."""
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _SCOUTING_GROUP, _SCOUTING_PORT = "224.0.0.224", 7446
-_SHORTEST_TOKEN = 20
 _COMMAND_S = 3.0
 _TOKEN = "python3 -c 'import secrets; print(secrets.token_urlsafe(32))'"
 
@@ -100,7 +99,7 @@ def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:
 
 def firewall_rules(settings: StationSettings) -> Finding:
     """No firewall drops what comes from outside, as far as its rules can be read."""
-    outside = [port for port in ports_of(settings) if not sockets.is_loopback(port.host)]
+    outside = [port for port in ports_of(settings) if not access.is_loopback(port.host)]
     interface = settings.telemetry.discoverable
     if interface and interface != scouting.LOOPBACK_INTERFACE:
         group = Port("discoverable", socket.SOCK_DGRAM, _SCOUTING_GROUP, _SCOUTING_PORT)
@@ -118,10 +117,10 @@ def firewall_rules(settings: StationSettings) -> Finding:
             f"its rules ({tools}) cannot be seen without root",
             "sudo blimp doctor, with the same --config",
         )
-    return _judged(outside, {name: _output(command) for name, command in there.items()})
+    return judged(outside, {name: _output(command) for name, command in there.items()})
 
 
-def _judged(outside: list[Port], rules: dict[str, str]) -> Finding:
+def judged(outside: list[Port], rules: dict[str, str]) -> Finding:
     """What the rules, by the tool that printed them, do with the ports."""
     dropped: list[Port] = []
     perhaps: list[Port] = []
@@ -187,30 +186,21 @@ def discovery(settings: StationSettings) -> Finding:
     return ok("discovery", f"'{interface}' with {address} takes part in {_SCOUTING_GROUP}")
 
 
-def access(http: HttpSettings) -> Finding:
+def token(http: HttpSettings) -> Finding:
     """The dashboard's token is there where it must be, and nobody else's to read."""
-    if not http.token_file:
-        if sockets.is_loopback(http.host):
-            return ok("token", "none: the dashboard is on loopback only")
-        mend = f"(umask 077; {_TOKEN} >token), then http.token_file"
-        return problem("token", f"http.host is {http.host}, which needs http.token_file", mend)
-    path = Path(http.token_file)
+    path = Path(http.token_file or "/etc/blimp/token")
+    make = f"(umask 077; {_TOKEN} >{path})"
+    if path.exists() and not os.access(path, os.R_OK):
+        found = f"{path}: not this user's to read"
+        return warning("token", found, f"sudo -u '#{path.stat().st_uid}' blimp doctor reads it")
     try:
-        status = path.stat()
-        token = path.read_text().strip()
-    except FileNotFoundError:
-        mend = f"(umask 077; {_TOKEN} >{path})"
-        return problem("token", f"{path}: there is no such file", mend)
-    except PermissionError:
-        return warning("token", f"{path}: not this user's to read", "run the doctor as its owner")
-    mode = stat.S_IMODE(status.st_mode)
-    if mode & 0o077:
-        found = f"{path}: others can read it (mode {mode:04o})"
-        return problem("token", found, f"chmod 600 {path}, and make a new token: {_TOKEN}")
-    if len(token) < _SHORTEST_TOKEN:
-        found = f"{path}: {len(token)} characters; at least {_SHORTEST_TOKEN} are needed"
-        return problem("token", found, f"{_TOKEN} >{path}")
-    return ok("token", f"{path}, mode {mode:04o}, {len(token)} characters")
+        found_token = access.read_token(http)
+    except access.AccessError as error:
+        more = "" if http.token_file else ", then set http.token_file to it"
+        return problem("token", str(error), f"rm -f {path}; {make}{more}")
+    if found_token is None:
+        return ok("token", "none: the dashboard is on loopback only")
+    return ok("token", f"{path}, {len(found_token)} characters, its owner's only")
 
 
 def _output(command: list[str]) -> str:

@@ -8,11 +8,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ground_station.service.doctor import ROOT
 from ground_station.service.doctor.findings import OK, Finding, ok, problem, warning
 
 _OLDEST = (3, 11)
 _IMPORT_S = 60.0
-_SETUP = "make setup"
+# An installed release has no Makefile of its own.
+_SETUP = "make setup" if (ROOT / "Makefile").exists() else "make install-service, in a checkout"
 # zlib and cv2 come before pycolmap, whose wheel brings zlib symbols of its own.
 _FIRST = ("zlib", "cv2")
 _TRY = """
@@ -128,7 +130,7 @@ def gstreamer() -> Finding:
     try:
         gst = _gst()
     except (ImportError, ValueError) as error:
-        mend = "make setup, which installs gir1.2-gstreamer-1.0"
+        mend = "sudo apt-get install gir1.2-gstreamer-1.0 gir1.2-gst-plugins-base-1.0"
         return problem("gstreamer", f"cannot be loaded: {error}", mend)
     found = {name: gst.ElementFactory.find(name) is not None for name in _ELEMENTS}
     version = ".".join(map(str, gst.version()[:3]))
@@ -152,7 +154,7 @@ def encoder() -> Finding:
     return problem(
         "encoder",
         f"of {_FRAMES} frames {len(units)} left x264 and {len(pictures)} the decoder",
-        "sudo apt-get install --reinstall gstreamer1.0-plugins-ugly; then make setup",
+        "sudo apt-get install --reinstall gstreamer1.0-plugins-ugly",
     )
 
 

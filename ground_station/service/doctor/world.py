@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ground_station.errors import GroundStationError
-from ground_station.service.doctor import sockets
 from ground_station.service.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import MapSettings, StationSettings
+from ground_station.service.web.access import is_loopback
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
 
@@ -96,7 +96,7 @@ def certificate(settings: StationSettings) -> Finding:
 
     text, name = settings.telemetry.certificates, "certificate"
     if not text:
-        if sockets.is_loopback(settings.video.host):
+        if is_loopback(settings.video.host):
             return ok(name, "none: telemetry and video on loopback only")
         found = f"none, and video.host is {settings.video.host}: plain RTP can be forged"
         mend = f"blimp keys ground {settings.name}, then set telemetry.certificates"
