@@ -129,6 +129,7 @@ class Client:
             f"ws://127.0.0.1:{port}",
             subprotocols=[Subprotocol("foxglove.sdk.v1")],
             max_size=None,
+            close_timeout=0.2,  # with messages unread its end of the closing is not read either
         )
         self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
@@ -168,23 +169,29 @@ class Client:
         self.until(lambda: bool(self.received[topic]), topic, again)
         return self.received[topic][0]
 
-    def receive(self, timeout_s: float) -> None:
-        """Takes one message, if one comes."""
+    def drain(self) -> None:
+        """Receives until nothing came for half a second."""
+        while self.receive(0.5):
+            pass
+
+    def receive(self, timeout_s: float) -> bool:
+        """Takes one message; whether one came."""
         try:
             data = self.socket.recv(timeout=timeout_s)
         except TimeoutError:
-            return
+            return False
         if isinstance(data, bytes):
             kind, number, log_ns = struct.unpack_from("<BIQ", data)
             assert kind == 1
             topic = self._topics[number]
             self.received[topic].append((log_ns, self._decode(topic, data[13:])))
-            return
+            return True
         said = json.loads(data)
         if said["op"] == "serverInfo":
             self.info = said
         elif said["op"] == "advertise":
             self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+        return True
 
     def _decode(self, topic: str, data: bytes) -> Any:
         channel = self.channels[topic]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.service.foxglove import conversion
-from ground_station.service.notes import EstimateNote, FrameNote
+from ground_station.service.notes import EstimateNote, EventNote, FrameNote
 
 Array = npt.NDArray[np.float64]
 
@@ -53,6 +53,12 @@ def stamp_ns(note: FrameNote | EstimateNote) -> int:
 def is_time(value: object) -> bool:
     """Whether it can be a stamp."""
     return type(value) is int and 0 <= value <= LAST_NS
+
+
+def is_event(note: EventNote) -> bool:
+    """Whether it is text throughout: it is kept, and told to all who come later."""
+    words = (note.source, note.level, note.name, note.text)
+    return all(isinstance(word, str) for word in words)
 
 
 def solved(note: EstimateNote) -> Solved | None:

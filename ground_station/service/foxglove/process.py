@@ -132,6 +132,8 @@ class Publishing:
             payload.status(note)
 
     def _take_event(self, payload_id: str, note: EventNote) -> None:
+        if not checks.is_event(note):
+            return
         time_ns = note.time_ns if checks.is_time(note.time_ns) else time.time_ns()
         self._events.append((payload_id, note, time_ns))
         self._event.say(lambda: documents.event(payload_id, note), time_ns)

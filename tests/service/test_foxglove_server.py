@@ -1,0 +1,390 @@
+"""The live channel serves what the station says, to whoever asks, and waits for nobody."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from foxglove import Context
+from foxglove_stand import CAPTURE_NS, PAYLOAD, ROOT, Client, Station, estimate, server, until
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from ground_station.geometry.camera import Camera
+from ground_station.mapping import store
+from ground_station.service import notes
+from ground_station.service.foxglove.inbox import Inbox
+from ground_station.service.foxglove.topics import json_topic
+from ground_station.service.notes import EventNote, FrameNote, PayloadNote, RecordingNote
+
+RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))
+SCHEMAS = {
+    "/tf": "foxglove.FrameTransforms",
+    "/map/floorplan": "foxglove.Grid",
+    "/map/landmarks": "foxglove.PointCloud",
+    "/events": "blimp.Event",
+    "/log": "foxglove.Log",
+    "/recording": "blimp.Recording",
+    f"/{PAYLOAD}/camera/image": "foxglove.CompressedImage",
+    f"/{PAYLOAD}/camera/points": "foxglove.ImageAnnotations",
+    f"/{PAYLOAD}/camera/calibration": "foxglove.CameraCalibration",
+    f"/{PAYLOAD}/pose": "foxglove.PoseInFrame",
+    f"/{PAYLOAD}/scene": "foxglove.SceneUpdate",
+    f"/{PAYLOAD}/estimate": "blimp.Estimate",
+    f"/{PAYLOAD}/battery": "blimp.Battery",
+    f"/{PAYLOAD}/health": "blimp.Health",
+    f"/{PAYLOAD}/status": "blimp.Payload",
+}
+
+
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
+    """One process for all tests that leave it as it was."""
+    station = Station(tmp_path_factory.mktemp("run"))
+    try:
+        with server(station.folder) as (process, port):
+            yield SimpleNamespace(station=station, process=process, port=port)
+            assert process.poll() is None
+    finally:
+        station.close()
+
+
+def close(a: Any, *b: float) -> bool:
+    """Whether a message's x, y, z (and w) are these numbers."""
+    return np.allclose([getattr(a, name) for name in "xyzw"[: len(b)]], b, atol=1e-9)
+
+
+def test_every_topic_has_its_schema(stand: SimpleNamespace) -> None:
+    with Client(stand.port) as client:
+        client.until(
+            lambda: SCHEMAS.keys() <= client.channels.keys(),
+            "topics",
+            again=lambda: stand.station.say(estimate()),
+        )
+        assert {name: client.channels[name]["schemaName"] for name in SCHEMAS} == SCHEMAS
+        # Nothing can be asked of it but to be told.
+        assert client.info["capabilities"] == []
+
+
+def test_a_pose_goes_out_in_ros_frames(stand: SimpleNamespace) -> None:
+    say = lambda: stand.station.say(estimate())  # noqa: E731
+    say()
+    with Client(stand.port) as client:
+        client.subscribe("/tf", f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate")
+        log_ns, pose = client.first(f"/{PAYLOAD}/pose", say)
+        assert log_ns == CAPTURE_NS == pose.timestamp.ToNanoseconds()
+        assert pose.frame_id == "map"
+        assert close(pose.pose.position, 3, 4, 2.5) and close(pose.pose.orientation, 0, 0, 0, 1)
+
+        _, tf = client.first("/tf", say)
+        camera, optical = tf.transforms
+        assert (camera.parent_frame_id, camera.child_frame_id) == ("map", f"{PAYLOAD}/camera")
+        assert close(camera.translation, 3, 4, 2.5) and close(camera.rotation, 0, 0, 0, 1)
+        assert optical.parent_frame_id == f"{PAYLOAD}/camera"
+        assert optical.child_frame_id == f"{PAYLOAD}/camera_optical"
+        # As in REP 103; together they are the pose that was estimated.
+        assert close(optical.rotation, 0.5, -0.5, 0.5, -0.5) or close(
+            optical.rotation, -0.5, 0.5, -0.5, 0.5
+        )
+
+        _, said = client.first(f"/{PAYLOAD}/estimate", say)
+        sec, nanosec = divmod(CAPTURE_NS, 1_000_000_000)
+        assert said["header"] == {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
+        assert said["pose"]["pose"]["position"] == {"x": 3.0, "y": 4.0, "z": 2.5}
+        covariance = np.reshape(said["pose"]["covariance"], (6, 6))
+        assert np.allclose(np.diag(covariance), [3e-4, 1e-4, 2e-4, 3e-6, 1e-6, 2e-6])
+        assert (said["state"], said["inliers"], said["sequence"]) == ("TRACKING", 40, 7)
+
+
+def test_a_frame_that_was_not_solved_has_no_pose(stand: SimpleNamespace) -> None:
+    lost = estimate(9, state="LOST", reason="too few", position_m=None, quaternion_xyzw=None)
+    stand.station.say(estimate())
+    with Client(stand.port) as client:
+        client.subscribe(f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene")
+        got = client.received[f"/{PAYLOAD}/estimate"]
+        client.until(
+            lambda: bool(got) and got[-1][1]["sequence"] == 9,
+            "the lost one",
+            lambda: stand.station.say(lost),
+        )
+        _, said = got[-1]
+        assert said["pose"] is None and (said["state"], said["reason"]) == ("LOST", "too few")
+        poses = len(client.received[f"/{PAYLOAD}/pose"])
+        stand.station.say(lost)
+        client.drain()
+        assert got[-1][1]["pose"] is None and len(client.received[f"/{PAYLOAD}/pose"]) == poses
+        # The marker stays where it was last and says so; nothing claims to know how well.
+        scene = client.received[f"/{PAYLOAD}/scene"]
+        client.until(
+            lambda: any("LOST" in e.texts[0].text for _, s in scene for e in s.entities if e.texts),
+            "marker",
+            lambda: stand.station.say(lost),
+        )
+        assert "ellipsoid" in [deletion.id for deletion in scene[-1][1].deletions]
+
+
+def test_the_scene_has_marker_ellipsoid_and_trail(stand: SimpleNamespace) -> None:
+    with Client(stand.port) as client:
+        stand.station.say(estimate())
+        client.subscribe(f"/{PAYLOAD}/scene")
+        found: dict[str, Any] = {}
+        x = iter(range(1000))
+
+        def fly() -> None:
+            stand.station.say(estimate(position_m=[3.0 + 0.1 * next(x), 4.0, 2.5]))
+
+        def complete() -> bool:
+            for _, scene in client.received[f"/{PAYLOAD}/scene"]:
+                found.update({entity.id: entity for entity in scene.entities})
+            return (
+                found.keys() >= {"marker", "ellipsoid", "trail"} and len(found["trail"].lines) > 0
+            )
+
+        client.until(complete, "scene", fly)
+        assert found["marker"].texts[0].text == f"{PAYLOAD} TRACKING"
+        assert {entity.frame_id for entity in found.values()} == {"map"}
+        size = found["ellipsoid"].spheres[0].size
+        expected = 2 * 2.7955 * np.sqrt([1e-4, 2e-4, 3e-4])
+        assert np.allclose(sorted([size.x, size.y, size.z]), expected, rtol=1e-3)
+        # Gone: drawn no more.
+        gone = PayloadNote(False, 1)
+        client.until(
+            lambda: (
+                {"marker", "ellipsoid"}
+                <= {
+                    d.id
+                    for _, scene in client.received[f"/{PAYLOAD}/scene"]
+                    for d in scene.deletions
+                }
+            ),
+            "deletion",
+            lambda: stand.station.bus.say(notes.PAYLOAD, PAYLOAD, gone),
+        )
+
+
+def test_pictures_are_the_rings_with_their_capture_time_and_points(stand: SimpleNamespace) -> None:
+    stand.station.say(estimate())
+    sequence = iter(range(10_000))
+    with Client(stand.port) as client:
+        client.subscribe(f"/{PAYLOAD}/camera/image", f"/{PAYLOAD}/camera/points")
+        log_ns, image = client.first(
+            f"/{PAYLOAD}/camera/image", lambda: stand.station.show(RAMP, next(sequence))
+        )
+        assert log_ns == CAPTURE_NS == image.timestamp.ToNanoseconds()
+        assert (image.frame_id, image.format) == (f"{PAYLOAD}/camera_optical", "jpeg")
+        decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert decoded is not None and decoded.shape == RAMP.shape
+        assert np.abs(decoded.astype(int) - RAMP).mean() < 2
+        _, points = client.first(f"/{PAYLOAD}/camera/points", lambda: stand.station.say(estimate()))
+        assert [(p.x, p.y) for p in points.points[0].points] == [(10.0, 20.0), (30.5, 40.5)]
+
+
+def test_pictures_come_no_faster_than_the_dashboards(stand: SimpleNamespace) -> None:
+    stand.station.say(estimate())
+    with Client(stand.port) as client:
+        client.subscribe(f"/{PAYLOAD}/camera/image")
+        begin_s, sequence = time.monotonic(), 0
+        while time.monotonic() - begin_s < 1.5:
+            sequence += 1
+            stand.station.show(RAMP, sequence)
+            client.receive(0.005)
+        count = len(client.received[f"/{PAYLOAD}/camera/image"])
+        # 15 Hz of about 150; the first may come at once and each a quarter of a period early.
+        assert 1 <= count <= 15 * (time.monotonic() - begin_s) + 2 < sequence
+
+
+def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
+    stand: SimpleNamespace,
+) -> None:
+    station = stand.station
+    battery = {"schema": "blimp.battery/1.1", "time_ns": 5, "voltage": 3.9}
+    note = PayloadNote(True, 1, battery=battery, health={"uptime_s": 3.0}, rate_hz=30.0)
+    event = EventNote(CAPTURE_NS, "localizer", "warning", "map-refused", "why")
+    recording = RecordingNote(True, "a.mcap", 1.0)
+    kept = (
+        "/events", "/log", "/recording", "/map/floorplan", "/map/landmarks",
+        f"/{PAYLOAD}/battery", f"/{PAYLOAD}/health", f"/{PAYLOAD}/status",
+        f"/{PAYLOAD}/camera/calibration", f"/{PAYLOAD}/scene",
+    )  # fmt: skip
+    with Client(stand.port) as first:
+        first.until(
+            lambda: f"/{PAYLOAD}/scene" in first.channels,
+            "payload",
+            lambda: station.say(estimate()),
+        )
+        first.subscribe(*kept)
+
+        def say() -> None:
+            station.bus.say(notes.PAYLOAD, PAYLOAD, note)
+            station.bus.say(notes.EVENT, PAYLOAD, event)
+            station.bus.say(notes.RECORDING, notes.STATION, recording)
+            station.show(RAMP, 1)
+            station.say(estimate())
+
+        first.until(lambda: all(first.received[topic] for topic in kept), "all", say)
+        first.drain()
+        before = {topic: len(first.received[topic]) for topic in kept}
+        with Client(stand.port) as second:
+            second.subscribe(*kept)
+            second.until(lambda: all(second.received[topic] for topic in kept), "what holds")
+            first.drain()
+            assert {topic: len(first.received[topic]) for topic in kept} == before
+            told = {topic: second.received[topic][0] for topic in kept}
+    camera: Camera = store.load_info(ROOT / "maps" / "atrium").camera
+    _, calibration = told[f"/{PAYLOAD}/camera/calibration"]
+    assert calibration.frame_id == f"{PAYLOAD}/camera_optical"
+    assert (calibration.width, calibration.height) == (640, 480)
+    assert list(calibration.K) == camera.matrix.ravel().tolist()
+    assert list(calibration.D) == camera.distortion.tolist()
+    assert calibration.P[0] == camera.fx_px and len(calibration.P) == 12
+    assert told[f"/{PAYLOAD}/battery"][1] == battery
+    assert told[f"/{PAYLOAD}/status"][1]["rate_hz"] == 30.0
+    log_ns, said = told["/events"]
+    assert log_ns == CAPTURE_NS and (said["payload"], said["text"]) == (PAYLOAD, "why")
+    assert told["/log"][1].message == "map-refused: why" and told["/log"][1].level == 3
+    assert told["/recording"][1]["file"] == "a.mcap"
+    # The sample's plan is 1020x700 of 25 mm.
+    grid, cloud = told["/map/floorplan"][1], told["/map/landmarks"][1]
+    assert (grid.column_count, len(grid.data)) == (1020, 4 * 1020 * 700)
+    assert grid.cell_size.x == 0.025 and close(grid.pose.position, -0.75, -0.75, 0)
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
+    assert 1000 < len(points) <= 20_000
+    truth = store.load(ROOT / "maps" / "atrium").landmarks.position_m.astype("<f4")
+    assert {tuple(point) for point in points.tolist()} <= {tuple(p) for p in truth.tolist()}
+
+
+def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
+    with Client(stand.port) as client:
+        stand.station.say(estimate())
+        client.subscribe(f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene", "/events", "/log")
+        hostile: list[Any] = [
+            estimate(1, state=[1], reason=5, map={"a": 1}),
+            estimate(2, position_m="abc", points_px={"a": 1}),
+            estimate(3, capture_ns="x", done_ns=None),
+            estimate(4, points_px=[1.0, float("nan"), 2.0]),
+        ]
+        for note in hostile:
+            stand.station.say(note)
+        bus = stand.station.bus
+        bus.say(notes.EVENT, PAYLOAD, EventNote("x", 1, [2], None, {}))  # type: ignore[arg-type]
+        bus.say(notes.PAYLOAD, PAYLOAD, PayloadNote("x", [], battery=3, health=[]))  # type: ignore[arg-type]
+        bus.say(notes.FRAME, PAYLOAD, FrameNote(-1, "a", None, 0, 0, 0, 640, 480, 0))  # type: ignore[arg-type]
+        bus.say(notes.ESTIMATE, "No Payload", estimate())
+        client.until(
+            lambda: any(
+                said["sequence"] == 77 for _, said in client.received[f"/{PAYLOAD}/estimate"]
+            ),
+            "the next",
+            lambda: stand.station.say(estimate(77)),
+        )
+        bus.say(notes.EVENT, PAYLOAD, EventNote(CAPTURE_NS, "web", "info", "next", "one"))
+        client.until(
+            lambda: any(said.message == "next: one" for _, said in client.received["/log"]),
+            "the next event",
+        )
+        with Client(stand.port) as later:
+            later.subscribe("/log")
+            later.until(lambda: bool(later.received["/log"]), "what was kept")
+        assert not any("No Payload" in topic for topic in client.channels)
+
+
+def test_a_client_that_does_not_read_delays_nobody(stand: SimpleNamespace) -> None:
+    stand.station.say(estimate())
+    topics = tuple(topic for topic in SCHEMAS if topic.startswith(f"/{PAYLOAD}/"))
+    with Client(stand.port) as slow, Client(stand.port) as quick:
+        slow.subscribe(*topics)
+        quick.subscribe(f"/{PAYLOAD}/estimate")
+        long = "x" * 100_000  # more than sockets and the slow client's queue can hold
+        for sequence in range(100, 500):
+            stand.station.say(estimate(sequence, reason=long))
+            quick.receive(0.0)
+        got = quick.received[f"/{PAYLOAD}/estimate"]
+        quick.until(
+            lambda: bool(got) and got[-1][1]["sequence"] == 2000,
+            "the newest",
+            lambda: stand.station.say(estimate(2000)),
+        )
+        beats = len(stand.station.beats)
+        until(lambda: len(stand.station.beats) > beats, "beat")
+        # It did lose some, and not the newest.
+        slow.drain()
+        numbers = [said["sequence"] for _, said in slow.received[f"/{PAYLOAD}/estimate"]]
+        assert numbers[-1] == 2000 and len(set(numbers)) < 401 and numbers == sorted(numbers)
+
+
+def test_it_says_that_it_lives(stand: SimpleNamespace) -> None:
+    until(lambda: bool(stand.station.beats), "beat")
+    beat = stand.station.beats[-1]
+    assert (beat.name, beat.pid) == ("foxglove", stand.process.pid)
+
+
+def test_another_protocol_is_refused(stand: SimpleNamespace) -> None:
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://127.0.0.1:{stand.port}", subprotocols=[Subprotocol("chat")])
+
+
+def test_a_bus_that_comes_back_is_heard_again(tmp_path: Path) -> None:
+    station = Station(tmp_path)
+    try:
+        with server(tmp_path) as (process, port), Client(port) as client:
+            station.say(estimate())
+            client.subscribe(f"/{PAYLOAD}/estimate")
+            client.first(f"/{PAYLOAD}/estimate", lambda: station.say(estimate()))
+            station.close()
+            station.open()
+            client.until(
+                lambda: client.received[f"/{PAYLOAD}/estimate"][-1][1]["sequence"] == 8,
+                "the next",
+                lambda: station.say(estimate(8)),
+            )
+            until(lambda: bool(station.beats), "beat")
+            # With a client and a map being asked for, it still ends when it is told to.
+            client.subscribe("/map/landmarks")
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(10) == 0
+    finally:
+        station.close()
+
+
+def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        station = Station(tmp_path, port=port)
+        try:
+            command = [sys.executable, "-m", "ground_station.service.foxglove", str(tmp_path)]
+            done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+        finally:
+            station.close()
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert f"foxglove.port {port}" in line and "in use" in line
+
+
+def test_nothing_is_built_that_nobody_wants() -> None:
+    topic = json_topic("/a", {}, Context())
+    topic.say(lambda: pytest.fail("built for nobody"), 1)
+
+
+def test_a_full_inbox_loses_the_oldest_and_counts_them() -> None:
+    inbox, seen = Inbox(), []
+    for number in range(2003):
+        inbox.put(lambda number=number: seen.append(number))
+    for number in range(3):
+        inbox.frame("a", FrameNote(number, 0, number, 0, 0, 0, 1, 1, 1))
+    tasks, frames = inbox.take(0.0)
+    for task in tasks:
+        task()
+    assert seen == list(range(3, 2003)) and inbox.dropped == 3
+    assert frames["a"].sequence == 2 and inbox.skipped == 2
+    assert inbox.take(0.0) == ([], {})
