@@ -74,7 +74,7 @@ def of_machine() -> list[Check]:
 def of_settings(settings: StationSettings) -> list[Check]:
     """The checks of what a configuration names."""
     from ground_station.service.doctor import machine, network, running, world
-    from ground_station.service.doctor.findings import Check, Finding
+    from ground_station.service.doctor.findings import Check
 
     looked = threading.Event()
 
