@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -438,3 +440,27 @@ def test_what_grows_while_it_is_sent_ends_where_it_was(shelf, served):
     assert len(b"".join(pieces)) == 1000
     with pytest.raises(OSError):
         os.fstat(descriptor)
+
+
+def test_only_so_many_wait_for_an_answer(served, monkeypatch):
+    client, bus, _ = served
+    answer, asked = threading.Event(), threading.Semaphore(0)
+
+    def waits(*_, **__):
+        asked.release()
+        assert answer.wait(30.0)
+        return {"done": True}
+
+    monkeypatch.setattr(bus, "ask", waits)
+
+    def post(_):
+        return client.post("/api/recording", json={"active": True}).status_code
+
+    with ThreadPoolExecutor(8) as threads:
+        waiting = threads.map(post, range(8))
+        for _ in range(8):
+            assert asked.acquire(timeout=30.0)
+        late = client.post("/api/recording", json={"active": True})
+        assert late.status_code == 429 and late.headers["retry-after"]
+        answer.set()
+        assert list(waiting) == [200] * 8

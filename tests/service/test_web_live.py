@@ -381,3 +381,54 @@ def test_a_connection_that_asks_nothing_is_closed(served, monkeypatch):
             with contextlib.suppress(ConnectionResetError):
                 assert sock.recv(100) == b""
     assert httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200
+
+
+def test_who_stops_in_the_middle_of_a_later_request_is_closed_too(served, monkeypatch):
+    _, _, port = served
+    from ground_station.service.web import server as server_module
+
+    monkeypatch.setattr(server_module, "_REQUEST_S", 0.5)
+    with socket.create_connection(("127.0.0.1", port), timeout=20.0) as sock:
+        request = f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n".encode()
+        sock.sendall(request + b"\r\n")
+        assert sock.recv(4096).startswith(b"HTTP/1.1 200")
+        sock.sendall(request)  # and not the empty line
+        with contextlib.suppress(ConnectionResetError):
+            while sock.recv(4096):
+                pass
+
+
+def test_a_body_that_does_not_come_is_refused_in_time(served, monkeypatch):
+    _, _, port = served
+    from ground_station.service.web import guard
+
+    monkeypatch.setattr(guard, "_BODY_S", 0.3)
+    with socket.create_connection(("127.0.0.1", port), timeout=20.0) as sock:
+        sock.sendall(
+            f"POST /api/recording HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n"
+            'Content-Type: application/json\r\nContent-Length: 16\r\n\r\n{"active"'.encode()
+        )
+        assert sock.recv(4096).startswith(b"HTTP/1.1 408")
+
+
+def test_connections_are_bounded(served, monkeypatch):
+    _, _, port = served
+    from ground_station.service.web import server as server_module
+
+    monkeypatch.setattr(server_module, "CONNECTIONS", 8)
+    with contextlib.ExitStack() as stack:
+        held = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20.0))
+            for _ in range(8)
+        ]
+        late = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20.0))
+        with contextlib.suppress(ConnectionResetError):
+            assert late.recv(1) == b""
+        assert len(held) == 8
+    station.until(lambda: _answers(port))
+
+
+def _answers(port) -> bool:
+    with contextlib.suppress(httpx.HTTPError):
+        return httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200
+    return False
