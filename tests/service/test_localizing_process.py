@@ -35,6 +35,7 @@ from ground_station.recording.frames import Frame, FrameRange
 from ground_station.service import notes
 from ground_station.service.bus import Bus
 from ground_station.service.firmware import FirmwareProcess
+from ground_station.service.localizing import maps
 from ground_station.service.localizing.process import RESTART, Localizing
 from ground_station.service.notes import EstimateNote
 from ground_station.service.pictures import SLOTS
@@ -222,7 +223,7 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
         assert refused is not None and refused.level == "alarm"
         assert "landmarks.safetensors" in refused.text and "\n" not in refused.text
         answer = told.bus.ask(NAME, {"do": "relocalize"})
-        assert not answer["done"] and "there is no map to search" in answer["reason"]
+        assert not answer["done"] and "nothing to search: no map: " in answer["reason"]
         said = localized(told, flight[0])
         assert said.state == "INITIALIZING" and said.reason.startswith("no map: ")
         assert (said.processed, said.skipped, said.position_m) == (0, 1, None)
@@ -346,6 +347,35 @@ def test_bad_input_is_one_line_and_status_2(tmp_path: Path) -> None:
             _, said = process.communicate(timeout=LIMIT_S)
             assert process.returncode == 2
             assert said.startswith("localizer ") and said.count("\n") == 1
+
+
+def test_while_its_map_is_loaded_it_says_so(
+    run_folder: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is no alarm, and no frame is without account."""
+    release, real, stop = threading.Event(), maps.prepare, threading.Event()
+
+    def slow(*arguments: Any) -> Localizer:
+        release.wait(LIMIT_S)
+        return real(*arguments)
+
+    monkeypatch.setattr(maps, "prepare", slow)
+    with station(run_folder) as told, Bus(run_folder, NAME) as bus:
+        localizing = Localizing(bus, run_folder, PAYLOAD, told.settings)
+        thread = threading.Thread(target=localizing.run, args=(stop,))
+        thread.start()
+        try:
+            said = localized(told, flight[0])
+            assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
+            answer = told.bus.ask(NAME, {"do": "map", "name": "atrium"})
+            assert answer["reason"] == "the map 'atrium' is being loaded; try again then"
+            release.set()
+            until(lambda: told.event("map-loaded") is not None, "the map")
+            assert error_m(localized(told, flight[1])) < 0.1
+        finally:
+            release.set()
+            stop.set()
+            thread.join()
 
 
 class _Failing:

@@ -33,7 +33,7 @@ RESTART = 3
 _POLL_S = 0.2
 _ANSWER_S = 3.0
 """A question for a map waits this long for it to be loaded; a larger one is told by an event."""
-_REFUSED_EVERY_S = 1.0
+_WAITING_EVERY_S = 1.0
 _FORGET_AFTER, _END_AFTER = 3, 10
 """Frames in a row that failed: what is known of the flight may be the cause; the process is."""
 _BESIDE_NICE = 5
@@ -52,7 +52,7 @@ class Localizing:
         self._pictures = PictureReader(folder, payload_id)
         self._loader = Loader(settings)
         self._localizer: Localizer | None = None
-        self._map, self._refused = "", "the map is being loaded"
+        self._map, self._waiting = "", "the map is being loaded"
         self._forget = threading.Event()
         self._stream: tuple[int, int] | None = None  # ssrc and time of the last frame
         self._failed = 0
@@ -87,7 +87,7 @@ class Localizing:
     def _frame(self, note: FrameNote) -> None:
         if self._localizer is None:
             self._skip()
-            self._tell_refused(note)
+            self._tell_waiting(note)
             return
         taken = frames.take(self._pictures, note)
         if isinstance(taken, str):
@@ -150,7 +150,7 @@ class Localizing:
         if loading.localizer is None:
             self._refuse(loading)
         else:
-            self._localizer, self._map, self._refused = loading.localizer, loading.name, ""
+            self._localizer, self._map = loading.localizer, loading.name
             self._failed = 0
             count = len(loading.localizer.map.landmarks)
             text = f"the map '{loading.name}' is in use: {count} landmarks"
@@ -160,19 +160,18 @@ class Localizing:
     def _refuse(self, loading: Loading) -> None:
         kept = f"; '{self._map}' stays in use" if self._map else ""
         if not self._map:
-            self._refused = loading.refused
+            self._waiting = f"no map: {loading.refused}"
         level = notes.WARNING if self._map else notes.ALARM
         self._event(level, "map-refused", f"{loading.refused}{kept}")
 
-    def _tell_refused(self, note: FrameNote) -> None:
+    def _tell_waiting(self, note: FrameNote) -> None:
         """Without a map a frame's state says so, each second: an event may have been missed."""
         now_s = time.monotonic()
-        if now_s - self._told_s < _REFUSED_EVERY_S or frames.fault_of(note):
+        if now_s - self._told_s < _WAITING_EVERY_S or frames.fault_of(note):
             return
         self._told_s = now_s
-        reason = f"no map: {self._refused}"
         about = (self.accounts, "", time.time_ns())
-        told = derive.unsolved_note(note, State.INITIALIZING, reason, *about)
+        told = derive.unsolved_note(note, State.INITIALIZING, self._waiting, *about)
         self._bus.say(notes.ESTIMATE, self._payload_id, told)
 
     # Questions, on a thread of the bus
@@ -181,7 +180,7 @@ class Localizing:
         what = request.get("do")
         if what == "relocalize":
             if self._localizer is None:
-                raise LocalizingError(f"there is no map to search: {self._refused}")
+                raise LocalizingError(f"nothing to search: {self._waiting}")
             self._forget.set()
             self._event(notes.INFO, "relocalize", "asked to forget the pose and to search")
             return {}
