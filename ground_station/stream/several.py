@@ -331,3 +331,13 @@ class SeveralReceiver:
         for stream in self.streams():
             if now_ns - stream.last_ns > _SILENT_NS:
                 self._drop(stream)
+            else:
+                self._rename(stream)
+
+    def _rename(self, stream: Stream) -> None:
+        """A stream that was taken for another's, or nobody's, goes on as who says it is its own."""
+        key_owner = self._unprotector.payload_id(stream.ssrc) if self._unprotector else None
+        owner = self._owner(stream.ssrc, key_owner, 0.0)
+        taken = {other.payload_id for other in self.streams()}
+        if owner is not None and owner not in taken and key_owner in (None, owner):
+            stream.payload_id = owner

@@ -54,7 +54,7 @@ def _record(intake: Intake) -> None:
 
 
 def main() -> int:
-    """The exit status: 0 after a signal, 2 for bad input, 3 where only a new process can mend it."""
+    """The exit status: 0 after a signal, 2 for bad input, 3 where a new process may mend it."""
     if len(sys.argv) != 2:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2

@@ -16,7 +16,7 @@ from ground_station.service.intake import poses, questions
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.intake.roster import Roster
+from ground_station.service.intake.roster import NAMELESS, Roster
 from ground_station.service.notes import EstimateNote, EventNote, Note
 from ground_station.service.pose_feed import PoseFeed
 from ground_station.service.settings import StationSettings
@@ -232,6 +232,8 @@ class Intake:
             )
             self._say(notes.PAYLOAD, payload.id, note)
             self.recorder.note(notes.PAYLOAD, payload.id, note)
+            if payload.id.startswith(NAMELESS) and not payload.alive:
+                self._roster.forget(payload)
         refused = ", ".join(sorted(self._roster.refused))
         text = f"no place for {refused[:100]}: payloads.most" if refused else ""
         self._tell(notes.STATION, "payloads-too-many", text)

@@ -11,6 +11,9 @@ from ground_station.service.settings import PayloadSettings
 
 GRACE_S = 3.0
 """How long a stream comes before it is taken although nobody announced it."""
+NAMELESS_S = 12.0
+"""Longer where that leaves it without a name: telemetry that starts late needs some seconds."""
+NAMELESS = "stream-"
 _REFUSED = 64
 
 
@@ -63,6 +66,12 @@ class Roster:
             left.close()
         return taken
 
+    def forget(self, payload: Payload) -> None:
+        """Lets go of one that has no name of its own and is gone."""
+        with self._lock:
+            self._payloads.pop(payload.id, None)
+        payload.close()
+
     def owner(self, ssrc: int, key_owner: str | None, age_s: float) -> str | None:
         """Whose a stream is, as `several.Owner`.
 
@@ -78,9 +87,9 @@ class Roster:
                 if self._announced.ssrc(key_owner) is not None:
                     return None
                 payload_id = key_owner
-            elif self._announced.anyone():
+            elif age_s < NAMELESS_S or self._announced.anyone():
                 return None
             else:
                 ids = self._settings.ids
-                payload_id = ids[0] if len(ids) == 1 else f"stream-{ssrc:08x}"
+                payload_id = ids[0] if len(ids) == 1 else f"{NAMELESS}{ssrc:08x}"
         return payload_id if self.take_up(payload_id) is not None else None

@@ -1,0 +1,229 @@
+"""Payloads' own programs fly to the intake's: pictures, accounts, appearing and going."""
+
+from __future__ import annotations
+
+import random
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from intake_stand import (
+    ROUND,
+    ImpairedLink,
+    Impairment,
+    Stand,
+    encoded,
+    eventually,
+    packets,
+    stamped,
+)
+
+from ground_station.service import notes
+from ground_station.service.notes import EstimateNote
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.telemetry import open_session
+
+
+def all_right(stand: Stand, payload_id: str) -> list[int]:
+    """The sequence numbers that were shown, each once, in order, with its own picture."""
+    frames = stand.heard.of(payload_id)
+    shown = [note.sequence for note, _ in frames]
+    assert shown == sorted(set(shown))
+    assert all(number in (note.sequence % ROUND, -1) for note, number in frames)
+    assert sum(number == -1 for _, number in frames) <= len(frames) // 4  # a busy machine's
+    return shown
+
+
+def test_two_payloads_and_garbage_on_one_port(tmp_path: Path) -> None:
+    draw = random.Random(3)
+    stranger = packets([stamped(unit, k) for k, unit in enumerate(encoded(30))], ssrc=4711)
+    with Stand(tmp_path) as stand:
+        slow = "&pace=stepped&max_hz=15"
+        flying = {name: stand.payload(name, query=slow) for name in ("blimp-1", "blimp-2")}
+        for name in flying:
+            eventually(lambda name=name: len(stand.heard.of(name)) > 20)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
+            for datagram in stranger:
+                noise.sendto(datagram, ("127.0.0.1", stand.port))
+                noise.sendto(draw.randbytes(draw.randint(0, 1400)), ("127.0.0.1", stand.port))
+        at = {name: len(stand.heard.of(name)) for name in flying}
+        for name in flying:
+            eventually(lambda name=name: len(stand.heard.of(name)) > at[name] + 60)
+        counts = {name: payload.end().counts for name, payload in flying.items()}
+        for name, ended in counts.items():
+            note = stand.settled(name, ended)
+            account = note.frames
+            assert account["received"] == account["sent"] == len(all_right(stand, name))
+            assert account["lost"] == account["withheld"] == account["dropped"] == 0
+            assert note.ssrc is not None and not note.encrypted
+            assert note.battery is not None and note.health is not None and note.clock is not None
+            assert {"started", "stopped", "payload-appeared"} <= {*stand.heard.event_names(name)}
+        # Two that fly at one rate get as much: neither starves the other.
+        one, two = (len(stand.heard.of(name)) for name in flying)
+        assert min(one, two) > 0.5 * max(one, two)
+        captures = [note for _, note, _ in stand.heard.frames if note.capture_ns is not None]
+        assert len(captures) > 20
+        late_ms = [(note.arrival_ns - (note.capture_ns or 0)) / 1e6 for note in captures]
+        assert -5 < statistics.median(late_ms) < 1000
+        assert set(stand.heard.payloads) == {"blimp-1", "blimp-2"}  # and no stranger
+        stand.process.terminate()
+        assert stand.process.wait(10) == 0 and stand.written() == ""
+
+
+def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
+    with (
+        Stand(tmp_path) as stand,
+        ImpairedLink(stand.port, Impairment(loss=0.02), seed=5) as link,
+    ):
+        payload = stand.payload("blimp-1", port=link.port)
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 150)
+        ended = payload.end().counts
+        eventually(lambda: link.idle)
+        note = stand.settled("blimp-1", ended)
+        account, stream = note.frames, note.stream
+        shown = all_right(stand, "blimp-1")
+        assert account["received"] == len(shown) < account["sent"]
+        assert account["received"] + account["withheld"] + account["lost"] == account["sent"]
+        given_up = stream["packets_late"]  # later than 30 ms on a busy machine
+        assert stream["packets"] == link.counts.passed
+        assert given_up <= stream["packets"] // 20
+        # A loss behind the last packet that came is one that nobody can see.
+        assert 0 <= link.counts.lost - (stream["packets_lost"] - given_up) <= 3
+        assert any(said.lost_share > 0 for said in stand.heard.payloads["blimp-1"])
+
+
+def test_a_payload_that_starts_anew_is_taken_up_and_counts_from_zero(tmp_path: Path) -> None:
+    with Stand(tmp_path, payloads={"most": 1}) as stand:
+        first = stand.payload("blimp-1")
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 20)
+        first.process.kill()
+        gone = eventually(
+            lambda: (note := stand.heard.payload("blimp-1")) and not note.alive and note
+        )
+        assert gone.frames["received"] > 20
+        second = stand.payload("blimp-1")
+        anew = eventually(
+            lambda: (
+                (note := stand.heard.payload("blimp-1"))
+                and note.alive
+                and note.ssrc not in (None, gone.ssrc)
+                and note
+            )
+        )
+        assert anew.ssrc is not None
+
+        def shown_anew() -> list[int]:
+            return [n.sequence for n, _ in stand.heard.of("blimp-1") if n.ssrc == anew.ssrc]
+
+        eventually(lambda: len(shown_anew()) > 20)
+        note = stand.settled("blimp-1", second.end().counts)
+        shown = shown_anew()
+        assert note.frames["received"] == note.frames["sent"] == len(shown)
+        assert shown == list(range(len(shown))) and note.frames["lost"] == 0
+        names = stand.heard.event_names("blimp-1")
+        assert names.count("payload-appeared") == 2 and names.count("payload-gone") >= 1
+        # Its place is free for another now.
+        stand.payload("blimp-2")
+        eventually(lambda: len(stand.heard.of("blimp-2")) > 5)
+
+
+def test_an_intake_that_starts_anew_takes_up_who_flies(tmp_path: Path) -> None:
+    with Stand(tmp_path) as stand:
+        payload = stand.payload("blimp-1")
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 60)
+        stand.process.kill()
+        stand.process.wait()
+        seen = len(stand.heard.frames)
+        stand.start()
+        eventually(lambda: len(stand.heard.frames) > seen + 40)
+        note = stand.settled("blimp-1", payload.end().counts)
+        shown = [n.sequence for n, _ in stand.heard.of("blimp-1")][seen:]
+        assert note.frames["received"] == len(shown) < note.frames["sent"]
+        # What it sent while nobody was there is not lost to this intake.
+        assert note.frames["lost"] == 0 and note.frames["withheld"] < 30
+
+
+def test_of_two_payloads_with_one_id_the_first_is_kept(tmp_path: Path) -> None:
+    with Stand(tmp_path) as stand:
+        stand.payload("blimp-1")
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 20)
+        ssrc = stand.heard.of("blimp-1")[0][0].ssrc
+        stand.payload("blimp-1")
+        eventually(lambda: "payload-twice" in stand.heard.event_names("blimp-1"))
+        seen = len(stand.heard.of("blimp-1"))
+        eventually(lambda: len(stand.heard.of("blimp-1")) > seen + 60)
+        assert {note.ssrc for note, _ in stand.heard.of("blimp-1")} == {ssrc}
+        all_right(stand, "blimp-1")
+
+
+def test_who_is_not_named_is_not_taken_up(tmp_path: Path) -> None:
+    with Stand(tmp_path, payloads={"ids": ["blimp-2"]}) as stand:
+        stand.payload("blimp-1")
+        stand.payload("blimp-2")
+        eventually(lambda: len(stand.heard.of("blimp-2")) > 30)
+        assert set(stand.heard.payloads) == {"blimp-2"} and not stand.heard.of("blimp-1")
+
+
+def test_poses_reach_the_payload_and_commands_are_answered(tmp_path: Path) -> None:
+    with Stand(tmp_path) as stand:
+        poses: list[messages.Pose] = []
+        listener = open_session(connect=[stand.endpoint])
+        subscriber = listener.zenoh.declare_subscriber(
+            keys.key("blimp-1", keys.POSE),
+            lambda sample: poses.append(messages.decode(messages.Pose, sample.payload.to_bytes())),
+        )
+        stand.payload("blimp-1")
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 5)
+        bad = EstimateNote(sequence=1, time_ns=1, clock_ns=1, done_ns=1, state="ELATED")
+        said = EstimateNote(
+            sequence=7, time_ns=70, clock_ns=71, done_ns=72, state="TRACKING",
+            position_m=[1.0, 2.0, 3.0], quaternion_xyzw=[0.0, 0.0, 1.0, 0.0],
+            covariance=[float(k) for k in range(36)], relocalized=True,
+        )  # fmt: skip
+
+        def told() -> bool:
+            for note in (bad, said):
+                stand.bus.say(notes.ESTIMATE, "blimp-1", note)
+            return bool(poses)
+
+        eventually(told)
+        assert {pose.state for pose in poses} == {"TRACKING"}
+        pose = poses[0]
+        assert (pose.sequence, pose.capture_ns, pose.relocalized) == (7, 71, True)
+        assert pose.position_m == [1.0, 2.0, 3.0]
+        assert pose.quaternion_xyzw == pytest.approx([0.0, 0.0, 1.0, 0.0])
+        assert pose.covariance == [float(k) for k in range(36)]
+        ask = {"do": "payload-command", "payload": "blimp-1"}
+        assert stand.ask(**ask, name="idr", arguments={})["done"] is True
+        answer = stand.ask(**ask, name="bitrate", arguments={"kbps": 1e9})
+        assert answer["done"] is False and "kbps" in answer["reason"]
+        refused = (
+            {**ask, "name": "explode"},
+            {**ask, "name": "bitrate", "arguments": {"kbps": "much"}},
+            {**ask, "name": "idr", "payload": "../etc"},
+            {**ask, "name": "idr", "payload": "blimp-9"},
+            {"do": "dance"},
+            {},
+        )
+        for request in refused:
+            answer = stand.ask(**request)
+            assert answer["done"] is False and answer["reason"].count("\n") == 0, request
+            assert answer["reason"], request
+        subscriber.undeclare()
+        listener.close()
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with Stand(tmp_path) as stand:
+        done = subprocess.run(
+            [sys.executable, "-m", "ground_station.service.intake", str(stand.run_folder)],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2 and "in use" in done.stderr
+        assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+        stand.process.send_signal(signal.SIGINT)
+        assert stand.process.wait(10) == 0
