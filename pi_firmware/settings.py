@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import tomllib
-import typing
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pi_firmware.wire import video
-from pi_firmware.wire.config import from_mapping, key, read, table
-from pi_firmware.wire.errors import ConfigError, TelemetryError
+from pi_firmware.wire.config import apply_override, from_mapping, key, read, table
+from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
 
@@ -233,32 +229,5 @@ def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
     """
     document = {} if path is None else read(path)
     for override in overrides:
-        _apply(document, override)
+        apply_override(document, override, Settings)
     return from_mapping(document, Settings, where=str(path or "defaults"))
-
-
-def _apply(document: dict[str, Any], override: str) -> None:
-    name, equals, text = override.partition("=")
-    if not equals:
-        raise ConfigError(f"--set {override!r}: expected key=value, as camera.rate_hz=5")
-    *tables, last = name.strip().split(".")
-    for part in tables:
-        document = document.setdefault(part, {})
-        if not isinstance(document, dict):
-            raise ConfigError(f"--set {override!r}: '{part}' is not a table")
-    document[last] = text if _is_text([*tables, last]) else _toml_value(text, override)
-
-
-def _is_text(path: list[str]) -> bool:
-    """Whether the key holds a string, which `--set` then takes as it is, without quotes."""
-    kind: Any = Settings
-    for part in path:
-        kind = typing.get_type_hints(kind).get(part) if dataclasses.is_dataclass(kind) else None
-    return kind is str
-
-
-def _toml_value(text: str, override: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError):
-        raise ConfigError(f"--set {override!r}: {text!r} is not a TOML value") from None

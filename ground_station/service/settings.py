@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pi_firmware.wire import video
-from pi_firmware.wire.config import from_mapping, key, read, table
+from pi_firmware.wire.config import apply_override, from_mapping, key, read, table
 from pi_firmware.wire.errors import ConfigError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
@@ -149,16 +147,7 @@ def load(path: Path | None, overrides: Iterable[str] = ()) -> StationSettings:
     """
     document = {} if path is None else read(path)
     for override in overrides:
-        name, equals, text = override.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {override!r}: expected key=value, as http.port=8081")
-        *tables, last = name.strip().split(".")
-        inner = document
-        for part in tables:
-            inner = inner.setdefault(part, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"--set {override!r}: '{part}' is not a table")
-        inner[last] = _value(text)
+        apply_override(document, override, StationSettings)
     return from_mapping(document, StationSettings, where=str(path or "defaults"))
 
 
@@ -176,11 +165,3 @@ def load_run(folder: Path) -> Run:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except ValueError:
         raise ConfigError(f"{path}: not JSON text") from None
-
-
-def _value(text: str) -> Any:
-    """A TOML value, or the text itself where it is none: strings need no quotes."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError):
-        return text

@@ -36,6 +36,37 @@ def key(
     return dataclasses.field(default=default, metadata=meta)
 
 
+def apply_override(document: dict[str, Any], override: str, cls: type) -> None:
+    """Puts `table.key=value` on top of a document that is to become a `cls`.
+
+    A key that holds text takes what stands there as it is, any other a TOML value. Raises
+    `ConfigError` with one line.
+    """
+    name, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {override!r}: expected key=value, as in the file")
+    *tables, last = name.strip().split(".")
+    for part in tables:
+        document = document.setdefault(part, {})
+        if not isinstance(document, dict):
+            raise ConfigError(f"--set {override!r}: '{part}' is not a table")
+    document[last] = text if _is_text([*tables, last], cls) else _toml_value(text, override)
+
+
+def _is_text(path: list[str], kind: Any) -> bool:
+    """Whether the key holds a string, which `--set` then takes as it is, without quotes."""
+    for part in path:
+        kind = typing.get_type_hints(kind).get(part) if dataclasses.is_dataclass(kind) else None
+    return kind is str
+
+
+def _toml_value(text: str, override: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        raise ConfigError(f"--set {override!r}: {text!r} is not a TOML value") from None
+
+
 def range_of(cls: type, name: str) -> tuple[float, float]:
     """The bounds of a number that is declared with `key`, inclusive; infinite where it has none."""
     meta = next(field.metadata for field in dataclasses.fields(cls) if field.name == name)
