@@ -21,7 +21,7 @@ usage() { sed -n '4,9s/^# *//p' "$here/service.sh" >&2; exit 2; }
 
 action=${1:-}
 case $action in install | uninstall) shift ;; *) usage ;; esac
-root= environment= purge=
+root='' environment='' purge=''
 given="$*"
 while [ $# -gt 0 ]; do
   case $1 in
@@ -287,5 +287,5 @@ uninstall_service() {
   fi
 }
 
-"${action}_service"
+case $action in install) install_service ;; uninstall) uninstall_service ;; esac
 exit  # what a checkout changes in this file meanwhile is not read

@@ -67,6 +67,9 @@ def test_sets_and_ranges_of_ports(right: object, passes: bool) -> None:
 def test_a_rule_for_some_senders_only_depends() -> None:
     assert nft(ruleset([SOURCE, {"accept": None}])) == Fate(DROP, depends=True)
     assert nft(ruleset([SOURCE, {"drop": None}], policy="accept")) == Fate(ACCEPT, depends=True)
+    # What would be decided anyway does not depend.
+    assert nft(ruleset([SOURCE, {"accept": None}], policy="accept")) == Fate(ACCEPT)
+    assert nft(ruleset([SOURCE, {"drop": None}])) == Fate(DROP)
 
 
 def test_jumps_returns_and_rejects() -> None:

@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 ACCEPT, DROP, JUMP, GOTO, RETURN, NEXT = "accept", "drop", "jump", "goto", "return", "next"
 _DEEPEST = 32
+_UNKNOWN = "unknown"
 _FAMILIES = ("ip", "inet", "netdev")  # the video is IPv4
 
 
@@ -45,6 +46,14 @@ class Fate:
     depends: bool = False
 
 
+@dataclass
+class _Way:
+    """Where a packet's way through a chain ends; `others`: where it could have ended before."""
+
+    end: str
+    others: set[str] = field(default_factory=set)
+
+
 Chains = Mapping[str, Chain]
 
 
@@ -53,36 +62,36 @@ def judge(chains: Chains) -> Fate:
     ends = []
     for name, chain in chains.items():
         if chain.base:
-            fate = _walk(chains, name, 0)
-            ends.append(replace(fate, verdict=chain.policy) if fate.verdict == NEXT else fate)
+            way = _walk(chains, name, 0)
+            verdict = chain.policy if way.end == NEXT else way.end
+            ends.append(Fate(verdict, bool(way.others - {verdict})))
     dropped = [end for end in ends if end.verdict == DROP]
     if dropped:
         return Fate(DROP, all(end.depends for end in dropped))
     return Fate(ACCEPT, any(end.depends for end in ends))
 
 
-def _walk(chains: Chains, name: str, depth: int) -> Fate:
-    """What a chain decides; `NEXT` when it ends without a verdict."""
-    chain, depends = chains.get(name), False
+def _walk(chains: Chains, name: str, depth: int) -> _Way:
+    """A packet's way through a chain; it ends with `NEXT` where there is no verdict."""
+    chain, others = chains.get(name), set[str]()
     if chain is None or depth > _DEEPEST:
-        return Fate(NEXT, True)
+        return _Way(NEXT, {_UNKNOWN})
     for rule in chain.rules:
         if rule.met is False or rule.verdict == NEXT:
             continue
-        verdict, inner = rule.verdict, False
-        if verdict in (JUMP, GOTO):
-            fate = _walk(chains, rule.target, depth + 1)
-            verdict, inner = fate.verdict, fate.depends
-            if verdict == NEXT:
-                depends |= inner
-                if rule.verdict == JUMP or rule.met is None:
-                    continue
-                return Fate(NEXT, depends)
-        if rule.met is None:
-            depends = True
-            continue
-        return Fate(NEXT if verdict == RETURN else verdict, depends or inner)
-    return Fate(NEXT, depends)
+        end = rule.verdict
+        if end in (JUMP, GOTO):
+            way = _walk(chains, rule.target, depth + 1)
+            end = way.end
+            others |= way.others
+            if end == NEXT and rule.verdict == JUMP:
+                continue
+        elif end == RETURN:
+            end = NEXT
+        if rule.met is not None:
+            return _Way(end, others)
+        others.add(_UNKNOWN if end == NEXT else end)
+    return _Way(NEXT, others)
 
 
 def from_nft(document: str, protocol: str, port: int) -> dict[str, Chain]:
