@@ -40,7 +40,7 @@ POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; connect-src 'self'; frame-ancestors 'none'; "
     "base-uri 'none'; form-action 'self'"
 )
-FRAMES = 320
+FRAMES = 200
 RATE_HZ = 30.0
 LATENCY_S = 0.04
 _PLAN = {"resolution_m": 0.025, "origin": [-0.75, -0.75, 0.0], "width_px": 1020, "height_px": 700}
@@ -498,7 +498,7 @@ class Served:
             make_app(self.station),
             host="127.0.0.1",
             port=self.port,
-            log_level="error",
+            log_level="critical",
             timeout_graceful_shutdown=1,
         )
         self._server = uvicorn.Server(config)
@@ -521,7 +521,7 @@ def sample_station() -> FakeStation:
     """One payload that tracks and a second one."""
     station = FakeStation()
     station.payloads["blimp-1"] = Payload("blimp-1")
-    station.payloads["blimp-2"] = Payload("blimp-2", first=160)
+    station.payloads["blimp-2"] = Payload("blimp-2", first=100)
     station.event("info", "blimp-1 appeared", "blimp-1")
     station.event("info", "map atrium: 7573 landmarks")
     return station

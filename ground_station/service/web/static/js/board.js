@@ -46,9 +46,11 @@ export class Board {
     const is_live = this.store.isLive(payload);
     const stale = (/** @type {string} */ name) => !is_live || Boolean(payload?.stale.includes(name));
     const note = payload?.note;
-    this.drawBattery(note?.battery, stale("battery"), payload?.age_s.battery);
+    const told_s = (performance.now() - (payload?.told_ms ?? 0)) / 1e3;
+    const age_s = (/** @type {string} */ name) => (payload?.age_s[name] == null ? null : payload.age_s[name] + told_s);
+    this.drawBattery(note?.battery, stale("battery"), age_s("battery"));
     this.drawRadio(note, !is_live, stale("health"));
-    this.drawBoard(note, stale("health"), payload?.age_s.health);
+    this.drawBoard(note, stale("health"), age_s("health"));
   }
 
   /** @param {Record<string, any>|null|undefined} battery @param {boolean} is_stale @param {number|null|undefined} age_s */

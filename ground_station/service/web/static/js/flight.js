@@ -28,7 +28,9 @@ export class Flight {
     setIcon(f.icon, look.icon);
     setText(f.word, look.word);
     setText(f.since, this.since(payload, state));
-    setText(f.reason, this.reason(payload, state));
+    const reason = this.reason(payload, state);
+    setText(f.reason, reason);
+    setAttribute(f.reason, "title", reason);
     this.speak(payload, look.word);
 
     const estimate = payload?.estimate;
@@ -54,18 +56,15 @@ export class Flight {
   since(payload, state) {
     if (!payload) return "";
     const now_ms = performance.now();
-    if (state === "GONE") {
-      const seen = payload.note ? `since ${clockTime(payload.note.seen_ns / 1e6)}` : "";
-      return payload.is_alive ? "" : seen;
-    }
+    if (state === "GONE") return payload.note ? `since ${clockTime(payload.note.seen_ns / 1e6)}` : "";
+    if (state === "OFFLINE") return "";
     if (state === "STALE") return `for ${duration((now_ms - payload.estimate_ms) / 1e3)}`;
     return payload.estimate ? `for ${duration((now_ms - payload.state_ms) / 1e3)}` : "";
   }
 
   /** @param {import("./store.js").Payload|null} payload @param {string} state */
   reason(payload, state) {
-    if (state === "GONE" && payload?.is_alive) return "The station is not connected: what is shown is old";
-    if (state === "GONE" || state === "STALE" || !payload?.estimate) return lookOf(state).meaning;
+    if (["GONE", "OFFLINE", "STALE"].includes(state) || !payload?.estimate) return lookOf(state).meaning;
     const estimate = payload.estimate;
     if (estimate.reason) return estimate.reason;
     const inliers = estimate.inliers ? `, ${estimate.inliers} landmarks` : "";

@@ -8,6 +8,7 @@ import { drawBlimp, drawEllipse, drawGrid, drawScale, drawTrail } from "./plan_m
 import { View2d } from "./view2d.js";
 
 const ELLIPSE_SIGMAS = 2;
+const LABEL = 16; // letters
 
 export class Plan {
   /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop @param {import("./theme.js").Theme} theme */
@@ -146,7 +147,7 @@ export class Plan {
     for (const other of store.payloads.values()) {
       if (other === payload || !other.placed || (other.placed.map ?? "") !== (placed?.map ?? other.placed.map ?? "")) continue;
       const state = store.stateOf(other);
-      drawBlimp(c, view, theme, other.placed, state, { label: other.id, old: !isCurrent(other, state), size: 11 });
+      drawBlimp(c, view, theme, other.placed, state, { label: short(other.id), old: !isCurrent(other, state), size: 11 });
     }
     if (!payload) return;
     drawTrail(c, view, theme, payload.trail);
@@ -156,6 +157,11 @@ export class Plan {
     if (!old) drawEllipse(c, view, theme, placed, state, ELLIPSE_SIGMAS);
     drawBlimp(c, view, theme, placed, state, { old, label: old ? "last known" : "" });
   }
+}
+
+/** @param {string} name */
+function short(name) {
+  return name.length > LABEL ? `${name.slice(0, LABEL - 1)}…` : name;
 }
 
 /** @param {import("./store.js").Payload} payload @param {string} state */

@@ -7,6 +7,7 @@ import { floorGrid, frustum, landmarkPoints, trailLines } from "./scene_shapes.j
 import { Renderer, Shape } from "./webgl.js";
 
 const POINT_PX = 45;
+const DRAW_MS = 60; // it is a view to look around in, the numbers are elsewhere
 
 export class Scene {
   /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop @param {import("./theme.js").Theme} theme */
@@ -39,7 +40,7 @@ export class Scene {
     byId("scene-fit").addEventListener("click", () => this.fit());
     byId("scene-follow").addEventListener("click", () => this.follow(!this.is_following));
     this.start();
-    loop.add(["scene", "theme", "estimate", "trail", "payload", "stale"], () => this.draw());
+    loop.add(["scene", "theme", "estimate", "trail", "payload", "stale"], () => this.draw(), DRAW_MS);
   }
 
   start() {

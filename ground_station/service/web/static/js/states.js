@@ -14,11 +14,12 @@
 
 /** @type {Record<string, Look>} */
 const LOOKS = {
-  TRACKING: { key: "tracking", word: "Tracking", icon: "tracking", meaning: "Position known from this frame" },
+  TRACKING: { key: "tracking", word: "Tracking", icon: "tracking", meaning: "Position known" },
   DEGRADED: { key: "degraded", word: "Degraded", icon: "degraded", meaning: "Position known, but weakly" },
   LOST: { key: "lost", word: "Lost", icon: "lost", meaning: "Position unknown" },
   INITIALIZING: { key: "initializing", word: "Initializing", icon: "initializing", meaning: "Looking for the first position" },
   GONE: { key: "gone", word: "Gone", icon: "gone", meaning: "Nothing is heard of this payload" },
+  OFFLINE: { key: "gone", word: "Offline", icon: "gone", meaning: "The station is not connected; what is shown is old" },
   STALE: { key: "gone", word: "No estimate", icon: "gone", meaning: "No estimate comes any more" },
   WAITING: { key: "none", word: "Waiting", icon: "none", meaning: "No estimate yet" },
   NONE: { key: "none", word: "No payload", icon: "none", meaning: "No payload has been heard yet" },

@@ -172,14 +172,19 @@ export class Store {
 
   /** Whether what the page shows of a payload is of now. @param {Payload|null} payload */
   isLive(payload) {
-    if (!payload?.is_alive || this.link.phase !== "open") return false;
-    return performance.now() - payload.told_ms < STALE_S * 1e3;
+    return Boolean(payload?.is_alive) && this.isTold(payload);
+  }
+
+  /** Whether the station still speaks of a payload. @param {Payload|null} payload */
+  isTold(payload) {
+    return this.link.phase === "open" && performance.now() - (payload?.told_ms ?? 0) < STALE_S * 1e3;
   }
 
   /** The state to show, which may be less than the last estimate's. @param {Payload|null} payload */
   stateOf(payload) {
-    if (!payload) return "NONE";
-    if (!this.isLive(payload)) return "GONE";
+    if (!payload) return this.link.phase === "open" ? "NONE" : "OFFLINE";
+    if (!this.isTold(payload)) return "OFFLINE";
+    if (!payload.is_alive) return "GONE";
     if (!payload.estimate) return "WAITING";
     return performance.now() - payload.estimate_ms < STALE_S * 1e3 ? payload.estimate.state : "STALE";
   }

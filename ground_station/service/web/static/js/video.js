@@ -40,6 +40,7 @@ export class Video {
   turn(is_on) {
     this.is_on = is_on;
     setAttribute(byId("video-toggle"), "aria-pressed", String(is_on));
+    setText(byId("video-toggle"), is_on ? "On" : "Off");
     if (!is_on) this.clear();
     this.ask();
     this.loop.mark("video");
@@ -139,6 +140,7 @@ export class Video {
     const since_s = (performance.now() - this.shown_at_ms) / 1e3;
     const is_stale = Boolean(this.shown) && since_s > 2;
     setAttribute(this.canvas, "data-stale", is_stale ? "true" : null);
+    setAttribute(this.overlay, "data-stale", is_stale ? "true" : null);
     show(this.empty, !this.shown || is_stale);
     const text = !this.is_on
       ? "Video is off"

@@ -1,0 +1,450 @@
+"""The dashboard in a real browser, against a station that says what a test wants it to say."""
+
+from __future__ import annotations
+
+import base64
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from fake_station import FRAMES, STATIC, FakeStation, Payload, Served, sample_flight, sample_station
+
+LIMIT_MS = 20_000
+SIZES = {"desk": (1440, 900), "landscape": (1024, 768), "portrait": (768, 1024)}
+# It reports a refused connection itself, whoever waits for it; it advises on reading canvases back,
+# which the tests do and the page does not; and on its own way of drawing without a GPU.
+OF_THE_BROWSER = ("ERR_CONNECTION", "willReadFrequently", "GL Driver Message")
+# The page's own clock is eleven days off, in all tests: it must not matter.
+WRONG_CLOCK = "const now = Date.now; Date.now = () => now() + 1e9;"
+WATCH_POLICY = (
+    "window.violations = []; addEventListener('securitypolicyviolation',"
+    " (e) => violations.push(e.violatedDirective + ' ' + e.blockedURI));"
+)
+
+
+class Watched:
+    """A page with all that it complained of."""
+
+    def __init__(self, browser: Any, served: Served) -> None:
+        width, height = SIZES["desk"]
+        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page.set_default_timeout(LIMIT_MS)
+        self.problems: list[str] = []
+        self.hosts: set[str] = set()
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", self._said)
+        self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        self.page.add_init_script(WRONG_CLOCK)
+        self.page.add_init_script(WATCH_POLICY)
+        self.page.goto(served.url)
+        self.page.wait_for_selector('#link[data-phase="open"]')
+        self.page.evaluate("window.marker = 'not loaded anew'")
+
+    def _said(self, message: Any) -> None:
+        expected = any(word in message.text for word in OF_THE_BROWSER)
+        if message.type in ("error", "warning") and not expected:
+            self.problems.append(message.text)
+
+    def until(self, expression: str) -> None:
+        """Waits until a JavaScript expression is true.
+
+        Playwright's own waiting evaluates text in the page, which the policy forbids.
+        """
+        eventually(lambda: bool(self.page.evaluate(expression)))
+
+    def text(self, selector: str) -> str:
+        """The text of an element."""
+        return str(self.page.text_content(selector))
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    one = Served(sample_station())
+    sample_flight()
+    yield one
+    one.stop()
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Any, served: Served) -> Iterator[Watched]:
+    watched = Watched(browser, served)
+    yield watched
+    watched.page.close()
+
+
+@pytest.fixture
+def shown(opened: Watched, served: Served) -> Iterator[Watched]:
+    """The page and a station that is as at its start; what the page complains of fails the test."""
+    fresh, station = sample_station(), served.station
+    for name in ("refuse", "answer_s", "recording", "demo", "floorplan", "map", "name"):
+        setattr(station, name, getattr(fresh, name))
+    for name, payload in fresh.payloads.items():
+        station.payloads[name].__dict__.update(
+            payload.__dict__ | {"sequence": station.payloads[name].sequence}
+        )
+    station.alarms.clear()
+    station.asked.clear()
+    opened.page.keyboard.press("1")
+    opened.until("document.querySelector('#alarms').childElementCount === 0")
+    opened.until("document.querySelector('.state').dataset.state === 'tracking'")
+    opened.until("!document.querySelector('[data-phase=working]')")
+    yield opened
+    assert opened.problems == []
+    assert opened.page.evaluate("violations") == []
+    assert opened.hosts == {f"127.0.0.1:{served.port}"}
+    assert opened.page.evaluate("window.marker") == "not loaded anew"
+
+
+@pytest.fixture
+def station(served: Served) -> FakeStation:
+    return served.station
+
+
+def eventually(holds: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + LIMIT_MS / 1e3
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def stand_still(watched: Watched, station: FakeStation, frame: int) -> None:
+    """The first payload stays at a frame of the sample, and the page shows it."""
+    one = station.payloads["blimp-1"]
+    one.flies = False
+    time.sleep(0.1)  # a step that has begun is over then
+    one.sequence = (one.sequence // FRAMES + 1) * FRAMES + frame
+    x = sample_flight().positions_m[frame][0]
+    watched.until(f"document.querySelector('[data-f=x]').textContent === '{x:.2f}'")
+
+
+PIXEL = """([id, x, y]) => {
+    const canvas = document.getElementById(id);
+    const ratio = canvas.width / canvas.clientWidth;
+    const [u, v] = [Math.round(x * ratio), Math.round(y * ratio)];
+    return [...canvas.getContext('2d').getImageData(u, v, 1, 1).data];
+}"""
+
+
+def rgb(colour: str) -> list[int]:
+    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+
+
+@pytest.mark.parametrize("frame", [40, 150])
+def test_the_blimp_is_drawn_where_it_is(shown: Watched, station: FakeStation, frame: int) -> None:
+    stand_still(shown, station, frame)
+    x_m, y_m, _ = sample_flight().positions_m[frame]
+    box = shown.page.locator("#plan-above").bounding_box()
+    # The whole plan, 25.5 m x 17.5 m around (12, 8), with a margin of 16 px.
+    scale = min((box["width"] - 32) / 25.5, (box["height"] - 32) / 17.5)
+    place = [
+        box["width"] / 2 + (x_m - 12) * scale,
+        box["height"] / 2 - (y_m - 8) * scale,
+    ]
+    tracking = rgb(
+        shown.page.evaluate(
+            "getComputedStyle(document.documentElement).getPropertyValue('--tracking')"
+        ).strip()
+    )
+    eventually(lambda: shown.page.evaluate(PIXEL, ["plan-above", *place])[:3] == tracking)
+
+
+def test_the_picture_is_the_newest_and_its_landmarks_lie_on_it(
+    shown: Watched, station: FakeStation
+) -> None:
+    for frame in (60, 120):
+        stand_still(shown, station, frame)
+        sequence = station.payloads["blimp-1"].sequence
+        shown.until(f"document.querySelector('#video-caption').textContent.includes('{sequence}')")
+        url = shown.page.evaluate("document.getElementById('video-picture').toDataURL()")
+        png = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
+        picture = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE).astype(float)
+        jpeg = np.frombuffer(sample_flight().jpegs[frame // 2], np.uint8)
+        sent = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+        assert np.abs(picture - sent).mean() < 2.0
+        u, v = sample_flight().points_px[frame][:2]
+        box = shown.page.locator("#video-points").bounding_box()
+        scale = min(box["width"] / 640, box["height"] / 480)
+        place = [
+            (box["width"] - 640 * scale) / 2 + (u + 0.5) * scale,
+            (box["height"] - 480 * scale) / 2 + (v + 0.5) * scale,
+        ]
+        eventually(
+            lambda place=place: (
+                shown.page.evaluate(PIXEL, ["video-points", *place])[:3] == [240, 228, 66]
+            )
+        )
+
+
+def test_the_scene_shows_the_map_and_can_be_turned(shown: Watched) -> None:
+    scene = shown.page.locator("#scene-canvas")
+    before = cv2.imdecode(np.frombuffer(scene.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 50
+    scene.focus()
+    for _ in range(4):
+        shown.page.keyboard.press("ArrowLeft")
+    shown.page.wait_for_timeout(300)
+    after = cv2.imdecode(np.frombuffer(scene.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(after.astype(int) - before).mean() > 1.0
+    shown.page.keyboard.press("0")
+
+
+def test_latencies_are_by_the_stations_clock(shown: Watched, station: FakeStation) -> None:
+    shown.until("Number(document.querySelector('[data-f=pose]').textContent) > 0")
+    assert 20 <= float(shown.text("[data-f=pose]")) <= 60  # the fake's are 32 to 48 ms
+    shown.until("Number(document.querySelector('[data-f=screen]').textContent) > 0")
+    assert 0 < float(shown.text("[data-f=screen]")) < 10_000
+    eventually(lambda: any(heard["type"] == "shown" for heard in station.heard))
+    told = [heard["shown_ms"] for heard in station.heard if heard["type"] == "shown"]
+    assert all(0 < ms < 10_000 for ms in told)
+
+
+def test_an_alarm_is_loud_then_acknowledged_and_quiet_then_gone(
+    shown: Watched, station: FakeStation
+) -> None:
+    station.alarm("lost", "alarm", "blimp-1", "LOST for 2 s: no landmarks")
+    row = '[data-id="lost/blimp-1"]'
+    shown.page.wait_for_selector(row)
+    assert "blimp-1: LOST for 2 s: no landmarks" in shown.text(row)
+    shown.until("document.title.startsWith('⚠ blimp-1: LOST')")
+    assert "LOST" in shown.text("#say")
+    loud = shown.page.locator(row).bounding_box()["height"]
+    shown.page.click(f"{row} button")
+    shown.page.wait_for_selector(f"{row}[data-seen]")
+    assert shown.page.locator(row).bounding_box()["height"] < loud
+    station.end_alarms()
+    shown.page.wait_for_selector(row, state="detached")
+    shown.until("!document.title.startsWith('⚠')")
+    # When it comes again, it is new.
+    station.alarm("lost", "alarm", "blimp-1", "LOST for 2 s: no landmarks")
+    shown.page.wait_for_selector(f"{row}:not([data-seen])")
+
+
+def test_states_are_said_in_words_and_old_values_are_not_shown_as_current(
+    shown: Watched, station: FakeStation
+) -> None:
+    one = station.payloads["blimp-1"]
+    one.state, one.reason = "DEGRADED", "few landmarks: 14 of 120"
+    shown.until("document.querySelector('.state').dataset.state === 'degraded'")
+    assert shown.text("[data-f=word]") == "Degraded"
+    assert shown.text("[data-f=reason]") == "few landmarks: 14 of 120"
+    assert shown.page.locator(".metrics[data-stale]").count() == 0
+    one.state, one.reason = "LOST", "no landmarks"
+    shown.until("document.querySelector('.state').dataset.state === 'lost'")
+    shown.page.wait_for_selector(".metrics[data-stale]")
+    assert "last known" in shown.text(".old-tag")
+    one.alive = False
+    shown.until("document.querySelector('[data-f=word]').textContent === 'Gone'")
+    assert re.search(r"since \d\d:\d\d:\d\d", shown.text("[data-f=since]"))
+    shown.page.wait_for_selector("#battery[data-stale]")
+    assert shown.page.locator("#act-relocalize").is_disabled()
+    one.alive, one.state = True, "TRACKING"
+    shown.until("document.querySelector('[data-f=word]').textContent === 'Tracking'")
+    shown.page.wait_for_selector("#battery:not([data-stale])")
+
+
+def test_a_recording_starts_and_stops(shown: Watched, station: FakeStation) -> None:
+    shown.page.click("#act-record")
+    shown.page.wait_for_selector("#act-record[data-on]")
+    assert station.asked == [("recording", {"active": True})]
+    shown.until("document.querySelector('#act-record').textContent.includes('Stop')")
+    shown.page.click("#act-record")
+    shown.page.wait_for_selector("#act-record:not([data-on])")
+    assert station.asked[1:] == [("recording", {"active": False})]
+
+
+def test_a_refusal_says_why_and_work_shows_that_it_works(
+    shown: Watched, station: FakeStation
+) -> None:
+    station.refuse, station.answer_s = "the localizer is loading a map", 0.7
+    working = shown.page.evaluate(
+        """() => {
+            const button = document.getElementById('act-relocalize');
+            button.click();
+            const shows = button.dataset.phase === 'working' && button.ariaBusy === 'true';
+            button.click(); // while it works it asks nothing more
+            return shows;
+        }"""
+    )
+    assert working
+    shown.page.wait_for_selector('#act-relocalize[data-phase="refused"]')
+    assert "refused: the localizer is loading a map" in shown.text("#outcome")
+    assert [what for what, _ in station.asked] == ["blimp-1/relocalize"]
+
+
+def test_what_is_dangerous_wants_the_payloads_name(shown: Watched, station: FakeStation) -> None:
+    shown.page.click("#act-power")
+    assert shown.page.locator("#power-shutdown").is_disabled()
+    shown.page.fill("#power-word", "blimp-2")
+    assert shown.page.locator("#power-shutdown").is_disabled()
+    shown.page.fill("#power-word", "blimp-1")
+    shown.page.keyboard.press("Enter")
+    assert station.asked == []
+    shown.page.click("#power-shutdown")
+    eventually(lambda: len(station.asked) == 1)
+    assert station.asked == [("blimp-1/command", {"name": "shutdown", "arguments": {}})]
+
+
+def test_a_map_is_chosen_and_one_without_a_plan_has_a_grid(
+    shown: Watched, station: FakeStation
+) -> None:
+    shown.page.click("#act-map")
+    shown.page.click("text=great-hall-of-the-east-wing")
+    shown.page.wait_for_selector("#plan-empty:not([hidden])")
+    assert station.asked == [("blimp-1/map", {"name": "great-hall-of-the-east-wing"})]
+    assert "no floor plan" in shown.text("#plan-empty")
+    station.payloads["blimp-1"].map = "atrium"
+    shown.page.wait_for_selector("#plan-empty", state="hidden")
+
+
+def test_events_are_newest_first_bounded_filtered_and_never_markup(
+    shown: Watched, station: FakeStation
+) -> None:
+    for k in range(450):
+        station.event(("info", "warning", "alarm")[k % 3], f"event {k}", "blimp-1")
+    station.event("alarm", "<img src=x onerror=alert(1)><b>bold</b>", "blimp-1")
+    shown.until("document.querySelector('.event .text')?.textContent.includes('<b>bold</b>')")
+    assert shown.page.locator(".event").count() == 200
+    assert "event 449" in shown.text(".event:nth-child(2) .text")
+    shown.page.click('.events [data-level="alarm"]')
+    shown.until("document.querySelectorAll('.event:not([data-level=alarm])').length === 0")
+    assert shown.page.locator(".event").count() > 100
+    shown.page.click('.events [data-level="info"]')
+
+
+def test_keys_do_what_the_help_says(shown: Watched, station: FakeStation) -> None:
+    keys = shown.page.keyboard
+    keys.press("?")
+    shown.page.wait_for_selector("#help-dialog[open]")
+    assert "Relocalize" in shown.text("#help-keys")
+    keys.press("Escape")
+    shown.page.wait_for_selector("#help-dialog", state="hidden")
+    keys.press("l")
+    eventually(lambda: ("blimp-1/relocalize", {}) in station.asked)
+    keys.press("2")
+    shown.page.wait_for_selector('.payload[aria-label^="blimp-2"][aria-checked="true"]')
+    shown.until("document.querySelector('#video-caption').textContent.includes('frame')")
+    keys.press("f")
+    shown.page.wait_for_selector('#plan-follow[aria-pressed="true"]')
+    keys.press("0")
+    shown.page.wait_for_selector('#plan-follow[aria-pressed="false"]')
+    below = "document.getElementById('plan-below').toDataURL()"
+    shown.page.wait_for_timeout(300)
+    before = shown.page.evaluate(below)
+    shown.page.focus("#plan-above")
+    keys.press("ArrowRight")
+    eventually(lambda: shown.page.evaluate(below) != before)
+    keys.press("0")
+
+
+def test_thirty_estimates_a_second_do_not_lay_the_page_out_thirty_times(shown: Watched) -> None:
+    session = shown.page.context.new_cdp_session(shown.page)
+    session.send("Performance.enable")
+
+    def metrics() -> dict[str, float]:
+        found = session.send("Performance.getMetrics")["metrics"]
+        return {metric["name"]: metric["value"] for metric in found}
+
+    begin = metrics()
+    shown.page.wait_for_timeout(2000)
+    end = metrics()
+    span_s = end["Timestamp"] - begin["Timestamp"]
+    # Text that people read changes seven times a second at most; an event or a tick may add some.
+    assert (end["LayoutCount"] - begin["LayoutCount"]) / span_s < 20
+    session.detach()
+
+
+@pytest.mark.parametrize("size", list(SIZES))
+def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: str) -> None:
+    name = "the-very-long-name-of-a-payload-number-17"
+    station.payloads[name] = Payload(name, first=80)
+    station.alarm("hot", "warning", name, "the payload's processor has 82 °C")
+    width, height = SIZES[size]
+    shown.page.set_viewport_size({"width": width, "height": height})
+    try:
+        shown.page.wait_for_selector(f'[data-id="hot/{name}"]')
+        shown.page.wait_for_selector(f'.payload[aria-label^="{name}"]')
+        shown.page.wait_for_timeout(300)
+        over = shown.page.evaluate(
+            """selectors => [...document.querySelectorAll(selectors)]
+                .filter((node) => node.scrollWidth > node.clientWidth + 1)
+                .map((node) => `${node.className}: ${node.textContent.trim().slice(0, 40)}`)""",
+            "html, .bar, .page, .metric, .lines div, .big, .pairs, .fates td:first-child, "
+            ".act span, .state-word, .alarm, .banner",
+        )
+        assert over == []
+    finally:
+        del station.payloads[name]
+        shown.page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
+
+
+def test_a_station_that_was_gone_is_taken_up_again_without_a_reload(
+    shown: Watched, served: Served
+) -> None:
+    served.stop()
+    shown.page.wait_for_selector("#offline:not([hidden])")
+    assert re.search(r"No connection to the station since \d\d:\d\d:\d\d", shown.text("#offline"))
+    shown.until("document.title.startsWith('⚠ No connection')")
+    shown.until("document.querySelector('[data-f=word]').textContent === 'Offline'")
+    shown.page.wait_for_selector(".metrics[data-stale]")
+    served.station.refuse = "never asked"
+    served.start()
+    shown.page.wait_for_selector("#offline", state="hidden")
+    shown.until("document.querySelector('[data-f=word]').textContent === 'Tracking'")
+    caption = shown.text("#video-caption")
+    eventually(lambda: shown.text("#video-caption") != caption)
+
+
+def test_the_files_load_nothing_from_elsewhere_and_need_no_markup_in_data() -> None:
+    for path in STATIC.rglob("*.*"):
+        text = path.read_text()
+        urls = set(re.findall(r"https?://[^\s\"'`)]+", text)) - {"http://www.w3.org/2000/svg"}
+        assert not urls, path
+        for word in (
+            "innerHTML",
+            "outerHTML",
+            "insertAdjacentHTML",
+            "eval(",
+            "Date.now",
+            "@import",
+        ):
+            assert word not in text, f"{path}: {word}"
+        if path.suffix == ".js":
+            assert text.startswith("// @ts-check"), path
+            assert text.count("\n") < 250, path
+    page = (STATIC / "index.html").read_text()
+    assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*src=)", page)
+    ids = re.findall(r'\sid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_text_stands_out_from_its_ground() -> None:
+    text = (STATIC / "tokens.css").read_text()
+    light, dark = text.split("@media (prefers-color-scheme: dark)")
+    colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
+    pairs = [
+        *[("ink", ground) for ground in ("ground", "surface", "raised", "degraded-fill")],
+        *[("ink-soft", ground) for ground in ("ground", "surface", "raised")],
+        *[("ink", f"{state}-fill") for state in ("tracking", "initializing", "gone", "none")],
+        *[(state, "surface") for state in ("tracking", "degraded", "lost", "initializing")],
+        *[("on-lost", "lost-fill"), ("accent", "surface"), ("accent", "initializing-fill")],
+    ]
+    for table in (colours, colours | dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", dark))):
+        for ink, ground in pairs:
+            ratio = contrast(table[ink], table[ground])
+            assert ratio >= 4.5, f"{ink} {table[ink]} on {ground} {table[ground]}: {ratio:.2f}"
+
+
+def contrast(ink: str, ground: str) -> float:
+    """WCAG 2.2's contrast ratio."""
+
+    def luminance(colour: str) -> float:
+        c = np.array(rgb(colour)) / 255
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    low, high = sorted((luminance(ink), luminance(ground)))
+    return (high + 0.05) / (low + 0.05)
