@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +117,13 @@ def read_tum(path: str | Path) -> Trajectory:
     return Trajectory(times, table[:, :3].copy(), quaternions)
 
 
+def tum_line(time_ns: int, position_m: Iterable[float], quaternion_xyzw: Iterable[float]) -> str:
+    """One pose as TUM text, without its line's end."""
+    sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
+    numbers = " ".join(f"{value:.9f}" for value in (*position_m, *quaternion_xyzw))
+    return f"{sign}{s}.{ns:09d} {numbers}"
+
+
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Writes a TUM text file, beside and renamed."""
     lines = ["# timestamp tx ty tz qx qy qz qw"]
@@ -125,7 +133,5 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         trajectory.quaternion_xyzw,
         strict=True,
     ):
-        sign, (s, ns) = ("-" if time_ns < 0 else ""), divmod(abs(time_ns), 1_000_000_000)
-        numbers = " ".join(f"{value:.9f}" for value in (*p, *q))
-        lines.append(f"{sign}{s}.{ns:09d} {numbers}")
+        lines.append(tum_line(time_ns, p, q))
     write_text(path, "\n".join(lines) + "\n")

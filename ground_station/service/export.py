@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.errors import GroundStationError, InputError
+from ground_station.geometry.trajectory import tum_line
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, PoseSample, RecordingReader, RecordingWriter
 
 HEADER = "# timestamp tx ty tz qx qy qz qw\n"
@@ -71,7 +72,7 @@ def tum(poses: Poses) -> Iterator[str]:
         if last_ns is not None and sample.time_ns < last_ns:
             yield AGAIN
         last_ns = sample.time_ns
-        yield _line(sample)
+        yield tum_line(sample.time_ns, sample.position_m, sample.quaternion_xyzw) + "\n"
     if poses.left_out:
         yield f"# {poses.left_out} left out: no finite pose or time\n"
     if poses.cut_reason:
@@ -110,9 +111,3 @@ def _usable(sample: PoseSample) -> bool:
     numbers = (*sample.position_m, *sample.quaternion_xyzw)
     finite = bool(np.isfinite(numbers).all() and np.linalg.norm(sample.quaternion_xyzw) > 1e-6)
     return finite and 0 <= sample.time_ns < 1 << 63
-
-
-def _line(sample: PoseSample) -> str:
-    seconds, ns = divmod(sample.time_ns, 1_000_000_000)
-    numbers = (*sample.position_m, *sample.quaternion_xyzw)
-    return f"{seconds}.{ns:09d} {' '.join(f'{number:.9f}' for number in numbers)}\n"

@@ -37,7 +37,7 @@ _WAITING_EVERY_S = 1.0
 _FORGET_AFTER, _END_AFTER = 3, 10
 """Frames in a row that failed: what is known of the flight may be the cause; the process is."""
 _BESIDE_NICE = 5
-"""On two busy cores: a pose's p99 50 to 70 ms, and 65 to 115 ms without."""
+"""On two busy cores, three rounds each: a pose's p99 49 to 72 ms, and 66 to 74 ms without."""
 
 
 class LocalizingError(GroundStationError):
