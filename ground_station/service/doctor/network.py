@@ -24,6 +24,8 @@ _RECEIVE_BYTES = 4 << 20
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _SCOUTING_GROUP, _SCOUTING_PORT = "224.0.0.224", 7446
 _COMMAND_S = 3.0
+_SERVICE = Path("/etc/blimp")
+"""The configuration of the installed service, whose user is blimp."""
 _TOKEN = "python3 -c 'import secrets; print(secrets.token_urlsafe(32))'"
 
 
@@ -188,8 +190,10 @@ def discovery(settings: StationSettings) -> Finding:
 
 def token(http: HttpSettings) -> Finding:
     """The dashboard's token is there where it must be, and nobody else's to read."""
-    path = Path(http.token_file or "/etc/blimp/token")
+    path = Path(http.token_file or (_SERVICE / "token" if _SERVICE.is_dir() else "token"))
     make = f"(umask 077; {_TOKEN} >{path})"
+    if path.parent == _SERVICE:
+        make += f" && chown blimp {path}"
     if path.exists() and not os.access(path, os.R_OK):
         found = f"{path}: not this user's to read"
         return warning("token", found, f"sudo -u '#{path.stat().st_uid}' blimp doctor reads it")
