@@ -159,10 +159,8 @@ def _of_board(
 
 
 def _of_gone(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    if not isinstance(view.get("payload"), dict):
-        return
-    seen_s = _number(_table(view, "age_s").get("frame"))
-    if seen_s is not None and seen_s > GONE_FOR_S:
+    gone_s = _number(view.get("gone_s"))
+    if gone_s is None or gone_s > GONE_FOR_S:  # never here, or switched off for long
         return
     name = f"gone/{payload_id}"
     if view.get("ended"):
@@ -176,7 +174,10 @@ def _of_recording(state: Mapping[str, Any], standing: frozenset[str]) -> Iterato
     if recording.get("problem"):
         yield Alarm("recording", ALARM, STATION, f"recording: {recording['problem']}")
     free_MB = _number(recording.get("free_MB"))
-    if recording.get("active") and _below(free_MB, 2 * DISK_WARNING_MB, "disk" in standing):
+    # It ends at the setting's limit: the warning comes before.
+    limit_MB = _number(_table(state, "station").get("min_free_MB")) or 0.0
+    limit_MB = limit_MB + max(limit_MB, DISK_WARNING_MB)
+    if recording.get("active") and _below(free_MB, limit_MB, "disk" in standing):
         yield Alarm("disk", WARNING, STATION, f"{free_MB:.0f} MB left on the recordings' disk")
 
 

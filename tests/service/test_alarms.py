@@ -129,8 +129,16 @@ def test_a_payload_that_is_gone(told, how):
 
 def test_a_payload_gone_for_long_is_no_alarm_any_more(told):
     snapshot, clock = told
-    clock.ns += 11 * 60 * S
-    assert ids(snapshot) == {}
+    for after_s, found in ((300, {f"gone/{P}"}), (301, set())):
+        clock.ns += after_s * S
+        snapshot.payload(P, station.payload(alive=False))
+        snapshot.process("-", station.process())
+        assert set(ids(snapshot)) == found
+
+
+def test_a_payload_that_was_never_here_is_not_gone(told):
+    told[0].payload("blimp-2", station.payload(alive=False))
+    assert ids(told[0]) == {}
 
 
 def test_an_unknown_clock(told):
@@ -150,8 +158,9 @@ def test_an_unknown_clock(told):
     ("recording", "found"),
     [
         ({"problem": "the disk is full"}, {"recording": "alarm"}),
-        ({"active": True, "free_MB": 900.0}, {"disk": "warning"}),
-        ({"active": False, "free_MB": 900.0}, {}),
+        ({"active": True, "free_MB": 2000.0}, {"disk": "warning"}),  # it ends at 1024
+        ({"active": True, "free_MB": 2100.0}, {}),
+        ({"active": False, "free_MB": 2000.0}, {}),
         ({"active": True, "free_MB": None}, {}),
     ],
 )

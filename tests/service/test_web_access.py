@@ -258,7 +258,7 @@ def test_reading_is_not_done_on_behalf_of_another_site(opened):
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/api/state", "/nope", "/login", "/api/docs", "/metrics", "/static/nope.js"]
+    "path", ["/", "/api/state", "/nope", "/page.css", "/api/docs", "/metrics", "/static/nope.js"]
 )
 def test_every_answer_carries_the_headers(opened, path):
     client, _ = opened
@@ -347,6 +347,14 @@ def test_failed_bearer_tokens_count_as_well(closed):
 def test_a_login_that_is_no_form(closed, body):
     headers = {**OWN, "content-type": "application/x-www-form-urlencoded"}
     assert closed[0].post("/login", content=body, headers=headers).status_code in (401, 422)
+
+
+def test_the_form_is_sent_with_its_origin(closed):
+    """Under no-referrer a browser sends a form's Origin as null, which is another site's."""
+    client, _ = closed
+    for answer in (client.get("/login"), log_in(client, "wrong")):
+        assert answer.headers["referrer-policy"] == "same-origin"
+    assert log_in(client, headers={"origin": "null"}).status_code == 403
 
 
 def test_a_login_of_another_site(closed):

@@ -12,6 +12,10 @@ from pi_firmware.wire.errors import BlimpError
 
 _BAD_INPUT, _FAILED = 2, 1
 _BEAT_S = 0.5
+_EXPOSED = (
+    "{host} is reached by others, who need the token; plain HTTP does not hide it from who listens"
+    " on that network (a tunnel does: ssh -L)"
+)
 
 
 class ServerEnded(BlimpError):
@@ -37,7 +41,7 @@ async def _serve(folder: Path) -> None:
     from ground_station.service import processes
     from ground_station.service.bus import Bus
     from ground_station.service.settings import load_run
-    from ground_station.service.web.access import read_token
+    from ground_station.service.web.access import is_loopback, read_token
     from ground_station.service.web.app import build
     from ground_station.service.web.server import listen, server
 
@@ -55,6 +59,8 @@ async def _serve(folder: Path) -> None:
         host, port = socket.getsockname()[:2]
         place = f"[{host}]" if ":" in host else host
         print(f"dashboard: http://{place}:{port}/", flush=True)
+        if not is_loopback(http.host):
+            print(f"web: {_EXPOSED.format(host=http.host)}", file=sys.stderr, flush=True)
         while not stop.is_set() and not task.done():
             bus.beat()  # from this loop: one that hangs is silent
             try:

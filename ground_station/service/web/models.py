@@ -79,6 +79,7 @@ class StationModel(BaseModel):
     started_ns: int
     map: str
     demo: bool
+    min_free_MB: int
 
 
 class ProcessModel(BaseModel):
@@ -101,6 +102,7 @@ class PayloadModel(BaseModel):
     estimate: EstimateNote | None
     alive: bool
     alive_s: float | None
+    gone_s: float | None
     ended: bool
     age_s: dict[str, float | None]
     stale: list[str]

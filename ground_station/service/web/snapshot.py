@@ -62,6 +62,7 @@ class _Payload:
     clock_ns: int | None = None  # since when the payload's clock is not known
     ended: bool = False
     alive_ns: int | None = None  # since when it is heard
+    heard_ns: int | None = None  # when it was last
     trail: Trail = field(default_factory=Trail)
 
 
@@ -151,8 +152,10 @@ class Snapshot:
             now_ns = self._clock_ns()
             if not note.alive:
                 item.alive_ns = None
-            elif not self._alive(item, now_ns):
-                item.alive_ns, item.ended = now_ns, False
+            else:
+                if not self._alive(item, now_ns):
+                    item.alive_ns, item.ended = now_ns, False
+                item.heard_ns = now_ns
             if note.clock is not None:
                 item.clock_ns = None
             elif item.clock_ns is None:
@@ -239,6 +242,7 @@ class Snapshot:
                     "started_ns": self.run.started_ns,
                     "map": Path(station.map.folder).name,
                     "demo": self.run.demo,
+                    "min_free_MB": station.recording.min_free_MB,
                 },
                 "processes": [
                     {
@@ -266,11 +270,13 @@ class Snapshot:
         estimate = item.estimate
         if estimate is not None and not full:
             estimate = dataclasses.replace(estimate, points_px=[])
+        alive = self._alive(item, now_ns)
         result: dict[str, Any] = {
             "payload": None if item.payload is None else notes.as_document(item.payload),
             "estimate": None if estimate is None else notes.as_document(estimate),
-            "alive": self._alive(item, now_ns),
-            "alive_s": _age_s(now_ns, item.alive_ns) if self._alive(item, now_ns) else None,
+            "alive": alive,
+            "alive_s": _age_s(now_ns, item.alive_ns) if alive else None,
+            "gone_s": None if alive else _age_s(now_ns, item.heard_ns),
             "ended": item.ended,
             "age_s": age_s,
             "stale": [name for name, age in age_s.items() if age and age > STALE_S[name]],
