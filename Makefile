@@ -2,10 +2,11 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench soak lock sample virtual-camera
+.PHONY: help setup demo serve test check bench soak install-service uninstall-service lock sample \
+  virtual-camera
 
 help:  ## Show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
 
 setup:  ## Install system packages (root or sudo for these only) and the locked Python environment
 	@sh deploy/ground_station/setup.sh
@@ -13,8 +14,14 @@ setup:  ## Install system packages (root or sudo for these only) and the locked 
 demo: setup  ## Map the sample atrium, stream the sample flight, localize it live: out/demo/report.html
 	@$(BLIMP) replay --demo --out out/demo
 
-serve: setup  ## Run the ground station with the sample flight: http://127.0.0.1:8080/
-	@$(BLIMP) serve --demo
+serve: setup  ## Run the ground station: the sample flight, or MAP=maps/NAME; http://127.0.0.1:8080/
+	@$(BLIMP) serve $(if $(MAP),--map $(MAP),--demo)
+
+install-service: setup  ## Install the ground station as a hardened system service (root or sudo)
+	@sh deploy/ground_station/service.sh install
+
+uninstall-service:  ## Take the service away; configuration and recordings stay
+	@sh deploy/ground_station/service.sh uninstall
 
 test: setup  ## Run the tests of every room
 	@.venv/bin/python -m pytest -q tests

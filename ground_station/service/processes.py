@@ -58,6 +58,7 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._started_s = 0.0
         self._heard_s: float | None = None
+        self._last_heard_s = clock()
         self._due_s: float | None = clock()
         self._pause_s = _FIRST_PAUSE_S
 
@@ -75,10 +76,15 @@ class Child:
             self._heard_s is not None and self._clock() - self._heard_s < _SILENT_S
         )
 
+    @property
+    def hopeful(self) -> bool:
+        """Whether it was heard within a minute: restarts of its own may still mend it."""
+        return not self.spec.beats or self._clock() - self._last_heard_s < _START_S
+
     def beat(self, pid: int) -> None:
         """It was heard; a beat of the process before it does not count."""
         if self._process is not None and pid == self._process.pid:
-            self._heard_s = self._clock()
+            self._heard_s = self._last_heard_s = self._clock()
 
     def step(self) -> str:
         """Starts it when it is due, and ends one that is silent; what happened, in words, or "".
@@ -186,8 +192,14 @@ class Children:
 
     def living(self) -> bool:
         """Whether every needed process runs and was heard of late."""
-        children = list(self._children.values())
-        return all(child.living for child in children if child.spec.needed)
+        return all(child.living for child in self._needed())
+
+    def hopeful(self) -> bool:
+        """Whether none of the needed processes has been silent for a minute, restarts and all."""
+        return all(child.hopeful for child in self._needed())
+
+    def _needed(self) -> list[Child]:
+        return [child for child in list(self._children.values()) if child.spec.needed]
 
     def close(self) -> None:
         """Ends all, the last ones started first."""

@@ -71,16 +71,16 @@ class _Parent:
         bus.hear(notes.PAYLOAD, PayloadNote, self._hear_payload)
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
-        """Until `stop`; systemd's watchdog is fed while every needed process is heard of."""
+        """Until `stop`; systemd's watchdog is fed while restarts of a process may still help."""
         ready, fed_s = False, 0.0
         while not stop.wait(_STEP_S):
             self.children.step()
             self._follow_payloads()
             self._bus.beat()
             now_s = time.monotonic()
-            if self.children.living() and now_s - fed_s > _FEED_S:
+            if now_s - fed_s > _FEED_S and self.children.hopeful():
                 fed_s = now_s
-                ready = ready or notifier.ready()
+                ready = ready or (self.children.living() and notifier.ready())
                 notifier.alive()
 
     def _hear_payload(self, payload_id: str, note: PayloadNote) -> None:

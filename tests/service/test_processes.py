@@ -100,6 +100,9 @@ def test_a_process_that_falls_silent_is_killed_and_started_anew(modules: Path) -
     clock.now_s += 0.6
     child.step()
     assert child.pid not in (None, first)
+    assert child.hopeful
+    clock.now_s += 60
+    assert not child.hopeful  # a minute's restarts did not help
     child.terminate()
     child.wait(clock() + LIMIT_S)
 
