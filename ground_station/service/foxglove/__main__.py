@@ -38,13 +38,18 @@ def main(arguments: list[str]) -> int:
         print("usage: python -m ground_station.service.foxglove RUN_FOLDER", file=sys.stderr)
         return _BAD_INPUT
     stop = _ending()
+    # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # The SDK tells each client that comes with another protocol, as any web page may: not news.
     logging.getLogger("foxglove").setLevel(logging.ERROR)
+
+    import cv2
 
     from ground_station.service import processes, settings
     from ground_station.service.bus import Bus
     from ground_station.service.foxglove.process import Publishing
 
+    cv2.setNumThreads(1)
     folder = Path(arguments[0])
     try:
         run = settings.load_run(folder)
