@@ -95,6 +95,25 @@ def test_a_viewer_is_greeted_with_everything_and_then_told_what_changes(served):
     run(main())
 
 
+def test_a_note_of_other_types_ends_nothing(served, capfd):
+    web, bus, port = served
+    bus.put(notes.ESTIMATE, P, station.estimate(points_px=None, stage_ms=[], done_ns="x"))
+    bus.put(notes.EVENT, P, station.event(text=None, level=7))
+    bus.put(notes.PAYLOAD, P, station.payload(battery=[], health="x", frames=None))
+    web.snapshot.set_alarms([])
+    web.snapshot._payloads[P].came_ns["frame"] = "what nobody checks"
+
+    async def main():
+        async with connect(port) as viewer:
+            with pytest.raises((TimeoutError, websockets.ConnectionClosed)):
+                await next_of(viewer, "hello", limit_s=0.6)
+            web.snapshot._payloads[P].came_ns["frame"] = 0
+        async with connect(port) as viewer:
+            await next_of(viewer, "state")
+
+    run(main())
+
+
 def test_a_payload_that_goes_is_told(served):
     _, bus, port = served
 

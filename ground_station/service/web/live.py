@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import sys
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +21,7 @@ from ground_station.service.settings import HttpSettings
 from ground_station.service.web.access import Buckets
 from ground_station.service.web.metrics import Metrics
 from ground_station.service.web.outbox import Outbox
-from ground_station.service.web.snapshot import PAYLOADS, Snapshot
+from ground_station.service.web.snapshot import PAYLOADS, TEXT, Snapshot
 from ground_station.service.web.video import Video
 
 STATE_S = 0.25
@@ -109,7 +111,9 @@ class Live:
 
     def event(self, payload_id: str, note: EventNote) -> None:
         """Everybody is told."""
-        self._tell(_text("event", event={**notes.as_document(note), "payload": payload_id}))
+        document = notes.as_document(note)
+        document["text"] = str(document["text"])[:TEXT]
+        self._tell(_text("event", event={**document, "payload": payload_id}))
 
     def recording(self, _: str, note: RecordingNote) -> None:
         """Everybody is told the newest."""
@@ -127,8 +131,14 @@ class Live:
 
     async def tick(self) -> None:
         """Judges the alarms and tells the state, four times a second, for ever."""
+        complained = False
         while True:
-            self.step()
+            try:
+                self.step()
+            except Exception:  # a note with values of other types than its own
+                if not complained:
+                    traceback.print_exc(file=sys.stderr)
+                complained = True
             await asyncio.sleep(STATE_S)
 
     def step(self) -> None:

@@ -34,7 +34,7 @@ from pi_firmware.wire.keys import check_payload_id
 
 EVENTS, EVENTS_SHOWN, PAYLOADS, PROCESSES = 500, 200, 32, 32
 POINTS = 300
-_TEXT = 500
+TEXT = 500
 _PROCESS_KEPT_S = 60.0
 _GONE_S = 5.0
 _MESSAGES = ("battery", "health", "autopilot")
@@ -171,7 +171,7 @@ class Snapshot:
 
     def event(self, payload_id: str, note: EventNote) -> None:
         """Something happened."""
-        note = dataclasses.replace(note, text=str(note.text)[:_TEXT], name=str(note.name)[:64])
+        note = dataclasses.replace(note, text=str(note.text)[:TEXT], name=str(note.name)[:64])
         with self._lock:
             self._events.append({**notes.as_document(note), "payload": payload_id})
             if note.source == "payload" and note.name in _ENDED and payload_id in self._payloads:
