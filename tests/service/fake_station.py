@@ -350,7 +350,7 @@ def make_app(station: FakeStation) -> FastAPI:
     def map_details(name: str) -> dict[str, Any]:
         has_plan = station.floorplan and name == "atrium"
         plan = {**_PLAN, "url": f"/api/maps/{name}/floorplan.png"} if has_plan else None
-        bounds = {"min": [0.0, 0.0, 0.0], "max": [24.0, 16.0, 6.0]}
+        bounds = {"min": [-3.0, -40.0, -1.0], "max": [60.0, 30.0, 9.0]}  # with what a window shows
         return {"name": name, "registered": True, "floorplan": plan, "bounds": bounds}
 
     @app.get("/api/maps/{name}/floorplan.png")

@@ -73,32 +73,29 @@ async function loadPlan(url) {
 }
 
 /**
+ * What a view of the whole map shows: the plan, or where nearly all landmarks are. Landmarks seen
+ * through a window may lie far outside.
  * @param {import("./types.js").MapDetails} details @param {ImageBitmap|null} plan
  * @param {Float32Array} landmarks
  */
 function boundsOf(details, plan, landmarks) {
-  const min = [Infinity, Infinity, Infinity];
-  const max = [-Infinity, -Infinity, -Infinity];
-  /** @param {ArrayLike<number>} point */
-  const include = (point) => {
-    for (let axis = 0; axis < 3; axis += 1) {
-      if (!Number.isFinite(point[axis])) continue;
-      min[axis] = Math.min(min[axis], point[axis]);
-      max[axis] = Math.max(max[axis], point[axis]);
-    }
-  };
+  const { min, max } = middle(landmarks) ?? details.bounds ?? { min: [-5, -5, 0], max: [5, 5, 3] };
   const found = details.floorplan;
-  if (plan && found) {
-    const [x, y, yaw] = found.origin;
-    for (const [u, v] of [[0, 0], [plan.width, 0], [0, plan.height], [plan.width, plan.height]]) {
-      const [a, b] = [u * found.resolution_m, v * found.resolution_m];
-      include([x + a * Math.cos(yaw) - b * Math.sin(yaw), y + a * Math.sin(yaw) + b * Math.cos(yaw), 0]);
-    }
-  }
-  for (const corner of details.bounds ? [details.bounds.min, details.bounds.max] : []) include(corner);
-  if (!details.bounds) for (let k = 0; k < landmarks.length; k += 3) include(landmarks.subarray(k, k + 3));
-  for (let axis = 0; axis < 3; axis += 1) {
-    if (min[axis] > max[axis]) [min[axis], max[axis]] = [axis === 2 ? 0 : -5, 5];
-  }
-  return { min, max };
+  if (!plan || !found) return { min, max };
+  const [x, y, yaw] = found.origin;
+  const [w, h] = [plan.width * found.resolution_m, plan.height * found.resolution_m];
+  const corners = [[0, 0], [w, 0], [w, h], [0, h]].map(([a, b]) => [
+    x + a * Math.cos(yaw) - b * Math.sin(yaw),
+    y + a * Math.sin(yaw) + b * Math.cos(yaw),
+  ]);
+  const [xs, ys] = [0, 1].map((axis) => corners.map((corner) => corner[axis]));
+  return { min: [Math.min(...xs), Math.min(...ys), Math.min(0, min[2])], max: [Math.max(...xs), Math.max(...ys), max[2]] };
+}
+
+/** @param {Float32Array} xyz @returns {{min: number[], max: number[]}|null} what holds 96 % along each axis */
+function middle(xyz) {
+  if (xyz.length < 30) return null;
+  const sorted = [0, 1, 2].map((axis) => xyz.filter((_, k) => k % 3 === axis).sort());
+  const at = (/** @type {number} */ share) => sorted.map((values) => values[Math.floor(share * (values.length - 1))]);
+  return { min: at(0.02), max: at(0.98) };
 }

@@ -141,11 +141,14 @@ export function drawBlimp(c, view, theme, estimate, state, how = {}) {
   if (!how.label) return;
   c.font = "600 14px system-ui, sans-serif";
   c.textAlign = "center";
-  c.textBaseline = "top";
+  // The names of others stand above, what is said of this one below.
+  const is_above = how.size !== undefined;
+  const at = is_above ? y - r - 5 : y + r + 5;
+  c.textBaseline = is_above ? "bottom" : "top";
   c.lineWidth = 4;
   c.lineJoin = "round";
   c.strokeStyle = theme.colour("halo");
-  c.strokeText(how.label, x, y + r + 6);
+  c.strokeText(how.label, x, at);
   c.fillStyle = theme.colour("ink");
-  c.fillText(how.label, x, y + r + 6);
+  c.fillText(how.label, x, at);
 }

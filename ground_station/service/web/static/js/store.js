@@ -120,6 +120,7 @@ export class Store {
       this.payload(id).takeEntry(entry);
     }
     if (snapshot.payloads) {
+      this.forget(snapshot.payloads);
       for (const topic of ["payload", "estimate", "trail"]) this.changed(topic);
       if (!this.selected) this.select(this.firstId());
     }
@@ -127,6 +128,16 @@ export class Store {
     if (snapshot.events) this.takeEvents(snapshot.events);
     if (snapshot.alarms) this.takeAlarms(snapshot.alarms);
     if (snapshot.recording) this.takeRecording(snapshot.recording);
+  }
+
+  /** Those that the station does not know any more. @param {Record<string, unknown>} known */
+  forget(known) {
+    for (const id of [...this.payloads.keys()]) {
+      if (id in known) continue;
+      this.payloads.delete(id);
+      if (id === this.selected) this.select(this.firstId());
+      this.changed("payloads");
+    }
   }
 
   /** The first that lives, or the first. */

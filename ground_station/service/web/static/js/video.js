@@ -4,6 +4,7 @@ import { byId, canvasById, fitCanvas, setAttribute, setText, show, watchBox } fr
 import { number } from "./format.js";
 
 const TELL_MS = 200;
+const FAINT_FRAMES = 4;
 
 export class Video {
   /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop @param {import("./theme.js").Theme} theme @param {(message: Record<string, any>) => void} send */
@@ -111,25 +112,41 @@ export class Video {
     this.send({ type: "shown", sequence: header.sequence, shown_ms: this.latency_ms });
   }
 
+  /**
+   * The landmarks of just the shown frame; where the localizer left that one out, those of one
+   * shortly before, faintly.
+   * @returns {{points: number[], is_exact: boolean}|null}
+   */
+  points() {
+    const known = this.store.current?.points;
+    if (!this.shown || !known) return null;
+    for (let back = 0; back <= FAINT_FRAMES; back += 1) {
+      const points = known.get(this.shown.sequence - back);
+      if (points) return { points, is_exact: back === 0 };
+    }
+    return null;
+  }
+
   drawPoints() {
     const c = this.overlay.getContext("2d");
     if (!c) return;
     const ratio = fitCanvas(this.overlay, this.box);
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.clearRect(0, 0, this.overlay.width, this.overlay.height);
-    const points = this.shown && this.store.current?.points.get(this.shown.sequence);
-    if (!this.shown || !points?.length) return;
+    const found = this.points();
+    if (!this.shown || !found) return;
     // The picture lies in the middle of the box, as `object-fit: contain` puts it.
     const scale = Math.min(this.box.width / this.shown.width_px, this.box.height / this.shown.height_px) * ratio;
     const x0 = (this.overlay.width - this.shown.width_px * scale) / 2;
     const y0 = (this.overlay.height - this.shown.height_px * scale) / 2;
-    for (const [radius, colour] of /** @type {[number, string][]} */ ([[4.2, "#000000"], [2.8, "#f0e442"]])) {
+    c.globalAlpha = found.is_exact ? 1 : 0.4;
+    for (const [size, colour] of /** @type {[number, string][]} */ ([[4.2, "#000000"], [2.8, "#f0e442"]])) {
       c.beginPath();
-      for (let k = 0; k + 1 < points.length; k += 2) {
+      for (let k = 0; k + 1 < found.points.length; k += 2) {
         // Pixel (0, 0) is the centre of the first one.
-        const x = x0 + (points[k] + 0.5) * scale;
-        const y = y0 + (points[k + 1] + 0.5) * scale;
-        c.rect(x - (radius * ratio) / 2, y - (radius * ratio) / 2, radius * ratio, radius * ratio);
+        const x = x0 + (found.points[k] + 0.5) * scale;
+        const y = y0 + (found.points[k + 1] + 0.5) * scale;
+        c.rect(x - (size * ratio) / 2, y - (size * ratio) / 2, size * ratio, size * ratio);
       }
       c.fillStyle = colour;
       c.fill();
@@ -148,8 +165,8 @@ export class Video {
         ? "No picture yet"
         : `No picture for ${number(since_s, 0)} s`;
     if (!this.empty.hidden) setText(this.empty, text);
-    const points = this.shown && this.store.current?.points.get(this.shown.sequence);
-    const tracked = points ? `${points.length / 2} landmarks` : "";
+    const found = this.points();
+    const tracked = found ? `${found.points.length / 2} landmarks` : "";
     setText(this.caption, this.shown ? `frame ${this.shown.sequence}${tracked ? ` · ${tracked}` : ""}` : "");
   }
 }
