@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -125,11 +125,14 @@ class Client:
     """A client that knows nothing but the protocol: it decodes by the schemas it is told."""
 
     def __init__(self, port: int) -> None:
-        self.socket = connect(
-            f"ws://127.0.0.1:{port}",
-            subprotocols=[Subprotocol("foxglove.sdk.v1")],
-            max_size=None,
-            close_timeout=0.2,  # with messages unread its end of the closing is not read either
+        self._stack = ExitStack()
+        self.socket = self._stack.enter_context(
+            connect(
+                f"ws://127.0.0.1:{port}",
+                subprotocols=[Subprotocol("foxglove.sdk.v1")],
+                max_size=None,
+                close_timeout=0.2,  # with messages unread its end of the closing is unread, too
+            )
         )
         self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
@@ -140,7 +143,7 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.socket.close()
+        self._stack.close()
 
     def subscribe(self, *topics: str) -> None:
         """Waits until they are told of, and subscribes."""

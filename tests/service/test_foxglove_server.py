@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 import subprocess
@@ -25,7 +26,9 @@ from ground_station.geometry.camera import Camera
 from ground_station.mapping import store
 from ground_station.service import notes
 from ground_station.service.foxglove.inbox import Inbox
+from ground_station.service.foxglove.log import SeldomHandler
 from ground_station.service.foxglove.topics import json_topic
+from ground_station.service.localizing.seldom import Seldom
 from ground_station.service.notes import EventNote, FrameNote, PayloadNote, RecordingNote
 
 RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))
@@ -330,8 +333,9 @@ def test_it_says_that_it_lives(stand: SimpleNamespace) -> None:
 
 
 def test_another_protocol_is_refused(stand: SimpleNamespace) -> None:
-    with pytest.raises(InvalidStatus):
-        connect(f"ws://127.0.0.1:{stand.port}", subprotocols=[Subprotocol("chat")])
+    other = connect(f"ws://127.0.0.1:{stand.port}", subprotocols=[Subprotocol("chat")])
+    with pytest.raises(InvalidStatus), other:
+        pass
 
 
 def test_a_bus_that_comes_back_is_heard_again(tmp_path: Path) -> None:
@@ -369,6 +373,18 @@ def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert f"foxglove.port {port}" in line and "in use" in line
+
+
+def test_what_clients_make_the_sdk_say_is_said_once_a_minute() -> None:
+    said: list[str] = []
+    times_s = iter([0.0, 1.0, 59.0, 61.0])
+    handler = SeldomHandler(Seldom(lambda _, text: said.append(text), lambda: next(times_s)))
+    for number in range(4):
+        text = f"client {number}: {'x' * 10_000}"
+        handler.handle(logging.LogRecord("sdk", logging.ERROR, "", 0, text, None, None))
+    first, second = said
+    assert first.startswith("client 0") and len(first) <= 200
+    assert second.startswith("client 3") and second.endswith("(2 more since the last line)")
 
 
 def test_nothing_is_built_that_nobody_wants() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import signal
 import sys
@@ -40,9 +39,6 @@ def main(arguments: list[str]) -> int:
     stop = _ending()
     # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # The SDK tells each client that comes with another protocol, as any web page may: not news.
-    logging.getLogger("foxglove").setLevel(logging.ERROR)
-
     import cv2
 
     from ground_station.service import processes, settings

@@ -21,7 +21,7 @@ from ground_station.geometry.camera import Camera, load_camera
 from ground_station.mapping import store
 from ground_station.service import notes
 from ground_station.service.bus import Bus
-from ground_station.service.foxglove import checks, documents, drawing, world
+from ground_station.service.foxglove import checks, documents, drawing, log, world
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.payload import Payload
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
@@ -79,6 +79,7 @@ class Publishing:
         self._topics = {topic.id: topic for topic in topics}
         self._of_map = (self._plan.id, self._landmarks.id)
 
+        log.install(Seldom(_print))
         self.server = _listen(settings, context, self)
         bus.hear(notes.FRAME, FrameNote, self._hear_frame)
         bus.hear(notes.ESTIMATE, EstimateNote, self._later(self._take_estimate))
