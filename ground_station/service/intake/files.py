@@ -28,6 +28,7 @@ ESTIMATE_STATE_TOPIC = "/estimate/state"
 """JSON: the whole estimate but for the pixels of its points."""
 _OVERLAP_S = 2.0
 """How long a file waits for the last frames of a stream whose next IDR does not come."""
+_MOST_STREAMS = 64
 _LATE_S = 5.0
 """A file that is due goes on in the next without an IDR when none came for so long."""
 
@@ -120,6 +121,9 @@ class GroundRun(run.Run):
         if stream is None:
             if not idr:
                 return  # nothing is missing before the first
+            if len(self._streams) >= _MOST_STREAMS:
+                self._left_out += 1
+                return
             stream = self._begin(unit.stream)
         if idr and stream.file is not self._current:
             stream.file = self._current

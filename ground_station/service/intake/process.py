@@ -32,6 +32,8 @@ from pi_firmware.wire.errors import BlimpError, TelemetryError
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
 _IDR_S = 1.0
+_NAME_LENGTH, _TEXT_LENGTH = 64, 500
+_TOLD = 256
 
 _LEVELS = {
     messages.EVENT_FAILED: notes.ALARM,
@@ -204,9 +206,9 @@ class Intake:
         if "ssrc" in event.values:
             self._announced.said(payload_id, event.values["ssrc"])
         if self._roster.take_up(payload_id) is not None:
-            self._event(
-                "payload", _LEVELS.get(event.name, notes.INFO), event.name, event.text, payload_id
-            )
+            level = _LEVELS.get(event.name, notes.INFO)
+            name, text = event.name[:_NAME_LENGTH], event.text[:_TEXT_LENGTH]
+            self._event("payload", level, name, text, payload_id)
 
     def _follow(self) -> None:
         """Looks after each payload, and says how it is."""
@@ -244,6 +246,8 @@ class Intake:
         before = self._told.get(key, "")
         if problem == before:
             return
+        if len(self._told) >= _TOLD:  # of payloads that came and went
+            self._told.clear()
         self._told[key] = problem
         level = notes.WARNING if problem else notes.INFO
         self._event("intake", level, name, problem or "is over", payload_id)

@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from ground_station.geometry.camera import Camera
 from ground_station.service import notes
@@ -82,7 +83,7 @@ class GroundRecorder(Recorder):
         with contextlib.suppress(Exception):
             text = messages.encode(message)
             topic = "/" + keys.key(payload_id, kind)
-            active.queue.put(Said(topic, message.SCHEMA, time.time_ns(), text))
+            active.queue.put(Said(topic, message.SCHEMA, time.time_ns(), text), len(text))
 
     def estimate(self, payload_id: str, note: EstimateNote) -> None:
         """Records a pose, or that there is none."""
@@ -98,7 +99,8 @@ class GroundRecorder(Recorder):
             place = "" if payload_id == notes.STATION else f"/{payload_id}"
             topic = f"{STATION_TOPIC}{place}/{kind}"
             text = notes.encode(note)
-            active.queue.put(Said(topic, f"blimp.station.{kind}", time.time_ns(), text))
+            said = Said(topic, f"blimp.station.{kind}", time.time_ns(), text)
+            active.queue.put(said, len(text))
 
     def state(self) -> RecordingNote:
         """How it goes."""
@@ -122,10 +124,10 @@ class GroundRecorder(Recorder):
         return notes.ALARM if self.problem else notes.INFO
 
     def _watch_disk(self) -> None:
-        folder = self._settings.folder
+        folder = Path(self._settings.folder).absolute()
         while True:
             free_MB = None
-            for place in (folder, os.path.dirname(os.path.abspath(folder))):  # noqa: PTH100, PTH120
+            for place in (folder, folder.parent):  # it is made with the first recording
                 with contextlib.suppress(OSError):
                     disk = os.statvfs(place)
                     free_MB = round(disk.f_bavail * disk.f_frsize / 1e6, 1)

@@ -40,7 +40,7 @@ class Queue:
         self.left_out = 0
         """Units that were not taken."""
         self._limit_bytes, self._wake_bytes = limit_bytes, wake_bytes
-        self._items: deque[object] = deque()
+        self._items: deque[tuple[int, object]] = deque()
         self._bytes = 0
         self._skipping: set[str] = set()
         self._closed = False
@@ -67,11 +67,12 @@ class Queue:
                 self._skipping.add(stream)
                 self.left_out += 1
 
-    def put(self, item: object) -> None:
-        """Queues anything small; a full queue does not take it."""
+    def put(self, item: object, size_bytes: int = 0) -> None:
+        """Queues anything else, of so many bytes beside itself; a full queue does not take it."""
+        size = size_bytes + _ITEM_BYTES
         with self._lock:
-            if not self._closed and self._bytes + _ITEM_BYTES <= self._limit_bytes:
-                self._add(item, _ITEM_BYTES)
+            if not self._closed and self._bytes + size <= self._limit_bytes:
+                self._add(item, size)
 
     def wait(self, until_s: float) -> bool:
         """Until this monotonic time, or until much waits; whether the end has come."""
@@ -85,8 +86,8 @@ class Queue:
         with self._lock:
             if not self._items:
                 return None
-            item = self._items.popleft()
-            self._bytes -= _ITEM_BYTES + (len(item.data) if isinstance(item, Unit) else 0)
+            size, item = self._items.popleft()
+            self._bytes -= size
             return item
 
     def close(self) -> None:
@@ -98,12 +99,12 @@ class Queue:
     def clear(self) -> None:
         """Leaves out what still waits."""
         with self._lock:
-            self.left_out += sum(isinstance(item, Unit) for item in self._items)
+            self.left_out += sum(isinstance(item, Unit) for _, item in self._items)
             self._items.clear()
             self._bytes = 0
 
     def _add(self, item: object, size: int) -> None:
-        self._items.append(item)
+        self._items.append((size, item))
         self._bytes += size
         if self._bytes >= self._wake_bytes:
             self._wake.set()
