@@ -333,8 +333,8 @@ def test_it_says_that_it_lives(stand: SimpleNamespace) -> None:
 
 
 def test_another_protocol_is_refused(stand: SimpleNamespace) -> None:
-    other = connect(f"ws://127.0.0.1:{stand.port}", subprotocols=[Subprotocol("chat")])
-    with pytest.raises(InvalidStatus), other:
+    url, other = f"ws://127.0.0.1:{stand.port}", Subprotocol("chat")
+    with pytest.raises(InvalidStatus), connect(url, subprotocols=[other]):
         pass
 
 
