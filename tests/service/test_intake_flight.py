@@ -168,6 +168,44 @@ def test_who_is_not_named_is_not_taken_up(tmp_path: Path) -> None:
         assert set(stand.heard.payloads) == {"blimp-2"} and not stand.heard.of("blimp-1")
 
 
+def test_hostile_telemetry_neither_ends_the_intake_nor_takes_a_place(tmp_path: Path) -> None:
+    draw = random.Random(8)
+    gate = messages.Gate(
+        time_ns=-(2**62), capture_ns=2**62, sequence=2**31, passed=True, heartbeat=False,
+        entropy_bits=1.0, sharpness=1.0, captured=-5, gated=9, heartbeats=0, sent=-7, ssrc=-1,
+    )  # fmt: skip
+    said = [
+        b"", b"{", b"[" * 5000, b"null", b'{"schema": "blimp.gate/1.0"}', draw.randbytes(500),
+        messages.encode(gate),
+        messages.encode(messages.Event(time_ns=0, name="n" * 5000, text="\n" * 100_000)),
+        messages.encode(messages.Event(time_ns=0, name="x", text="", values={"ssrc": 2**70})),
+        messages.encode(messages.Battery(time_ns=2**70, voltage=1e300)),
+    ]  # fmt: skip
+    with Stand(tmp_path, recording={"at_start": True}) as stand:
+        stranger = open_session(connect=[stand.endpoint])
+        payload = stand.payload("blimp-1")
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 10)
+        for number in range(80):
+            for kind in (keys.GATE, keys.EVENT, keys.BATTERY, keys.HEALTH, "nothing"):
+                for body in said:
+                    stranger.zenoh.put(f"blimp/s{number}/{kind}", body)
+                    if number % 10 == 0 and kind != keys.EVENT and b"blimp.gate" not in body:
+                        stranger.zenoh.put(f"blimp/blimp-1/{kind}", body)
+        stranger.zenoh.put("blimp/../gate", said[6])
+        seen = len(stand.heard.of("blimp-1"))
+        eventually(lambda: len(stand.heard.of("blimp-1")) > seen + 60)
+        stranger.close()
+        ended = payload.end().counts
+        note = stand.settled("blimp-1", ended)
+        assert note.frames["received"] == note.frames["sent"]
+        all_right(stand, "blimp-1")
+        assert set(stand.heard.payloads) == {"blimp-1"}  # nobody else was seen to live
+        assert stand.heard.recording[-1].problem == "" and stand.heard.recording[-1].active
+        stand.process.terminate()
+        assert stand.process.wait(20) == 0
+        assert "Traceback" not in stand.written() and "panicked" not in stand.written()
+
+
 def test_poses_reach_the_payload_and_commands_are_answered(tmp_path: Path) -> None:
     with Stand(tmp_path) as stand:
         poses: list[messages.Pose] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ _STOP_S = 3.5
 _IDR_S = 1.0
 _NAME_LENGTH, _TEXT_LENGTH = 64, 500
 _TOLD = 256
+_EARLY, _EARLY_S = 64, 3.0
 
 _LEVELS = {
     messages.EVENT_FAILED: notes.ALARM,
@@ -80,6 +82,7 @@ class Intake:
         self._announced = Announced()
         self._roster = Roster(settings.payloads, self._announced, self._make)
         self._told: dict[str, str] = {}
+        self._early: deque[tuple[float, str, messages.Event]] = deque(maxlen=_EARLY)
         self._due_s = {"payloads": 0.0, "recording": 0.0}
         self._stack = contextlib.ExitStack()
         self.recorder = GroundRecorder(
@@ -205,16 +208,32 @@ class Intake:
     def _payload_said(self, payload_id: str, event: messages.Event) -> None:
         if "ssrc" in event.values:
             self._announced.said(payload_id, event.values["ssrc"])
-        if self._roster.take_up(payload_id) is not None:
-            level = _LEVELS.get(event.name, notes.INFO)
-            name, text = event.name[:_NAME_LENGTH], event.text[:_TEXT_LENGTH]
-            self._event("payload", level, name, text, payload_id)
+        if self._roster.get(payload_id) is None:
+            # It may be heard before it is seen to live, which is when it is taken up.
+            self._early.append((time.monotonic(), payload_id, event))
+        else:
+            self._pass_on(payload_id, event)
+
+    def _pass_on(self, payload_id: str, event: messages.Event) -> None:
+        level = _LEVELS.get(event.name, notes.INFO)
+        name, text = event.name[:_NAME_LENGTH], event.text[:_TEXT_LENGTH]
+        self._event("payload", level, name, text, payload_id)
+
+    def _pass_on_early(self) -> None:
+        """Events of payloads that are taken up by now; who does not live after a moment is left."""
+        for _ in range(len(self._early)):
+            at_s, payload_id, event = self._early.popleft()
+            if self._roster.get(payload_id) is not None:
+                self._pass_on(payload_id, event)
+            elif time.monotonic() - at_s < _EARLY_S:
+                self._early.append((at_s, payload_id, event))
 
     def _follow(self) -> None:
         """Looks after each payload, and says how it is."""
         living = set(self._listener.living())
         for payload_id in living:
             self._roster.take_up(payload_id)
+        self._pass_on_early()
         for payload in self._roster.all():
             was_alive, payload.alive = payload.alive, payload.id in living or payload.streaming
             if payload.alive and not was_alive:
