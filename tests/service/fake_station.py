@@ -126,6 +126,7 @@ class FakeStation:
     answer_s: float = 0.0
     """Commands take this long."""
     name: str = "Atrium station"
+    signed_out: bool = False
     asked: list[tuple[str, Any]] = field(default_factory=list)
     heard: list[dict[str, Any]] = field(default_factory=list)
     begun_ns: int = field(default_factory=time.time_ns)
@@ -314,6 +315,8 @@ def make_app(station: FakeStation) -> FastAPI:
 
     @app.middleware("http")
     async def headers(request: Request, call_next: Any) -> Response:
+        if station.signed_out and request.url.path.startswith("/api"):
+            return Response('{"detail": "a token is needed"}', 401)
         response: Response = await call_next(request)
         response.headers["Content-Security-Policy"] = POLICY
         response.headers["X-Content-Type-Options"] = "nosniff"
@@ -333,6 +336,10 @@ def make_app(station: FakeStation) -> FastAPI:
     @app.get("/")
     def page() -> Response:
         return Response((STATIC / "index.html").read_bytes(), media_type="text/html")
+
+    @app.get("/login")
+    def login() -> Response:
+        return Response("<!doctype html><title>Log in</title>", media_type="text/html")
 
     @app.get("/api/state")
     def state() -> dict[str, Any]:
@@ -393,6 +400,9 @@ def make_app(station: FakeStation) -> FastAPI:
 
     @app.websocket("/api/live")
     async def live(socket_: WebSocket, payload: str = "") -> None:
+        if station.signed_out:
+            await socket_.close()
+            return
         await socket_.accept()
         station.sockets += 1
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):

@@ -381,6 +381,19 @@ def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: 
         shown.page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
 
 
+def test_who_is_signed_out_is_asked_for_the_token(browser: Any) -> None:
+    other = Served(sample_station())
+    watched = Watched(browser, other)
+    try:
+        other.stop()
+        other.station.signed_out = True
+        other.start()
+        watched.page.wait_for_url("**/login")
+    finally:
+        watched.page.close()
+        other.stop()
+
+
 def test_a_station_that_was_gone_is_taken_up_again_without_a_reload(
     shown: Watched, served: Served
 ) -> None:

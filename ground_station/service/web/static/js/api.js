@@ -32,6 +32,15 @@ function failure(error) {
   return "the station cannot be reached";
 }
 
+/** Whether the station wants a token that this page has not, or no more. @returns {Promise<boolean>} */
+export async function isSignedOut() {
+  try {
+    return (await ask("/api/maps")).status === 401;
+  } catch {
+    return false; // it cannot be reached at all
+  }
+}
+
 /** @param {string} path @returns {Promise<any>} raises an Error with one line */
 export async function get(path) {
   let response;

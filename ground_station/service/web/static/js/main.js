@@ -109,6 +109,8 @@ const connection = new Connection({
   status: (status) => {
     store.link = status;
     if (status.phase === "refused") location.assign("/login");
+    // A handshake that is refused looks to a page like a broken network.
+    if (status.phase === "waiting") api.isSignedOut().then((is) => is && location.assign("/login"));
     loop.mark("connection");
     loop.mark("payload");
   },

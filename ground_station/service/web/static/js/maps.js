@@ -12,6 +12,8 @@ import { get, getBytes, mapPath } from "./api.js";
  */
 
 const AGAIN_MS = 5000;
+const OUTSIDE = 0.05; // of the landmarks, at each end of an axis
+const MARGIN = 0.08;
 
 /** Loads the map that the shown payload flies in; one that cannot be loaded is tried again. */
 export class Maps {
@@ -92,10 +94,12 @@ function boundsOf(details, plan, landmarks) {
   return { min: [Math.min(...xs), Math.min(...ys), Math.min(0, min[2])], max: [Math.max(...xs), Math.max(...ys), max[2]] };
 }
 
-/** @param {Float32Array} xyz @returns {{min: number[], max: number[]}|null} what holds 96 % along each axis */
+/** @param {Float32Array} xyz @returns {{min: number[], max: number[]}|null} what holds nearly all along each axis */
 function middle(xyz) {
   if (xyz.length < 30) return null;
   const sorted = [0, 1, 2].map((axis) => xyz.filter((_, k) => k % 3 === axis).sort());
   const at = (/** @type {number} */ share) => sorted.map((values) => values[Math.floor(share * (values.length - 1))]);
-  return { min: at(0.02), max: at(0.98) };
+  const [low, high] = [at(OUTSIDE), at(1 - OUTSIDE)];
+  const margin = high.map((value, axis) => MARGIN * (value - low[axis]));
+  return { min: low.map((value, axis) => value - margin[axis]), max: high.map((value, axis) => value + margin[axis]) };
 }
