@@ -1,0 +1,366 @@
+"""`blimp serve` as its user runs it: the real program, its processes, and who looks at it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from intake_stand import eventually, free_udp_port
+from payload_process import PayloadProcess, free_port
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
+
+from ground_station.service import notes
+from ground_station.service.bus import Bus
+from ground_station.service.notes import EstimateNote
+
+ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
+START_S = 60.0
+STOP_S = 10.0
+"""From SIGTERM until all are gone."""
+_ACCIDENTS = ("Traceback", "panicked", "CRITICAL", "Exception ignored", "Segmentation")
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process by its id and its start, so that another with the same id later is not it."""
+
+    name: str
+    pid: int
+    started: str
+
+    @property
+    def living(self) -> bool:
+        """Whether it runs; one that nobody reaped yet does not."""
+        stat = _stat(self.pid)
+        return bool(stat) and stat[0] != "Z" and stat[19] == self.started
+
+    def memory_MB(self) -> float:
+        """Its resident memory (proc(5), statm); 0 when it has gone."""
+        with contextlib.suppress(OSError):
+            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+            return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+        return 0.0
+
+    def cpu_s(self) -> float:
+        """Processor time that it used so far, its own and the kernel's for it."""
+        stat = _stat(self.pid)
+        return sum(map(int, stat[11:13])) / os.sysconf("SC_CLK_TCK") if stat else 0.0
+
+
+def _stat(pid: int) -> list[str]:
+    """Fields of proc(5)'s stat from the state on; empty when there is no such process."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return []
+
+
+def process(name: str, pid: int) -> Process | None:
+    """The process with an id now."""
+    stat = _stat(pid)
+    return Process(name, pid, stat[19]) if stat else None
+
+
+def children(pid: int) -> dict[str, Process]:
+    """The service's processes by their name in the table."""
+    found: dict[str, Process] = {}
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                command = Path(f"/proc/{child}/cmdline").read_bytes().decode().split("\0")
+                name = _name(command)
+                if name and (one := process(name, int(child))):
+                    found[name] = one
+    return found
+
+
+def _name(command: list[str]) -> str:
+    if "-m" not in command:
+        return ""
+    module, *arguments = command[command.index("-m") + 1 :]
+    if module == "pi_firmware":
+        return "demo-payload"
+    if module == "ground_station.service.localizing":
+        return f"localizer/{arguments[1]}"
+    return module.rpartition(".")[2] if module.startswith("ground_station.service.") else ""
+
+
+class Service:
+    """`blimp serve` on ports and in folders of its own; a context manager that checks its end.
+
+    `place` is the private folder in memory in which a run's folder lies. What the service writes is
+    kept over all its starts.
+    """
+
+    def __init__(self, folder: Path, *settings: str, demo: bool = False) -> None:
+        self.folder = folder
+        self.recordings = folder / "recordings"
+        self.place = Path(tempfile.mkdtemp(prefix="service-", dir="/dev/shm"))
+        self.video, self.foxglove = free_udp_port(), free_port(socket.SOCK_STREAM)
+        self.http = free_port(socket.SOCK_STREAM)
+        telemetry = free_port(socket.SOCK_STREAM)
+        self.endpoint = f"tcp/127.0.0.1:{telemetry}"
+        self._tcp = (self.http, self.foxglove, telemetry)
+        self.url = f"http://127.0.0.1:{self.http}"
+        blimp = str(Path(sys.executable).with_name("blimp"))
+        self.command = [blimp, "serve", "--demo" if demo else f"--map={ATRIUM}"]
+        for setting in (
+            f"http.port={self.http}",
+            f"foxglove.port={self.foxglove}",
+            f"video.port={self.video}",
+            f"telemetry.listen={json.dumps([self.endpoint])}",
+            f"recording.folder={self.recordings}",
+            "recording.min_free_MB=0",
+            *settings,
+        ):
+            self.command += ["--set", setting]
+        self.client = httpx.Client(base_url=self.url, timeout=20.0)
+        self.seen: set[Process] = set()
+        """All processes that it was ever seen to have."""
+        self._log = folder / "service.txt"
+
+    def __enter__(self) -> Service:
+        try:
+            self.start()
+        except BaseException:
+            self._clear()
+            raise
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if self.process.poll() is None and kind is None:
+                self.end()
+        finally:
+            self._clear()
+
+    # Its life
+
+    def launch(self, *more: str) -> subprocess.Popen[bytes]:
+        """Starts the program; its output goes to the log."""
+        environment = {k: v for k, v in os.environ.items() if k != "RUNTIME_DIRECTORY"}
+        with self._log.open("a") as log:
+            return subprocess.Popen(
+                [*self.command, *more],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=self.folder,
+                env=environment | {"XDG_RUNTIME_DIR": str(self.place)},
+            )
+
+    def start(self) -> None:
+        """Starts the service and waits for its page."""
+        self.process = self.launch()
+        eventually(self.answers, START_S)
+        self.processes()
+
+    def answers(self) -> bool:
+        """Whether the page is there; fails when the service has ended."""
+        assert self.process.poll() is None, self.written()
+        with contextlib.suppress(httpx.HTTPError):
+            return self.client.get("/healthz").status_code == 200
+        return False
+
+    def kill(self) -> None:
+        """SIGKILL for the parent, as from the kernel when memory ends."""
+        self.processes()
+        self.process.kill()
+        self.process.wait()
+
+    def end(self) -> float:
+        """SIGTERM; seconds until it had ended. Checks that all is in order and nothing is left."""
+        self.processes()
+        asked_s = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        status = self.process.wait(4 * STOP_S)
+        took_s = time.monotonic() - asked_s
+        assert status == 0, f"status {status}: {self.written()}"
+        self.assert_no_accident()
+        self.assert_nobody_left()
+        assert list(self.place.iterdir()) == []
+        return took_s
+
+    def written(self) -> str:
+        """What all its processes wrote."""
+        return self._log.read_text()
+
+    def assert_no_accident(self) -> None:
+        """No exception that nobody handled, in no process."""
+        written = self.written()
+        assert not [word for word in _ACCIDENTS if word in written], written
+
+    def assert_nobody_left(self, limit_s: float = STOP_S) -> None:
+        """No process runs any more, and the ports are free."""
+        eventually(lambda: not [p for p in self.seen if p.living], limit_s)
+        for port in self._tcp:
+            _bind(socket.SOCK_STREAM, port)
+        _bind(socket.SOCK_DGRAM, self.video)
+
+    def _clear(self) -> None:
+        with contextlib.suppress(AttributeError):
+            self.process.kill()
+            self.process.wait()
+        self.client.close()
+        shutil.rmtree(self.place, ignore_errors=True)
+
+    # What it tells
+
+    def processes(self) -> dict[str, Process]:
+        """Its processes now, without the parent."""
+        found = children(self.process.pid)
+        self.seen |= set(found.values())
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """The whole snapshot."""
+        answer = self.client.get("/api/state")
+        assert answer.status_code == 200, answer.text
+        return dict(answer.json())
+
+    def payload(self, payload_id: str) -> dict[str, Any]:
+        """One payload's part of it; empty before it is known."""
+        return dict(self.state()["payloads"].get(payload_id) or {})
+
+    def tracking(self, payload_id: str) -> bool:
+        """Whether it is localized now."""
+        view = self.payload(payload_id)
+        estimate = view.get("estimate") or {}
+        return estimate.get("state") == "TRACKING" and "estimate" not in view["stale"]
+
+    def record(self, *, active: bool) -> None:
+        """The dashboard's button."""
+        answer = self.client.post("/api/recording", json={"active": active})
+        assert answer.status_code == 200 and answer.json()["done"], answer.text
+
+    @contextlib.contextmanager
+    def bus(self) -> Iterator[Bus]:
+        """A place on its bus."""
+        (folder,) = self.place.glob("blimp-*")
+        with Bus(folder, "test") as bus:
+            yield bus
+
+    # Who flies to it
+
+    def fly(
+        self, payload_id: str, folder: Path, *, rate_hz: float = 30.0, port: int = 0
+    ) -> PayloadProcess:
+        """A payload's own program that flies the sample flight in a loop; a context manager.
+
+        A lower rate takes fewer of the flight's frames; `port` is of a link before the service.
+        """
+        return PayloadProcess(
+            folder,
+            f"payload_id={payload_id}",
+            f"camera.uri=replay:{ATRIUM / 'flight.mcap'}?loop=1&rate_hz={rate_hz:g}",
+            f"camera.rate_hz={rate_hz:g}",
+            f"link.port={port or self.video}",
+            f"telemetry.connect={json.dumps([self.endpoint])}",
+        )
+
+
+def _bind(kind: socket.SocketKind, port: int) -> None:
+    with socket.socket(socket.AF_INET, kind) as tried:
+        if kind == socket.SOCK_STREAM:  # connections that were closed may still linger
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        tried.bind(("127.0.0.1", port))
+
+
+class Viewer:
+    """A dashboard without a screen: takes all messages, and says of each picture that it came.
+
+    It comes back by itself when the connection ends; a context manager.
+    """
+
+    def __init__(self, service: Service, payload_id: str = "") -> None:
+        query = f"?payload={payload_id}" if payload_id else ""
+        self._url = f"ws://127.0.0.1:{service.http}/api/live{query}"
+        self.counts: dict[str, int] = {}
+        """Messages by type."""
+        self.events: list[dict[str, Any]] = []
+        self.connections = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+
+    def __enter__(self) -> Viewer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join(10)
+
+    def _run(self) -> None:
+        while not self._closing.wait(0.1):
+            with (
+                contextlib.suppress(OSError, WebSocketException, TimeoutError),
+                connect(self._url, max_size=None, close_timeout=1) as live,
+            ):
+                self.connections += 1
+                while not self._closing.is_set():
+                    with contextlib.suppress(TimeoutError):
+                        self._take(live.recv(timeout=0.5), live.send)
+
+    def _take(self, message: str | bytes, send: Callable[[str], None]) -> None:
+        if isinstance(message, str):
+            document = json.loads(message)
+            kind = document["type"]
+            if kind == "event":
+                self.events.append(document["event"])
+        else:
+            size = int.from_bytes(message[:4], "big")
+            header = json.loads(message[4 : 4 + size])
+            kind, sequence = header["type"], header["sequence"]
+            send(json.dumps({"type": "ping", "sent_ms": 0, "sequence": sequence}))
+        self.counts[kind] = self.counts.get(kind, 0) + 1
+
+
+class Estimates:
+    """Every estimate that is said on the bus, in few numbers, by payload."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.latency_ms: dict[str, list[float]] = {}
+        """From capture to pose; those with a pose and a known capture time."""
+        self.done_ns: dict[str, list[int]] = {}
+        self.states: dict[str, dict[str, int]] = {}
+        bus.hear(notes.ESTIMATE, EstimateNote, self._take)
+
+    def _take(self, payload_id: str, note: EstimateNote) -> None:
+        states = self.states.setdefault(payload_id, {})
+        states[note.state] = states.get(note.state, 0) + 1
+        self.done_ns.setdefault(payload_id, []).append(note.done_ns)
+        if note.capture_ns is not None and note.position_m is not None:
+            latency_ms = 1e-6 * (note.done_ns - note.capture_ns)
+            self.latency_ms.setdefault(payload_id, []).append(latency_ms)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table: a figure, its bound in words, and whether it holds."""
+
+    name: str
+    value: str
+    bound: str = ""
+    holds: bool = True
+
+
+def show(rows: list[Row]) -> bool:
+    """Prints a table; whether all bounds hold."""
+    for row in rows:
+        verdict = ("ok" if row.holds else "MISSED") if row.bound else ""
+        print(f"{row.name:34} {row.value:>30}  {row.bound:20} {verdict}")
+    return all(row.holds for row in rows)
