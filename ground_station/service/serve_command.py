@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import signal
-import threading
 from pathlib import Path
 
 _EPILOG = """\
@@ -34,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serves until a signal; raises a `BlimpError` with one line when it cannot start."""
     from ground_station.service import settings
+    from ground_station.service.ending import ending
     from ground_station.service.serve import SAMPLE, serve
 
     loaded = settings.load(args.config, args.set)
@@ -46,8 +45,5 @@ def run(args: argparse.Namespace) -> int:
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(loaded.map, folder=str(SAMPLE), shelf=str(SAMPLE.parent))
         loaded = dataclasses.replace(loaded, map=shelf)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    serve(loaded, stop, demo=SAMPLE / "flight.mcap" if args.demo else None)
+    serve(loaded, ending(None), demo=SAMPLE / "flight.mcap" if args.demo else None)
     return 0

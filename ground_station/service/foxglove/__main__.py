@@ -4,31 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
 
+from ground_station.service.ending import ending
 from pi_firmware.wire.errors import BlimpError
 
 _BAD_INPUT = 2
-_END_S = 1.5
-
-
-def _ending() -> threading.Event:
-    """Is set by SIGTERM or SIGINT; an end that takes too long is not waited for."""
-    stop = threading.Event()
-
-    def end(*_: object) -> None:
-        if not stop.is_set():
-            stop.set()
-            limit = threading.Timer(_END_S, os._exit, (0,))
-            limit.daemon = True
-            limit.start()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, end)
-    return stop
 
 
 def main(arguments: list[str]) -> int:
@@ -36,7 +18,7 @@ def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
         print("usage: python -m ground_station.service.foxglove RUN_FOLDER", file=sys.stderr)
         return _BAD_INPUT
-    stop = _ending()
+    stop = ending()
     # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import cv2

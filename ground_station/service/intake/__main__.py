@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -14,6 +13,7 @@ from ground_station.geometry.camera import Camera, load_camera
 from ground_station.mapping.store import load_info
 from ground_station.service import notes
 from ground_station.service.bus import Bus
+from ground_station.service.ending import ending
 from ground_station.service.intake.process import Intake
 from ground_station.service.notes import EstimateNote, EventNote
 from ground_station.service.settings import MapSettings, load_run
@@ -58,9 +58,7 @@ def main() -> int:
     if len(sys.argv) != 2:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = ending(None)  # a recording ends in its own time
     try:
         serve(Path(sys.argv[1]), stop)
     except BlimpError as error:
