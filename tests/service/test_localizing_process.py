@@ -327,7 +327,7 @@ def test_a_signal_ends_it(
 def test_what_does_not_end_by_itself_is_ended() -> None:
     """As a search in a large map, which nobody waits for."""
     code = (
-        "import time; from ground_station.service.localizing.__main__ import _ending; _ending();"
+        "import time; from ground_station.service.ending import ending; ending();"
         "print('ready', flush=True); time.sleep(3600)"
     )
     command = [sys.executable, "-c", code]
