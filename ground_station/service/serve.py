@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import shutil
 import sys
@@ -19,7 +20,7 @@ from ground_station.service import notes, processes
 from ground_station.service.bus import Bus, Router
 from ground_station.service.notes import EventNote, PayloadNote, ProcessNote
 from ground_station.service.processes import Children
-from ground_station.service.settings import Run, StationSettings, write_run
+from ground_station.service.settings import RUN_FILE, Run, StationSettings, write_run
 from pi_firmware.wire import config
 from pi_firmware.wire.recording import RecordingReader
 from pi_firmware.wire.systemd import Notifier
@@ -121,11 +122,28 @@ def _run_folder() -> Iterator[Path]:
             break
     else:
         place = tempfile.gettempdir()
+    _sweep(Path(place))
     folder = Path(tempfile.mkdtemp(prefix="blimp-", dir=place))
+    lock = os.open(folder, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)  # before it has a RUN_FILE; it ends with this process
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _sweep(place: Path) -> None:
+    """Removes the folders of services that were killed: nobody holds their locks any more."""
+    for run in place.glob(f"blimp-*/{RUN_FILE}"):
+        with contextlib.suppress(OSError):
+            lock = os.open(run.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(lock).st_uid == os.geteuid():
+                    shutil.rmtree(run.parent, ignore_errors=True)
+            finally:
+                os.close(lock)
 
 
 def _check_map(folder: Path) -> None:

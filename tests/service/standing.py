@@ -207,9 +207,9 @@ class Service:
     def assert_nobody_left(self, limit_s: float = STOP_S) -> None:
         """No process runs any more, and the ports are free."""
         eventually(lambda: not [p for p in self.seen if p.living], limit_s)
-        for port in self._tcp:
-            _bind(socket.SOCK_STREAM, port)
-        _bind(socket.SOCK_DGRAM, self.video)
+        # A process killed is seen as ended a moment before the last of its threads has.
+        eventually(lambda: all(_free(socket.SOCK_STREAM, port) for port in self._tcp), limit_s)
+        eventually(lambda: _free(socket.SOCK_DGRAM, self.video), limit_s)
 
     def _clear(self) -> None:
         with contextlib.suppress(AttributeError):
@@ -273,11 +273,15 @@ class Service:
         )
 
 
-def _bind(kind: socket.SocketKind, port: int) -> None:
+def _free(kind: socket.SocketKind, port: int) -> bool:
+    """Whether nobody listens on a port."""
     with socket.socket(socket.AF_INET, kind) as tried:
         if kind == socket.SOCK_STREAM:  # connections that were closed may still linger
             tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        tried.bind(("127.0.0.1", port))
+        with contextlib.suppress(OSError):
+            tried.bind(("127.0.0.1", port))
+            return True
+    return False
 
 
 class Viewer:
