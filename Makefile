@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench soak install-service uninstall-service lock sample \
+.PHONY: help setup demo serve test check bench soak soak-service install-service uninstall-service lock sample \
   virtual-camera
 
 help:  ## Show this list
@@ -47,6 +47,10 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
 	@sh tests/pi_firmware/virtual_camera/setup.sh
+
+soak-service: setup  ## The same for the whole service: an hour with a payload that comes and goes
+	@mkdir -p out
+	@.venv/bin/python tests/service/soak.py --minutes 60 --out out/soak-service.json
 
 lock:  ## Resolve requirements.lock anew from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv

@@ -33,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
     """Serves until a signal; raises a `BlimpError` with one line when it cannot start."""
     from ground_station.service import settings
     from ground_station.service.ending import ending
+    from ground_station.service.processes import ServiceError
     from ground_station.service.serve import SAMPLE, serve
 
     loaded = settings.load(args.config, args.set)
@@ -45,5 +46,8 @@ def run(args: argparse.Namespace) -> int:
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(loaded.map, folder=str(SAMPLE), shelf=str(SAMPLE.parent))
         loaded = dataclasses.replace(loaded, map=shelf)
-    serve(loaded, ending(None), demo=SAMPLE / "flight.mcap" if args.demo else None)
+    try:
+        serve(loaded, ending(None), demo=SAMPLE / "flight.mcap" if args.demo else None)
+    except ServiceError:  # the process that could not start has said why
+        return 2
     return 0
