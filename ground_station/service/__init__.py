@@ -1,1 +1,1 @@
-"""Programs that run for long: the live session, replay and demo."""
+"""The ground station as a service, its processes and its page; replay, demo and the benches."""
