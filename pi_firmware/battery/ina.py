@@ -5,6 +5,7 @@ Registers, bits and equations are those of the datasheets SBOS448G (INA219) and 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
@@ -29,10 +30,12 @@ class Shunt:
     discharge_positive: bool = True
 
 
-class _Ina:
+class _Ina(ABC):
     """What both chips have: a bus, a shunt, and settings that are written before the first read."""
 
     FULL_SCALE_V: float
+    _configuration: int
+    _calibration: int
 
     def __init__(self, bus: WordBus, shunt: Shunt, counts: Counts) -> None:
         _check_range(shunt, self.FULL_SCALE_V)
@@ -43,6 +46,25 @@ class _Ina:
         """Releases the bus."""
         self._ready = False
         self._bus.close()
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Writes the settings, unless they are there."""
+
+    def _words(self) -> tuple[int, int, int]:
+        """Shunt voltage, bus voltage and current as the registers have them, the first and last
+        signed; what a chip says that a dip of its supply has reset is refused.
+        """
+        self._prepare()
+        drop = signed(self._bus.read(SHUNT_VOLTAGE))
+        bus = self._bus.read(BUS_VOLTAGE)
+        current = signed(self._bus.read(CURRENT))
+        settings = self._bus.read(CONFIGURATION), self._bus.read(CALIBRATION)
+        if settings != (self._configuration, self._calibration):
+            self._ready = False
+            self.counts.resets += 1
+            raise _refused(self.counts, "the gauge has lost its settings; it is set up again")
+        return drop, bus, current
 
 
 class Ina219(_Ina):
@@ -65,11 +87,7 @@ class Ina219(_Ina):
 
     def read(self, time_ns: int) -> Battery:
         """One reading; raises `GaugeError` when there is none that can be believed."""
-        self._prepare()
-        drop = signed(self._bus.read(SHUNT_VOLTAGE))
-        bus = self._bus.read(BUS_VOLTAGE)
-        current = signed(self._bus.read(CURRENT))
-        _check_reset(self, self._configuration, self._calibration)
+        drop, bus, current = self._words()
         if bus & 0x1:
             raise _refused(self.counts, "ina219: the current is beyond the calibrated range")
         if abs(drop) >= round(_INA219_RANGES_V[self._gain] / 10e-6):
@@ -113,11 +131,7 @@ class Ina226(_Ina):
 
     def read(self, time_ns: int) -> Battery:
         """One reading; raises `GaugeError` when there is none that can be believed."""
-        self._prepare()
-        drop = signed(self._bus.read(SHUNT_VOLTAGE))
-        bus = self._bus.read(BUS_VOLTAGE)
-        current = signed(self._bus.read(CURRENT))
-        _check_reset(self, self._configuration, self._calibration)
+        drop, bus, current = self._words()
         if drop in (-0x8000, 0x7FFF):
             raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
         _check_agreement(self.counts, current, drop * self._calibration / 2048)
@@ -165,15 +179,6 @@ def _check_range(shunt: Shunt, full_scale_v: float) -> None:
             f"{shunt.max_A:g} A through {shunt.resistance_ohm:g} ohm are {drop_v:g} V;"
             f" the chip measures up to {full_scale_v:g} V"
         )
-
-
-def _check_reset(gauge: Ina219 | Ina226, configuration: int, calibration: int) -> None:
-    """Refuses what a chip says that a dip of its supply has reset: its current would be zero."""
-    bus = gauge._bus
-    if bus.read(CONFIGURATION) != configuration or bus.read(CALIBRATION) != calibration:
-        gauge._ready = False
-        gauge.counts.resets += 1
-        raise _refused(gauge.counts, "the gauge has lost its settings; it is set up again")
 
 
 def _check_agreement(counts: Counts, current: int, expected: float) -> None:

@@ -18,12 +18,11 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from conftest import _ARGUMENTS as BROWSER
 from intake_stand import eventually
-from standing import Estimates, Process, Row, Service, Viewer, process, show
+from standing import Estimates, Process, Row, Service, Viewer, conclude, process
 
 VIEWERS = 2
 MEDIAN_MS, P99_MS = 60.0, 150.0
@@ -212,12 +211,7 @@ def main() -> int:
         f"{measured.seconds:.0f} s, {arguments.payloads} payload(s) at {arguments.rate_hz:g} Hz,"
         f" two viewers{beside}"
     )
-    holds = show(table)
-    if arguments.out is not None:
-        document: dict[str, Any] = {**asdict(measured), "rows": [asdict(row) for row in table]}
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(document, indent=1) + "\n")
-    return 0 if holds else 1
+    return conclude(table, asdict(measured), arguments.out)
 
 
 if __name__ == "__main__":

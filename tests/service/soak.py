@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import random
 import socket
@@ -21,11 +20,10 @@ import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from intake_stand import ImpairedLink, Impairment, encoded, eventually, packets, stamped
 from payload_process import Ended
-from standing import Row, Service, Viewer, show
+from standing import Row, Service, Viewer, conclude
 
 from ground_station.service import notes
 from ground_station.service.bus import Bus
@@ -311,12 +309,7 @@ def main() -> int:
     flown = fly(60 * arguments.minutes, arguments.flight_s, arguments.gap_s, arguments.loss)
     table = rows(flown, 60 * arguments.settled, arguments.loss)
     print(f"\n{arguments.minutes:g} minutes, {100 * arguments.loss:g} % loss")
-    holds = show(table)
-    if arguments.out is not None:
-        document: dict[str, Any] = {**asdict(flown), "rows": [asdict(row) for row in table]}
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(document, indent=1) + "\n")
-    return 0 if holds else 1
+    return conclude(table, asdict(flown), arguments.out)
 
 
 if __name__ == "__main__":

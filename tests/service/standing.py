@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -366,9 +366,13 @@ class Row:
     holds: bool = True
 
 
-def show(rows: list[Row]) -> bool:
-    """Prints a table; whether all bounds hold."""
+def conclude(rows: list[Row], measured: dict[str, Any], out: Path | None) -> int:
+    """Prints a table, writes it with what was measured; the exit status, 1: a bound is missed."""
     for row in rows:
         verdict = ("ok" if row.holds else "MISSED") if row.bound else ""
         print(f"{row.name:34} {row.value:>30}  {row.bound:20} {verdict}")
-    return all(row.holds for row in rows)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        document = measured | {"rows": [asdict(row) for row in rows]}
+        out.write_text(json.dumps(document, indent=1) + "\n")
+    return 0 if all(row.holds for row in rows) else 1

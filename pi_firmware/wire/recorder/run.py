@@ -6,6 +6,7 @@ import contextlib
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
 from pi_firmware.wire.errors import RecordingError
@@ -31,7 +32,7 @@ TIMES_NS = range(1 << 63)
 """What MCAP and its readers take."""
 
 
-class Run:
+class Run(ABC):
     """Writes what `queue` is given until `end`, or until the disk takes no more.
 
     `told` is called on the thread with True and a text for a file that goes on from another, and
@@ -118,11 +119,11 @@ class Run:
         """Whether its thread still runs: it hangs on a disk when `end` was not done."""
         return self._thread.is_alive()
 
+    @abstractmethod
     def _put(self, item: object) -> None:
         """Writes an item of the queue; a frame that cannot be written is one of `_left_out`."""
-        raise NotImplementedError
 
-    def _before_end(self) -> None:
+    def _before_end(self) -> None:  # noqa: B027  # what a file needs at its end, if anything
         """All of the queue is written; what else there is goes into the file now."""
 
     def _run(self) -> None:
