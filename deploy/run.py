@@ -1,0 +1,126 @@
+"""Runs Debian's tools: a list of words without a shell, and one line when it goes wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from deploy.errors import DeployError
+
+# The Debian package of each tool that deploy/ runs and that a plain system may lack.
+_PACKAGES = {
+    "apt-get": "apt",
+    "bmaptool": "bmap-tools",
+    "cpio": "cpio",
+    "debugfs": "e2fsprogs",
+    "depmod": "kmod",
+    "dpkg-deb": "dpkg",
+    "dpkg-scanpackages": "dpkg-dev",
+    "e2fsck": "e2fsprogs",
+    "fakeroot": "fakeroot",
+    "git": "git",
+    "gpg": "gnupg",
+    "lsblk": "util-linux",
+    "mcopy": "mtools",
+    "mdel": "mtools",
+    "mdir": "mtools",
+    "mke2fs": "e2fsprogs",
+    "mkfs.vfat": "dosfstools",
+    "mmd": "mtools",
+    "mmdebstrap": "mmdebstrap",
+    "mren": "mtools",
+    "mtype": "mtools",
+    "qemu-aarch64-static": "qemu-user-static",
+    "qemu-arm-static": "qemu-user-static",
+    "qemu-system-aarch64": "qemu-system-arm",
+    "resize2fs": "e2fsprogs",
+    "rsync": "rsync",
+    "scp": "openssh-client",
+    "sfdisk": "fdisk",
+    "ssh": "openssh-client",
+    "ssh-keygen": "openssh-client",
+    "systemd-analyze": "systemd",
+    "xz": "xz-utils",
+    "zstd": "zstd",
+}
+
+# Debian keeps some tools where a plain user's PATH does not look.
+_SYSTEM_FOLDERS = ("/usr/local/sbin", "/usr/sbin", "/sbin")
+
+
+def find(tool: str) -> str | None:
+    """The tool's path, also from the system folders; None when it is not installed."""
+    if "/" in tool:
+        return tool if os.access(tool, os.X_OK) else None
+    folders = [*os.environ.get("PATH", os.defpath).split(os.pathsep), *_SYSTEM_FOLDERS]
+    for folder in folders:
+        path = Path(folder or ".") / tool
+        if path.is_file() and os.access(path, os.X_OK):
+            return str(path)
+    return None
+
+
+def need(tool: str) -> str:
+    """The tool's path; raises `DeployError` that names the Debian package when it is missing."""
+    path = find(tool)
+    if path is None:
+        package = _PACKAGES.get(Path(tool).name)
+        hint = f": sudo apt-get install {package}" if package else ""
+        raise DeployError(f"{tool}: not found{hint}")
+    return path
+
+
+def run(
+    words: Sequence[str | Path],
+    *,
+    input: bytes | None = None,
+    env: Mapping[str, str] | None = None,
+    cwd: str | Path | None = None,
+    timeout_s: float | None = None,
+    ok: Sequence[int] = (0,),
+) -> bytes:
+    """Runs a tool to its end and gives what it wrote to standard output.
+
+    Args:
+        words: the tool and its arguments, no shell between.
+        input: its standard input (default: empty).
+        env: variables set beside the caller's own; the language is always C.
+        cwd: the folder to run in.
+        timeout_s: killed after so long (default: never).
+        ok: exit statuses that are no failure.
+
+    Raises:
+        DeployError: the tool is missing, takes too long or fails; one line with its last words.
+    """
+    arguments = [str(word) for word in words]
+    name = Path(arguments[0]).name
+    arguments[0] = need(arguments[0])
+    try:
+        done = subprocess.run(
+            arguments,
+            input=input if input is not None else b"",
+            capture_output=True,
+            env={**os.environ, "LC_ALL": "C", **(env or {})},
+            cwd=cwd,
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise DeployError(f"{name}: not done after {timeout_s:g} s") from None
+    except OSError as error:
+        raise DeployError(f"{name}: {error.strerror or error}") from None
+    if done.returncode not in ok:
+        raise DeployError(f"{name}: {_last_line(done)}")
+    return done.stdout
+
+
+def _last_line(done: subprocess.CompletedProcess[bytes]) -> str:
+    for stream in (done.stderr, done.stdout):
+        lines = [line for line in stream.decode(errors="replace").splitlines() if line.strip()]
+        if lines:
+            return lines[-1].strip()
+    if done.returncode < 0:
+        return f"killed by signal {-done.returncode}"
+    return f"exit status {done.returncode} and no word"
