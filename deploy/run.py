@@ -80,6 +80,7 @@ def run(
     cwd: str | Path | None = None,
     timeout_s: float | None = None,
     ok: Sequence[int] = (0,),
+    merge: bool = False,
 ) -> bytes:
     """Runs a tool to its end and gives what it wrote to standard output.
 
@@ -90,6 +91,7 @@ def run(
         cwd: the folder to run in.
         timeout_s: killed after so long (default: never).
         ok: exit statuses that are no failure.
+        merge: gives standard error among standard output, for a tool that fails with status 0.
 
     Raises:
         DeployError: the tool is missing, takes too long or fails; one line with its last words.
@@ -101,7 +103,8 @@ def run(
         done = subprocess.run(
             arguments,
             input=input if input is not None else b"",
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT if merge else subprocess.PIPE,
             env={**os.environ, "LC_ALL": "C", **(env or {})},
             cwd=cwd,
             timeout=timeout_s,
@@ -117,7 +120,7 @@ def run(
 
 
 def _last_line(done: subprocess.CompletedProcess[bytes]) -> str:
-    for stream in (done.stderr, done.stdout):
+    for stream in (done.stderr or b"", done.stdout):
         lines = [line for line in stream.decode(errors="replace").splitlines() if line.strip()]
         if lines:
             return lines[-1].strip()

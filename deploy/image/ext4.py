@@ -1,0 +1,176 @@
+"""An ext4 file system in a file, filled from a tree without mounting and without being root.
+
+`mke2fs` makes it empty with a fixed identifier and hash seed; `debugfs` fills it from a script
+that names every inode's owner, mode and time, in the tree's own order. So neither the builder's
+user, nor the order in which his disk lists a folder, nor its times reach the image (as they do
+with `mke2fs -d`), and two builds give the same bytes. E2FSPROGS_FAKE_TIME stands in for the clock.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.image.tree import Entry, Tree, clamp
+from deploy.run import run
+
+BLOCK_BYTES = 4096
+_INODE_BYTES = 256
+
+# Named here and not in the machine's /etc/mke2fs.conf, so that every builder makes the same.
+_FEATURES = (
+    "none,ext_attr,dir_index,filetype,extent,flex_bg,sparse_super,large_file,huge_file,dir_nlink,"
+    "extra_isize,metadata_csum"
+)
+_FORMATS = {"file": 0o100000, "folder": 0o040000, "link": 0o120000}
+# What debugfs says without being asked: its version, and what a command did.
+_CHATTER = re.compile(r"debugfs \d|debugfs: |Allocated inode: |$")
+
+
+@dataclass(frozen=True)
+class Ext4:
+    """How a file system is made; `journal` for one that is written to in flight."""
+
+    label: str
+    identifier: uuid.UUID
+    journal: bool = False
+
+
+def bytes_needed(tree: Tree) -> int:
+    """What a file system for this tree must have at least, with its tables, in whole MiB."""
+    blocks = sum(max(1, -(-entry.content.size // BLOCK_BYTES)) for _, entry in tree.items())
+    tables = _inodes(tree) * _INODE_BYTES
+    # Bitmaps and group descriptors are 2 blocks of 32768 each; extents and long folders the rest.
+    needed = (blocks * BLOCK_BYTES + tables) * 1.02 + (4 << 20)
+    return -(-int(needed) // (1 << 20)) << 20
+
+
+def make(image: Path, size: int, tree: Tree, kind: Ext4, epoch: int) -> None:
+    """Makes a file system of `size` bytes that holds the tree, and checks it.
+
+    Raises:
+        DeployError: the tree does not fit, or a tool fails.
+    """
+    needed = bytes_needed(tree)
+    if size < needed:
+        raise DeployError(
+            f"{kind.label}: contents need {needed >> 20} MiB and get {size >> 20} MiB"
+        )
+    image.unlink(missing_ok=True)
+    with open(image, "wb") as file:
+        file.truncate(size)
+    features = _FEATURES + (",has_journal,resize_inode" if kind.journal else "")
+    extended = f"hash_seed={kind.identifier},lazy_itable_init=0,lazy_journal_init=0,root_owner=0:0"
+    inodes = ["-i", "16384"] if kind.journal else ["-N", str(_inodes(tree))]
+    options = ["-b", str(BLOCK_BYTES), "-I", str(_INODE_BYTES), "-O", features, "-m", "0", *inodes]
+    names = ["-L", kind.label, "-U", str(kind.identifier), "-E", extended]
+    # A configuration of ours: /etc/mke2fs.conf is another on another machine.
+    run(
+        ["mke2fs", "-q", "-F", *options, *names, image],
+        env={**_clock(epoch), "MKE2FS_CONFIG": "/dev/null"},
+    )
+    fill(image, tree, epoch)
+
+
+def fill(image: Path, tree: Tree, epoch: int, before: Tree | None = None) -> None:
+    """Makes a file system hold the tree, where it holds `before` now (default: nothing).
+
+    Entries that both trees share (the same object) are left as they are.
+
+    Raises:
+        DeployError: no room, or a tool fails.
+    """
+    with tempfile.TemporaryDirectory(dir=image.parent, prefix=".fill-") as work:
+        script = Path(work) / "script"
+        commands = _Commands(tree, before or Tree(), Path(work), epoch)
+        script.write_text("\n".join([*commands.removals(), *commands.additions()]) + "\n")
+        debugfs(image, script, epoch)
+    run(["e2fsck", "-fn", image], env=_clock(epoch))
+
+
+class _Commands:
+    """The debugfs script that makes one tree out of another."""
+
+    def __init__(self, tree: Tree, before: Tree, work: Path, epoch: int) -> None:
+        self._tree = tree
+        self._before = dict(before.items())
+        self._work = work
+        self._epoch = epoch
+        self._count = 0
+
+    def removals(self) -> Iterator[str]:
+        after = dict(self._tree.items())
+        # Deepest first, so that a folder is empty when its turn comes.
+        for path in reversed(self._before):
+            old, new = self._before[path], after.get(path)
+            if new is old or (new is not None and new.kind == old.kind == "folder"):
+                continue
+            yield f'{"rmdir" if old.kind == "folder" else "rm"} "/{path}"'
+
+    def additions(self) -> Iterator[str]:
+        for path, entry in self._tree.items():
+            old = self._before.get(path)
+            if entry is not old:
+                exists = old is not None and old.kind == entry.kind == "folder"
+                yield from self._make(path, entry, exists)
+
+    def _make(self, path: str, entry: Entry, exists: bool) -> Iterator[str]:
+        folder, _, name = path.rpartition("/")
+        if not exists:
+            # A new name goes into the current folder: `write` takes no other, and `mkdir "/x"`
+            # means it by the empty name before the slash.
+            yield f'cd "/{folder}"'
+        if entry.kind == "folder" and not exists:
+            yield f'mkdir "{name}"'
+        elif entry.kind == "link":
+            yield f'symlink "{name}" "{_quotable(entry.target)}"'
+        elif entry.kind == "file":
+            yield f'write "{self._source(entry)}" "{name}"'
+        yield f'sif "/{path}" mode 0{_FORMATS[entry.kind] | entry.mode:o}'
+        yield f'sif "/{path}" mtime @{clamp(entry, self._epoch)}'
+        if entry.uid or exists:
+            yield f'sif "/{path}" uid {entry.uid}'
+        if entry.gid or exists:
+            yield f'sif "/{path}" gid {entry.gid}'
+        for key, value in entry.xattrs:
+            yield f'ea_set -f "{self._stored(value)}" "/{path}" {key}'
+
+    def _source(self, entry: Entry) -> Path:
+        content = entry.content
+        if content.path is not None and not content.offset:
+            return Path(_quotable(str(content.path.resolve())))
+        return self._stored(content.read())
+
+    def _stored(self, data: bytes) -> Path:
+        path = self._work / str(self._count)
+        self._count += 1
+        path.write_bytes(data)
+        return path
+
+
+def debugfs(image: Path, script: Path, epoch: int) -> None:
+    """Runs a script of debugfs commands; it exits with 0 whatever fails, so its words are read."""
+    said = run(["debugfs", "-w", "-f", script, image], env=_clock(epoch), merge=True)
+    for line in said.decode(errors="replace").splitlines():
+        if not _CHATTER.match(line):
+            raise DeployError(f"{image.name}: debugfs: {line.strip()}")
+
+
+def _quotable(text: str) -> str:
+    if any(character in text for character in '\n\r\0"'):
+        raise DeployError(f"{text!r}: a name with a line break or a quote")
+    return text
+
+
+def _clock(epoch: int) -> dict[str, str]:
+    return {"E2FSPROGS_FAKE_TIME": str(epoch), "TZ": "UTC"}
+
+
+def _inodes(tree: Tree) -> int:
+    # A few to spare; the first 10 are the file system's own.
+    return len(tree) + 64

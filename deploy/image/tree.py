@@ -1,0 +1,274 @@
+"""A file tree in memory: what a file system shall hold, whoever builds it, root or not.
+
+Owners, modes and times stand in a table and not on the builder's disk, so that nothing depends on
+who extracts a tar, in which order a folder lists its files or when that was. Contents stay where
+they are (inside a tar, in a file) until a file system is written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from deploy.errors import DeployError
+
+Kind = Literal["file", "folder", "link"]
+
+# Linux follows at most so many symbolic links in one path (path_resolution(7)).
+_MAX_LINKS = 40
+
+
+@dataclass(frozen=True)
+class Content:
+    """The bytes of a file: held here, or a stretch of a file on disk."""
+
+    data: bytes | None = None
+    path: Path | None = None
+    offset: int = 0
+    size: int = 0
+
+    @staticmethod
+    def of(data: bytes) -> Content:
+        return Content(data=data, size=len(data))
+
+    @staticmethod
+    def at(path: Path) -> Content:
+        return Content(path=path, size=path.stat().st_size)
+
+    def read(self) -> bytes:
+        if self.data is not None:
+            return self.data
+        assert self.path is not None
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(self.offset)
+                data = file.read(self.size)
+        except OSError as error:
+            raise DeployError(f"{self.path}: {error.strerror or error}") from None
+        if len(data) != self.size:
+            raise DeployError(f"{self.path}: cut at byte {self.offset + len(data)}")
+        return data
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file, folder or symbolic link; `mode` is the permission bits (0 to 0o7777)."""
+
+    kind: Kind
+    mode: int
+    uid: int = 0
+    gid: int = 0
+    mtime: int | None = None  # s since 1970; None: the build's epoch
+    content: Content = field(default_factory=Content)  # of a file
+    target: str = ""  # of a link
+    xattrs: tuple[tuple[str, bytes], ...] = ()
+
+
+class Tree:
+    """Entries by their path, relative to the root and without a leading slash."""
+
+    def __init__(self) -> None:
+        self._entries: dict[str, Entry] = {}
+
+    @staticmethod
+    def from_tar(path: Path) -> Tree:
+        """What an uncompressed tar holds, in it; device nodes and sockets are left out.
+
+        Raises:
+            DeployError: no tar, cut, or with a path that leaves the root.
+        """
+        tree = Tree()
+        try:
+            with tarfile.open(path, "r:") as tar:
+                for member in tar:
+                    tree._take(path, member)
+        except (OSError, tarfile.TarError) as error:
+            raise DeployError(f"{path}: no readable tar: {error}") from None
+        return tree
+
+    def _take(self, tar: Path, member: tarfile.TarInfo) -> None:
+        name = _checked(member.name)
+        if not name:
+            return
+        mode = member.mode & 0o7777
+        xattrs = tuple(
+            (key.removeprefix("SCHILY.xattr."), value.encode("utf-8", "surrogateescape"))
+            for key, value in sorted(member.pax_headers.items())
+            if key.startswith("SCHILY.xattr.")
+        )
+        owned = Entry("file", mode, member.uid, member.gid, int(member.mtime), xattrs=xattrs)
+        if member.isdir():
+            self._entries[name] = replace(owned, kind="folder")
+        elif member.issym():
+            self._entries[name] = replace(owned, kind="link", mode=0o777, target=member.linkname)
+        elif member.islnk():
+            # A second name gets its own copy: one inode with two names is worth nothing on a
+            # file system that is never written.
+            self._entries[name] = self[_checked(member.linkname)]
+        elif member.isreg():
+            content = Content(path=tar, offset=member.offset_data, size=member.size)
+            self._entries[name] = replace(owned, content=content)
+
+    def resolve(self, path: str) -> str:
+        """The path with its folders' links followed: `lib/x` is `usr/lib/x` on a merged /usr."""
+        done: list[str] = []
+        todo = _checked(path).split("/")
+        links = 0
+        while todo:
+            part = todo.pop(0)
+            if part in ("", "."):
+                continue
+            if part == "..":
+                done = done[:-1]
+                continue
+            here = "/".join([*done, part])
+            entry = self._entries.get(here)
+            if entry is not None and entry.kind == "link" and todo:
+                links += 1
+                if links > _MAX_LINKS:
+                    raise DeployError(f"{path}: more than {_MAX_LINKS} links")
+                if entry.target.startswith("/"):
+                    done = []
+                todo = entry.target.strip("/").split("/") + todo
+            else:
+                done.append(part)
+        return "/".join(done)
+
+    def add(self, path: str, entry: Entry) -> None:
+        """Puts an entry into its place, with the folders above it, over what was there."""
+        place = self.resolve(path)
+        if not place:
+            raise DeployError(f"'{path}' names no file")
+        parent = place.rpartition("/")[0]
+        if parent and parent not in self._entries:
+            self.add(parent, Entry("folder", 0o755))
+        elif parent and self._entries[parent].kind != "folder":
+            raise DeployError(f"{path}: {parent} is no folder")
+        old = self._entries.get(place)
+        if old is not None and old.kind == "folder" and entry.kind != "folder":
+            raise DeployError(f"{path}: a folder is there already")
+        self._entries[place] = entry
+
+    def write(
+        self, path: str, data: bytes | str, mode: int = 0o644, uid: int = 0, gid: int = 0
+    ) -> None:
+        """A file with these bytes."""
+        raw = data.encode() if isinstance(data, str) else data
+        self.add(path, Entry("file", mode, uid, gid, content=Content.of(raw)))
+
+    def folder(self, path: str, mode: int = 0o755, uid: int = 0, gid: int = 0) -> None:
+        self.add(path, Entry("folder", mode, uid, gid))
+
+    def link(self, path: str, target: str) -> None:
+        self.add(path, Entry("link", 0o777, target=target))
+
+    def take_folder(self, source: Path, into: str = "") -> None:
+        """A folder of the disk: root's, 644, or 755 for what is executable, as git keeps them."""
+        for path in sorted(source.rglob("*")):
+            if "__pycache__" in path.parts:
+                continue
+            name = str(Path(into) / path.relative_to(source))
+            if path.is_symlink():
+                self.link(name, str(path.readlink()))
+            elif path.is_dir():
+                # A folder that the system has already keeps its own mode (/tmp, /root).
+                if name not in self:
+                    self.folder(name)
+            else:
+                mode = 0o755 if path.stat().st_mode & 0o100 else 0o644
+                self.add(name, Entry("file", mode, content=Content.at(path)))
+
+    def merge(self, other: Tree) -> None:
+        """Takes another tree's entries over; a folder that is there keeps its own owner."""
+        for path, entry in other.items():
+            if entry.kind != "folder" or path not in self:
+                self.add(path, entry)
+
+    def remove(self, path: str) -> None:
+        """Takes a file, link or whole folder away; nothing there is no error."""
+        place = self.resolve(path)
+        for name in [n for n in self._entries if n == place or n.startswith(place + "/")]:
+            del self._entries[name]
+
+    def replace(self, path: str, **changes: int) -> None:
+        """Changes an entry's mode, uid, gid or mtime."""
+        place = self.resolve(path)
+        self._entries[place] = replace(self[place], **changes)  # type: ignore[arg-type]
+
+    def __contains__(self, path: str) -> bool:
+        return self.resolve(path) in self._entries
+
+    def __getitem__(self, path: str) -> Entry:
+        try:
+            return self._entries[self.resolve(path)]
+        except KeyError:
+            raise DeployError(f"/{path}: not in the file tree") from None
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def read(self, path: str) -> bytes:
+        """A file's bytes, through symbolic links."""
+        place = self.resolve(path)
+        for _ in range(_MAX_LINKS):
+            entry = self[place]
+            if entry.kind == "file":
+                return entry.content.read()
+            if entry.kind != "link":
+                raise DeployError(f"/{path}: not a file")
+            above = "" if entry.target.startswith("/") else place.rpartition("/")[0] + "/"
+            place = self.resolve(_flat(above + entry.target.lstrip("/")))
+        raise DeployError(f"/{path}: more than {_MAX_LINKS} links")
+
+    def items(self) -> Iterator[tuple[str, Entry]]:
+        """All entries, each after its folder, in an order that nothing else has a hand in."""
+        # By parts, so that a folder's contents follow it whatever sorts below the slash.
+        for path in sorted(self._entries, key=lambda name: name.split("/")):
+            yield path, self._entries[path]
+
+    def below(self, folder: str) -> Iterator[tuple[str, Entry]]:
+        """The entries inside a folder, by their path from the root."""
+        place = self.resolve(folder) + "/"
+        return ((path, entry) for path, entry in self.items() if path.startswith(place))
+
+    def digest(self, epoch: int) -> bytes:
+        """SHA-256 over every path, owner, mode, time and content."""
+        whole = hashlib.sha256()
+        for path, entry in self.items():
+            head = (path, entry.kind, entry.mode, entry.uid, entry.gid, clamp(entry, epoch))
+            whole.update(repr((*head, entry.target, entry.xattrs)).encode())
+            if entry.kind == "file":
+                whole.update(hashlib.sha256(entry.content.read()).digest())
+        return whole.digest()
+
+
+def clamp(entry: Entry, epoch: int) -> int:
+    """The time that an entry gets: its own, at most the epoch.
+
+    Kept and not set to the epoch, since Python's compiled files hold their source's time.
+    """
+    return epoch if entry.mtime is None else max(0, min(entry.mtime, epoch))
+
+
+def _flat(path: str) -> str:
+    done: list[str] = []
+    for part in path.split("/"):
+        if part == "..":
+            done = done[:-1]
+        elif part not in ("", "."):
+            done.append(part)
+    return "/".join(done)
+
+
+def _checked(name: str) -> str:
+    """A path without `./`; refuses what leaves the root or what a script line cannot hold."""
+    parts = [part for part in name.split("/") if part not in ("", ".")]
+    if ".." in parts:
+        raise DeployError(f"{name!r}: a path that leaves the root")
+    if any(character in name for character in '\n\r\0"'):
+        raise DeployError(f"{name!r}: a path with a line break or a quote")
+    return "/".join(parts)
