@@ -13,14 +13,11 @@ from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.recording.exposures import Exposures
-from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
+from ground_station.recording.frames import ALL_FRAMES, CAMERA_TABLE, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey
 from ground_station.recording.video import check_given, frame_name
 from pi_firmware.wire import annexb, config
 from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader, VideoSample
-
-CAMERA_TABLE = "camera"
-"""The recording's metadata table that may hold `readout_s`, which no Foxglove message has."""
 
 
 class FlightRecording:

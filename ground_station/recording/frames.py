@@ -65,6 +65,9 @@ class FrameRange:
 
 ALL_FRAMES = FrameRange()
 
+CAMERA_TABLE = "camera"
+"""A recording's metadata table that may hold `readout_s`, which no Foxglove message has."""
+
 
 class FrameSource(Protocol):
     """A folder of images, a video file or a recording. Iterating opens it anew from its start.

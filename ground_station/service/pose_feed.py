@@ -7,8 +7,8 @@ import time
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from ground_station.geometry.poses import to_quaternion
 from ground_station.localization.estimate import PoseEstimate, State
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.telemetry import Session
@@ -24,22 +24,30 @@ def pose_message(
     covariance is the estimate's, of the right tangent and rotation first, row by row. What is not
     finite is not told: without a finite pose the frame counts as LOST.
     """
-    wTc, covariance = estimate.wTc, estimate.covariance
-    state = estimate.state.value
+    from ground_station.geometry.poses import to_quaternion  # scipy: not for who only forwards
+
+    wTc = estimate.wTc
+    state = estimate.state
     if wTc is not None and not np.isfinite(wTc).all():
-        wTc, state = None, State.LOST.value
-    if covariance is not None and not np.isfinite(covariance).all():
-        covariance = None
+        wTc, state = None, State.LOST
     return messages.Pose(
         time_ns=now_ns,
         capture_ns=capture_ns,
         sequence=sequence,
-        state=state,
+        state=state.value,
         position_m=None if wTc is None else wTc[:3, 3].tolist(),
         quaternion_xyzw=None if wTc is None else to_quaternion(wTc).tolist(),
-        covariance=None if wTc is None or covariance is None else covariance.ravel().tolist(),
+        covariance=None if wTc is None else told_covariance(estimate.covariance),
         relocalized=estimate.relocalized,
     )
+
+
+def told_covariance(covariance: npt.NDArray[np.float64] | None) -> list[float] | None:
+    """A covariance (6, 6) row by row; None where it is not finite."""
+    if covariance is None or not np.isfinite(covariance).all():
+        return None
+    values: list[float] = covariance.ravel().tolist()
+    return values
 
 
 class PoseFeed:
@@ -53,6 +61,13 @@ class PoseFeed:
         self, payload_id: str, estimate: PoseEstimate, *, capture_ns: int, sequence: int
     ) -> None:
         """Sends one estimate, solved or not; see `pose_message`. One that cannot go is dropped."""
+        self.send(
+            payload_id,
+            pose_message(estimate, capture_ns=capture_ns, sequence=sequence, now_ns=time.time_ns()),
+        )
+
+    def send(self, payload_id: str, message: messages.Pose) -> None:
+        """Sends a pose as it is to be told. One that cannot go is dropped."""
         import zenoh
 
         if payload_id not in self._publishers:
@@ -62,8 +77,5 @@ class PoseFeed:
                 congestion_control=zenoh.CongestionControl.DROP,
                 express=True,
             )
-        message = pose_message(
-            estimate, capture_ns=capture_ns, sequence=sequence, now_ns=time.time_ns()
-        )
         with contextlib.suppress(zenoh.ZError):
             self._publishers[payload_id].put(messages.encode(message))

@@ -36,7 +36,8 @@ class Spec:
     """A process: its name, `python -m` module and arguments.
 
     `needed`: bad input at its start ends the service, with its own line on standard error. `beats`:
-    it says that it lives.
+    it says that it lives. `later`: its first start waits for all needed ones, which then have the
+    processors for themselves.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Spec:
     arguments: tuple[str, ...] = ()
     needed: bool = True
     beats: bool = True
+    later: bool = False
 
 
 class Child:
@@ -60,6 +62,8 @@ class Child:
         self._heard_s: float | None = None
         self._last_heard_s = clock()
         self._due_s: float | None = clock()
+        self.started = False
+        """Whether it ever was."""
         self._pause_s = _FIRST_PAUSE_S
 
     @property
@@ -131,6 +135,7 @@ class Child:
             command = [setpriv, "--pdeathsig", "KILL", "--", *command]
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         self._started_s, self._heard_s, self._due_s = self._clock(), None, None
+        self.started = True
 
     def _fell(self, reason: str) -> str:
         now_s = self._clock()
@@ -183,6 +188,8 @@ class Children:
     def step(self) -> None:
         """Starts what is due; raises `ServiceError` when a needed process cannot start."""
         for child in list(self._children.values()):
+            if child.spec.later and not (child.started or self.living()):
+                continue
             if said := child.step():
                 self._report(said)
 
@@ -222,7 +229,8 @@ def table(folder: Path, *, foxglove: bool, demo: Path | None) -> tuple[Spec, ...
         Spec(WEB, "ground_station.service.web", (run,)),
     ]
     if foxglove:
-        specs.append(Spec(FOXGLOVE, "ground_station.service.foxglove", (run,), needed=False))
+        module = "ground_station.service.foxglove"
+        specs.append(Spec(FOXGLOVE, module, (run,), needed=False, later=True))
     if demo is not None:
         specs.append(Spec(PAYLOAD, "pi_firmware", ("--config", str(demo)), beats=False))
     return tuple(specs)

@@ -13,8 +13,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import tomli_w
-
 from ground_station.errors import InputError
 from ground_station.service import notes, processes
 from ground_station.service.bus import Bus, Router
@@ -22,7 +20,6 @@ from ground_station.service.notes import EventNote, PayloadNote, ProcessNote
 from ground_station.service.processes import Children
 from ground_station.service.settings import RUN_FILE, Run, StationSettings, write_run
 from pi_firmware.wire import config
-from pi_firmware.wire.recording import RecordingReader
 from pi_firmware.wire.systemd import Notifier
 
 DEMO_PAYLOAD = "demo"
@@ -159,6 +156,10 @@ def _check_map(folder: Path) -> None:
 
 def _demo_config(folder: Path, settings: StationSettings, recording: Path) -> Path:
     """The configuration of a payload that plays a recording to this station."""
+    import tomli_w
+
+    from pi_firmware.wire.recording import RecordingReader
+
     camera = RecordingReader(recording).calibration()
     if camera is None:
         raise InputError(f"{recording}: it carries no camera calibration")

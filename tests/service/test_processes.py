@@ -125,6 +125,24 @@ def test_bad_input_of_a_needed_process_ends_the_service(modules: Path) -> None:
     assert "status 2" in said[-1]
 
 
+def test_a_later_process_waits_for_the_needed_ones_at_the_first_start_only(modules: Path) -> None:
+    needed = Spec("stays", "stand_in_stays")
+    later = Spec("ends", "stand_in_ends", needed=False, later=True)
+    children = Children((later, needed), lambda text: None)
+    waiting, awaited = (children._children[name] for name in ("ends", "stays"))
+    try:
+        for _ in range(20):
+            children.step()
+        assert awaited.pid is not None and not waiting.started
+        awaited.beat(awaited.pid)
+        children.step()
+        assert waiting.started
+        os.kill(awaited.pid, signal.SIGKILL)  # from here on none waits for the other
+        until(lambda: waiting.restarts >= 2 and awaited.restarts == 1, children.step)
+    finally:
+        children.close()
+
+
 def test_children_end_with_a_parent_that_is_killed(modules: Path, tmp_path: Path) -> None:
     parent = (
         "import sys, time\n"

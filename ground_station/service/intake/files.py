@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ground_station.geometry.camera import Camera
-from ground_station.recording.flight import CAMERA_TABLE
+from ground_station.recording.frames import CAMERA_TABLE
 from ground_station.service import notes
 from ground_station.service.notes import EstimateNote
 from pi_firmware.wire import annexb

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import sys
@@ -29,6 +30,7 @@ def main(arguments: list[str]) -> int:
         return _BAD_INPUT
     # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.disable()  # a sixth of the time until the page is there; modules are no garbage
     try:
         asyncio.run(_serve(Path(arguments[0])))
     except BlimpError as error:
@@ -55,6 +57,8 @@ async def _serve(folder: Path) -> None:
     with listen(http.host, http.port) as socket, Bus(folder, processes.WEB) as bus:
         web = build(run, folder, bus, token)
         serving = server(web.guarded)
+        gc.freeze()
+        gc.enable()
         task = asyncio.create_task(serving.serve([socket]))
         host, port = socket.getsockname()[:2]
         place = f"[{host}]" if ":" in host else host
