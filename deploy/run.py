@@ -18,6 +18,7 @@ _PACKAGES = {
     "depmod": "kmod",
     "dpkg-deb": "dpkg",
     "dpkg-scanpackages": "dpkg-dev",
+    "dumpe2fs": "e2fsprogs",
     "e2fsck": "e2fsprogs",
     "fakeroot": "fakeroot",
     "git": "git",

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
+from deploy.image.sparse import Range
 from deploy.image.tree import Entry, Tree, clamp
 from deploy.run import run
 
@@ -91,6 +92,36 @@ def fill(image: Path, tree: Tree, epoch: int, before: Tree | None = None) -> Non
         script.write_text("\n".join([*commands.removals(), *commands.additions()]) + "\n")
         debugfs(image, script, epoch)
     run(["e2fsck", "-fn", image], env=_clock(epoch))
+
+
+def used_ranges(image: Path) -> list[Range]:
+    """The stretches that matter on a card: all but free blocks, so empty tables and journal, too.
+
+    Without these, an inode table or a journal that an earlier system left on the card at the same
+    place would be taken for this one's.
+    """
+    said = run(["dumpe2fs", image], env={"TZ": "UTC"}).decode(errors="replace")
+    block = int(_field(said, "Block size"))
+    size = int(_field(said, "Block count")) * block
+    used: list[Range] = []
+    position = 0
+    for line in said.splitlines():
+        # "  Free blocks: 27394-32767, 40000" below each group; the head's count is not indented.
+        if not line.startswith("  Free blocks: "):
+            continue
+        for part in line.partition(": ")[2].replace(",", " ").split():
+            first, _, last = part.partition("-")
+            used.append(Range(position, int(first) * block))
+            position = (int(last or first) + 1) * block
+    used.append(Range(position, size))
+    return [item for item in used if item.start < item.stop]
+
+
+def _field(said: str, name: str) -> str:
+    found = re.search(rf"^{name}: +(\S+)$", said, re.MULTILINE)
+    if found is None:
+        raise DeployError(f"dumpe2fs: says no {name.lower()}")
+    return found[1]
 
 
 class _Commands:
