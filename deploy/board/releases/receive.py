@@ -1,0 +1,178 @@
+"""Takes a bundle from a stream: signature first, then every file, then the switch.
+
+Nothing is written before the list's signature is good, and nothing is switched before every byte
+was read back from the card. A stream that ends early, or a full card, leaves all as it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from deploy.board.releases import archive, manifest, places, shelf
+from deploy.board.releases.archive import Member
+from deploy.board.releases.choose import MANIFEST, RELEASE
+from deploy.board.releases.manifest import File, Manifest, Release
+from deploy.board.releases.places import FACTORY, Places
+from deploy.board.releases.service import Service
+from deploy.errors import DeployError
+
+SIGNATURE = MANIFEST + ".sig"
+_FILE_SYSTEM_BYTES = 4096  # what a file takes beside its content, at most
+_SPARE_BYTES = 4 << 20
+
+
+def receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
+    """Takes a bundle and switches to it, on trial; gives its `version` and the trial's `id`.
+
+    Raises `DeployError` with one line, and the card is as it was.
+    """
+    with shelf.lock(at):
+        try:
+            return _receive(at, stream, service)
+        except OSError as error:
+            raise DeployError(f"{error.filename or at.releases}: {error.strerror}") from None
+
+
+def _receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
+    if (trial := shelf.settle(at, service)) is not None:
+        raise DeployError(f"{trial['release']} is still on trial; wait until that is decided")
+    shelf.prune(at)
+    members = archive.members(stream)
+    data = _named(members, MANIFEST).bytes(manifest.MOST_BYTES)
+    signature = _named(members, SIGNATURE).bytes(manifest.MOST_SIGNATURE_BYTES)
+    manifest.verify(data, signature, at.signers)
+    listed = manifest.parse(data)
+    factory = manifest.load_release(at.factory)
+    current, running = shelf.in_force(at)
+    manifest.check_against(listed, factory, running)
+    name = listed.release.version
+    if name == running.version:
+        return _again(at, current, running, listed, data)
+    _make_room(at, listed)
+    part = at.releases / f"{name}.part"
+    try:
+        _unpack(at, part, members, listed, data)
+        if wrong := shelf.hash_fault(part, listed):
+            raise DeployError(wrong)
+        if at.folder(name).is_dir():  # not the one in force
+            shelf.discard(at.folder(name))
+        part.rename(at.folder(name))
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    places.sync_folder(at.releases)
+    trial_id = shelf.begin(at, name, telemetry=service.seen().telemetry)
+    service.watch()
+    return {"version": name, "id": trial_id}
+
+
+def _named(members: Iterator[Member], name: str) -> Member:
+    member = next(members, None)
+    if member is None or member.name != name:
+        raise DeployError(f"the bundle does not have {name} where it must be")
+    return member
+
+
+def _again(
+    at: Places, current: str, running: Release, listed: Manifest, data: bytes
+) -> dict[str, Any]:
+    """Of a bundle of the very version that runs: nothing to do, when it is the same."""
+    same = running.made == listed.release.made
+    if current != FACTORY:
+        held = places.read(at.folder(current) / MANIFEST) or {}
+        same = held.get("files") == json.loads(data)["files"]
+    if not same:
+        raise DeployError(f"{running.version} runs, with other files than this bundle's")
+    return {"version": running.version, "id": ""}
+
+
+def _make_room(at: Places, listed: Manifest) -> None:
+    """Raises `DeployError` when the card is too full; the release before the last goes first."""
+    need = listed.size + len(listed.files) * _FILE_SYSTEM_BYTES + _SPARE_BYTES
+    if _free(at) < need and at.linked("previous") != FACTORY:
+        at.point("previous", FACTORY)
+        shelf.prune(at)
+    if (free := _free(at)) < need:
+        raise DeployError(
+            f"{at.releases}: {need / 1e6:.0f} MB are needed and {free / 1e6:.0f} MB free;"
+            " delete recordings in /data/recordings"
+        )
+
+
+def _free(at: Places) -> int:
+    found = os.statvfs(at.releases)
+    return found.f_bavail * found.f_frsize
+
+
+def _unpack(
+    at: Places, part: Path, members: Iterator[Member], listed: Manifest, data: bytes
+) -> None:
+    """Writes all files of a release; those that the bundle leaves out are the card's own."""
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(0o755)
+    held = [at.folder(name) for name in {at.linked("current"), FACTORY}]
+    member = next(members, None)
+    for file in listed.files:
+        target = part / file.path
+        target.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        if member is not None and member.name == file.path:
+            _write(target, member.chunks(), file)
+            member = next(members, None)
+        else:
+            _write(target, _from_card(held, file), file)
+    if member is not None:
+        raise DeployError(f"the bundle has {member.name[:80]!r}, which its list lacks there")
+    release = manifest.load_release(part)
+    if release != listed.release:
+        raise DeployError(f"the bundle's {RELEASE} is not the one that its list tells")
+    (part / MANIFEST).write_bytes(data)
+    os.sync()  # one for all: each file's own costs the card a journal entry
+
+
+def _write(target: Path, chunks: Iterator[bytes], file: File) -> None:
+    digest, size = hashlib.sha256(), 0
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+    with open(descriptor, "wb") as out:
+        for chunk in chunks:
+            size += len(chunk)
+            if size > file.size:
+                break
+            digest.update(chunk)
+            out.write(chunk)
+    if size != file.size or digest.hexdigest() != file.sha256:
+        raise DeployError(f"the bundle's {file.path} is not the file that its list tells")
+
+
+def _from_card(held: list[Path], file: File) -> Iterator[bytes]:
+    """A file that a release on the card has already; the caller checks its hash."""
+    for folder in held:
+        path = folder / file.path
+        with contextlib.suppress(OSError):
+            if path.stat().st_size == file.size and manifest.sha256_of(path) == file.sha256:
+                with path.open("rb") as source:
+                    while chunk := source.read(1 << 18):
+                        yield chunk
+                return
+    raise DeployError(f"the bundle lacks {file.path}, and the card has none like it")
+
+
+def holds(at: Places) -> dict[str, str]:
+    """Path and SHA-256 of every file of the release in force: what a bundle may leave out."""
+    current, _ = shelf.in_force(at)
+    folder = at.folder(current)
+    if current != FACTORY:
+        found = places.read(folder / MANIFEST) or {}
+        return {path: sha256 for path, _, sha256 in found["files"]}
+    hashes = {}
+    for path in folder.rglob("*"):
+        relative = str(path.relative_to(folder))
+        if path.is_file() and manifest.is_path(relative):
+            hashes[relative] = manifest.sha256_of(path)
+    return hashes

@@ -1,0 +1,97 @@
+"""Decides within two minutes whether a new release stays, and goes back when it does not.
+
+Healthy is: frames leave the encoder (READY=1 of sd_notify, which the firmware says then and only
+then), the program has not ended since, it has run for 10 s, and the ground station hears it if it
+did before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from deploy.board.releases import choose, manifest, places, shelf
+from deploy.board.releases.choose import FELL_BACK, HEALTHY
+from deploy.board.releases.places import Places
+from deploy.board.releases.service import Seen, Service
+
+LIMIT_S = 120.0
+STEADY_S = 10.0
+_LOOK_S = 1.0
+_RESTART_S = 30.0
+
+
+def decide(
+    trial: dict[str, Any], running: dict[str, Any], seen: Seen, elapsed_s: float
+) -> tuple[str, str]:
+    """`HEALTHY`, or `FELL_BACK` with the reason, or '' while it is open.
+
+    `running` is what start.py said of the firmware's last start, `elapsed_s` is since the first
+    start in this boot.
+    """
+    release = trial["release"]
+    started = running.get("trial") == trial["id"]
+    if started and running.get("name") != release:
+        return FELL_BACK, str(running.get("reason") or f"{release}: not started")
+    if started and seen.restarts:
+        return FELL_BACK, f"{release}: the firmware ended by itself ({seen.said})"
+    lacks = ""
+    if not started or not seen.active:
+        lacks = f"no frames within {LIMIT_S:g} s ({seen.said})"
+    elif trial["telemetry"] and not seen.telemetry:
+        lacks = f"the ground station does not hear it within {LIMIT_S:g} s, and did before"
+    elif seen.active_s >= STEADY_S:
+        return HEALTHY, ""
+    if elapsed_s < LIMIT_S:
+        return "", ""
+    return FELL_BACK, f"{release}: {lacks or f'not steady within {LIMIT_S:g} s'}"
+
+
+def watch(
+    at: Places,
+    service: Service,
+    say: Callable[[str], None],
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
+    """Watches the trial that is under way to its end; without one it does nothing."""
+    with shelf.lock(at):
+        trial = shelf.settle(at, service)
+        if trial is None:
+            return
+        boot_id, now_s = at.this_boot(), at.uptime_s()
+        first = trial["boot_id"] == ""
+        if trial["boot_id"] != boot_id or now_s < trial["started_s"]:
+            trial |= {"boot_id": boot_id or "unknown", "started_s": now_s}
+            places.write(at.trial, trial)
+        before = trial["previous"] or "the image's"
+        say(f"{trial['release']} is on trial, after {before}")
+        # A board that comes back from a power cut starts the firmware itself.
+        restarted_s = -_RESTART_S if first else at.uptime_s()
+        while True:
+            running = places.read(at.running) or {}
+            waited_s = at.uptime_s() - restarted_s
+            if running.get("trial") != trial["id"] and waited_s >= _RESTART_S:
+                service.restart()
+                restarted_s = at.uptime_s()
+            elapsed_s = at.uptime_s() - trial["started_s"]
+            outcome, reason = decide(trial, running, service.seen(), elapsed_s)
+            if outcome:
+                break
+            sleep(_LOOK_S)
+        say(f"{trial['release']}: {outcome}{f': {reason}' if reason else ''}")
+        shelf.finish(at, service if outcome == FELL_BACK else None, trial, outcome, reason)
+
+
+def status(at: Places) -> dict[str, Any]:
+    """What runs, what is on trial and what became of the last update, for JSON."""
+    current, release = shelf.in_force(at)
+    trial = choose.read_trial(at)
+    return {
+        "schema": "blimp.releases/1",
+        "in_force": {"name": current, **release._asdict()},
+        "factory": manifest.load_release(at.factory)._asdict(),
+        "running": places.read(at.running),
+        "trial": trial["id"] if trial else "",
+        "last": choose.read_last(at),
+    }

@@ -1,0 +1,71 @@
+"""Starts the firmware: `python3 -m deploy.board.start`, for systemd.
+
+Chooses the release, counts the start of one that is under trial, and becomes `python3 -m
+pi_firmware` with the same process id. Whatever is wrong with an update, something is started.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+from deploy.board.releases import choose, places
+from deploy.board.releases.places import Places
+
+ENVIRONMENT = "BLIMP_RELEASE"
+"""Tells the firmware its release: a JSON object of `version`, `how` and `reason`."""
+
+
+def choice(at: Places, state: choose.State) -> choose.Choice:
+    """The release to start now; counts the start of one under trial."""
+    if state.on_trial and state.trial is not None and 0 <= state.starts < choose.STARTS:
+        counted = {"id": state.trial["id"], "starts": state.starts + 1}
+        try:
+            places.write(at.starts, counted)
+        except OSError as error:
+            print(f"start: {at.starts}: {error.strerror}", file=sys.stderr)
+            state.starts = -1
+    return choose.choose(state, lambda name: choose.size_fault(at, name))
+
+
+def environment(at: Places, chosen: choose.Choice, given: dict[str, str]) -> dict[str, str]:
+    """The firmware's environment: where its modules are, and which release it is."""
+    folder = at.folder(chosen.name)
+    release = places.read(folder / choose.RELEASE) or {}
+    version = chosen.name or str(release.get("version", ""))
+    told = {"version": version, "how": chosen.how, "reason": chosen.reason}
+    return {
+        **given,
+        "PYTHONPATH": os.pathsep.join((str(folder), str(folder / "site"))),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONSAFEPATH": "1",  # nothing is imported from where it happens to be started
+        ENVIRONMENT: json.dumps(told),
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Becomes the firmware; `--root DIR` in tests, all else goes to the firmware."""
+    root = "/"
+    if arguments[:1] == ["--root"] and len(arguments) > 1:
+        root, arguments = arguments[1], arguments[2:]
+    at = Places(root)
+    state = choose.read_state(at)
+    chosen = choice(at, state)
+    variables = environment(at, chosen, dict(os.environ))
+    told = json.loads(variables[ENVIRONMENT])
+    try:
+        trial = state.trial["id"] if state.on_trial and state.trial is not None else ""
+        running = {**told, "name": chosen.name, "trial": trial}
+        places.write(at.running, running, durable=False)
+    except OSError as error:  # the watcher knows less, the firmware flies all the same
+        print(f"start: {at.running}: {error.strerror}", file=sys.stderr)
+    said = f"start: release {told['version'] or '?'} ({chosen.how})"
+    print(f"{said}: {chosen.reason}" if chosen.reason else said, flush=True)
+    python = sys.executable or "/usr/bin/python3"
+    program = [python, "-m", "pi_firmware", "--config", str(at.config), *arguments]
+    os.execve(python, program, variables)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
