@@ -2,12 +2,15 @@
 
     FOLDER/authority.json         members and the step of a rotation
     FOLDER/authorities/N.pem|key  the authorities, newest last
-    FOLDER/payload/ID/            to copy to the payload: certificate, access list, SRTP, SSH
+    FOLDER/releases/N|N.pub       the keys that sign releases of the firmware, newest last
+    FOLDER/payload/ID/            to copy to the payload: certificate, access list, SRTP, SSH, and
+                                  whose releases it takes (allowed_signers)
     FOLDER/ground/NAME/           to copy to the ground station: the same, and all SRTP keys
 
 Zenoh reads no revocation list. A revoked name leaves the access lists of all others, which holds on
 each machine once its new folder is there and its program was started anew; a rotation of the
-authority ends what the old one signed, whatever the lists say.
+authority ends what the old one signed, whatever the lists say. The key of the releases goes along
+with it, step by step.
 """
 
 from __future__ import annotations
@@ -28,7 +31,9 @@ from pi_firmware.wire.credentials import GROUND, PAYLOAD
 SCHEMA = "blimp.authority/1"
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 730
 STEPS = ("settled", "both trusted", "new certificates")
-SRTP, SSH = "srtp.key", "ssh_ed25519"
+SRTP, SSH, SIGNERS = "srtp.key", "ssh_ed25519", "allowed_signers"
+RELEASES = "blimp-release"
+"""Name and OpenSSH namespace of what the release keys sign."""
 
 
 class Authority:
@@ -111,6 +116,21 @@ class Authority:
         self._save()
         return STEPS[self.step]
 
+    def release_key(self) -> tuple[Path, bool]:
+        """The private key that signs releases now, and whether it had to be made.
+
+        Raises `KeysError` when somebody took it away: another one would be trusted by no card.
+
+        An authority older than releases has none: it gets one, and its payloads' folders the public
+        part, which reaches a card only when it is provisioned anew.
+        """
+        path = self.folder / "releases" / str(self.signing)
+        made = not path.with_name(f"{path.name}.pub").is_file()
+        self._save()
+        if not path.is_file():
+            raise KeysError(f"{path}: the key that signs releases is not here; bring it back")
+        return path, made
+
     def live(self) -> list[str]:
         """The common names that are not revoked, sorted."""
         return sorted(name for name, entry in self.members.items() if not entry["revoked"])
@@ -142,6 +162,8 @@ class Authority:
             except (credentials.TelemetryError, KeysError, OSError) as error:
                 problems.append(f"{name}: {error}")
                 continue
+            if name.startswith(PAYLOAD) and not self._trusts_releases(held.folder):
+                problems.append(f"{name}: takes no releases of this authority; 'release' mends it")
             if common != name or held.name != name:
                 problems.append(f"{name}: the certificate is {common}'s")
             if set(held.peers) != set(self._peers(name)):
@@ -181,13 +203,17 @@ class Authority:
     def _save(self) -> None:
         """Writes the members' trust and access lists, then the authority's own file."""
         bundle = b"".join(self._pair(number).certificate for number in self.trusted)
+        self._make_release_keys()
+        signers = self._signers()
         live = self.live()
         for name in live:
             access = {"schema": credentials.SCHEMA, "name": name, "peers": self._peers(name)}
             folder = self.of(name)
             write_private(folder / credentials.AUTHORITIES, bundle, replace=True)
             write_private(folder / credentials.ACCESS, _json(access), replace=True)
-            if name.startswith(GROUND):
+            if name.startswith(PAYLOAD):
+                write_private(folder / SIGNERS, signers, replace=True)
+            else:
                 self._give_srtp(folder, [peer for peer in live if peer.startswith(PAYLOAD)])
         document = {
             "schema": SCHEMA,
@@ -197,6 +223,27 @@ class Authority:
             "members": self.members,
         }
         write_private(self.folder / "authority.json", _json(document), replace=True)
+
+    def _make_release_keys(self) -> None:
+        """A key for each trusted number that has none; Ed25519, like the machines' SSH keys."""
+        folder = _folder(self.folder / "releases")
+        for number in self.trusted:
+            if not (folder / f"{number}.pub").is_file():
+                private, public = certificates.make_ssh_key()
+                write_private(folder / str(number), private, replace=True)
+                write_private(folder / f"{number}.pub", public)  # last: it says that both are made
+
+    def _signers(self) -> bytes:
+        """OpenSSH's allowed signers: the trusted keys, without dates: a card may boot in 1970."""
+        public = [self.folder / "releases" / f"{number}.pub" for number in self.trusted]
+        who = f'{RELEASES} namespaces="{RELEASES}" '.encode()
+        return b"".join(who + path.read_bytes() for path in public)
+
+    def _trusts_releases(self, folder: Path) -> bool:
+        try:
+            return (folder / SIGNERS).read_bytes() == self._signers()
+        except OSError:
+            return False
 
     def _give_srtp(self, ground: Path, payloads: list[str]) -> None:
         folder = _folder(ground / "srtp")

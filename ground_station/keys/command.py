@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add.add_argument("name", help="1 to 32 of a-z, 0-9, - and _")
         add.add_argument("--days", type=int, default=730, help="valid for, days, 1 to 3650")
     actions.add_parser("list", help="who has a certificate, and until when")
+    actions.add_parser("release", help="name the key that signs releases; makes a missing one")
     revoke = actions.add_parser("revoke", help="take a name out of everyone's access list")
     revoke.add_argument("name", help="payload.ID or ground.NAME")
     actions.add_parser("rotate", help="go one step of the three that replace the authority")
@@ -62,6 +64,13 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{arguments.name} is off all lists: copy the folders again, restart the programs")
     elif action == "rotate":
         print(f"authority: {authority.rotate()}; copy all folders before the next step")
+    elif action == "release":
+        path, made = authority.release_key()
+        if made:
+            print(
+                f"{path} is new: copy the payloads' folders to their cards again", file=sys.stderr
+            )
+        print(path)
     elif action == "list":
         _list(authority)
     else:
