@@ -99,7 +99,8 @@ class Payload:
         """
         self._stop = stop
         announce = self._reporter.announce
-        announce(messages.EVENT_STARTED, f"streaming {self.settings.camera.uri}")
+        started = f"streaming {self.settings.camera.uri}, {self._supervision.release}"
+        announce(messages.EVENT_STARTED, started)
         try:
             self._link.start()
             self._capture.start()

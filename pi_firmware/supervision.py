@@ -12,6 +12,7 @@ from pi_firmware.capture import Capture
 from pi_firmware.ground import Ground
 from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi
 from pi_firmware.recording import Recorder
+from pi_firmware.release import Release, of_environment
 from pi_firmware.settings import Settings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.clock_offset import OffsetFilter
@@ -21,6 +22,8 @@ from pi_firmware.wire.systemd import Notifier
 VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
 _FEED_S = 1.0
 _CLOCK_S = 10.0
+TELEMETRY_UP, TELEMETRY_DOWN = "telemetry up", "telemetry down"
+"""What systemd's status line says; whoever tries out a new release looks for it."""
 _GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
 
 
@@ -53,10 +56,12 @@ class Supervision:
         settings: Settings,
         announce: Callable[[str, str], None],
         notifier: Notifier | None = None,
+        release: Release | None = None,
     ) -> None:
         self.table = Table(tasks(settings))
         self.notifier = notifier or Notifier()
         self.wifi = Wifi(settings.wifi, announce)
+        self.release = release or of_environment()
         self._settings = settings
         self._restarts = Restarts(settings.supervision.state, settings.supervision.process_restarts)
         folder = settings.recording.folder
@@ -65,6 +70,7 @@ class Supervision:
         self._started_s = time.monotonic()
         self._fed_s = 0.0
         self._ready = False
+        self._status = ""
         self._fresh = self._measured = 0
         self._measured_s = self._started_s
         self._clock = OffsetFilter()
@@ -87,6 +93,7 @@ class Supervision:
         def publish() -> None:
             self.wifi.step()
             telemetry.health(self.health(capture, ground, recorder))
+            self._tell_systemd(TELEMETRY_DOWN if ground.seen is None else TELEMETRY_UP)
 
         def ask() -> None:
             trip = telemetry.ask_time()
@@ -146,6 +153,9 @@ class Supervision:
             recording=recorder.file,
             recording_MB=recorder.size_MB,
             recording_dropped=recorder.dropped,
+            version=self.release.version,
+            release=self.release.how,
+            release_reason=self.release.reason,
             **asdict(self._board.read()),
         )
 
@@ -155,6 +165,12 @@ class Supervision:
         for thread in self._threads:
             thread.stop()
         self.wifi.stop()
+
+    def _tell_systemd(self, heard: str) -> None:
+        """The status line, once frames have come; said when it changes."""
+        status = f"{self.release}; {heard}"
+        if self._ready and status != self._status and self.notifier.status(status):
+            self._status = status
 
     def _may_reboot(self, *, ending: bool) -> bool:
         if not self._settings.supervision.reboot_command:

@@ -162,6 +162,7 @@ class Health(Message):
     """How payload and board are; None: this board cannot tell, or nothing was heard."""
 
     SCHEMA: ClassVar[str] = "blimp.health"
+    MINOR: ClassVar[int] = 1
 
     uptime_s: float  # of the program
     captured: int = 0
@@ -191,6 +192,9 @@ class Health(Message):
     recording: str = ""  # the file's name; empty: none
     recording_MB: float = 0.0
     recording_dropped: int = 0  # frames that a slow disk did not take
+    version: str = ""  # of the program, with the release's commit; an older writer gave none
+    release: str = ""  # how it came: factory, update, fell back; empty: it runs on no card
+    release_reason: str = ""  # why an update did not stay
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class Flying:
         self.notify.bind(str(tmp_path / "notify"))
         self.notify.setblocking(False)
         self.process: subprocess.Popen[str] | None = None
-        self._environment = {
+        self.environment = {
             **os.environ,
             "NOTIFY_SOCKET": str(tmp_path / "notify"),
             "WATCHDOG_USEC": "8000000",
@@ -48,7 +48,7 @@ class Flying:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=self._environment,
+            env=self.environment,
         )
 
     def state(self, condition: Callable[[PayloadState], bool]) -> PayloadState:
