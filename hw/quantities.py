@@ -7,12 +7,12 @@ import math
 from hw.errors import HardwareError
 
 RANGES: dict[str, tuple[float, float]] = {
-    "temperature_c": (-40.0, 60.0),
-    "pressure_hpa": (300.0, 1100.0),
+    "temperature_C": (-40.0, 60.0),
+    "pressure_hPa": (300.0, 1100.0),
     "altitude_m": (-430.0, 9000.0),
     "humidity_percent": (0.0, 100.0),
     "purity_percent": (50.0, 100.0),
-    "superpressure_pa": (0.0, 5000.0),
+    "superpressure_Pa": (0.0, 5000.0),
     "leak_percent_per_day": (0.0, 50.0),
     "days": (0.0, 365.0),
     "air_kg_m3": (0.3, 2.0),
@@ -34,8 +34,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "height_m": (0.1, 1000.0),
     "drag_coefficient": (0.01, 10.0),
     "required_g": (-1e6, 1e6),
-    "capacity_mah": (50.0, 20000.0),
-    "cutoff_v": (2.5, 4.0),
+    "capacity_mAh": (50.0, 20000.0),
+    "cutoff_V": (2.5, 4.0),
     "health_percent": (10.0, 100.0),
     "reserve_percent": (0.0, 90.0),
     "samples": (100, 1_000_000),
@@ -44,10 +44,10 @@ RANGES: dict[str, tuple[float, float]] = {
 """Smallest and largest value that is taken, both included."""
 
 _UNITS = {
-    "temperature_c": "°C", "pressure_hpa": "hPa", "humidity_percent": "%", "purity_percent": "%",
-    "superpressure_pa": "Pa", "leak_percent_per_day": "% a day", "air_kg_m3": "kg/m³",
+    "temperature_C": "°C", "pressure_hPa": "hPa", "humidity_percent": "%", "purity_percent": "%",
+    "superpressure_Pa": "Pa", "leak_percent_per_day": "% a day", "air_kg_m3": "kg/m³",
     "helium_kg_m3": "kg/m³", "volume_m3": "m³", "volume_sigma_percent": "%",
-    "film_g_m2": "g/m²", "capacity_mah": "mAh", "health_percent": "%", "reserve_percent": "%",
+    "film_g_m2": "g/m²", "capacity_mAh": "mAh", "health_percent": "%", "reserve_percent": "%",
 }  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def unit_of(name: str) -> str:
     """The unit that the name of an input carries, as it is printed; "" for a pure number."""
     if name in _UNITS:
         return _UNITS[name]
-    return {"m": "m", "g": "g", "v": "V"}.get(name.rsplit("_", 1)[-1], "")
+    return {"m": "m", "g": "g", "V": "V"}.get(name.rsplit("_", 1)[-1], "")
 
 
 def checked(name: str, value: float) -> float:

@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="F.mcap", help="recording to write")
     add("--duration-s", type=float, metavar="S", help="length of the flight (default: the plan's)")
     add("--rate-hz", type=float, default=30.0, metavar="R", help="frames a second (default: 30)")
+    add("--build", metavar="NAME", help="the blimp, of hw/builds.toml (default: atrium)")
     quality = parser.add_mutually_exclusive_group()
     quality.add_argument(
         "--crf", type=float, default=20.0, help="x264's quality, 0 (best) to 51 (default: 20)"
@@ -79,5 +80,5 @@ def settings_from(args: argparse.Namespace) -> SimulationSettings:
     return SimulationSettings(
         out=args.out, scene=args.scene, plan=args.plan, light=args.light, seed=args.seed,
         duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
-        bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points,
+        bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points, build=args.build,
     )  # fmt: skip

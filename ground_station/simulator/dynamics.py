@@ -3,52 +3,73 @@
 A rigid ellipsoid with its weight below its centre of buoyancy. Added mass after Lamb
 (Hydrodynamics, 1932, §114) as tabulated for prolate spheroids; drag as ½ρ C A v|v| along each body
 axis; draughts as an Ornstein–Uhlenbeck process. The pilot is a PD controller with limited thrust.
+Masses, sizes and coefficients are a build's, from `hw/builds.toml`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ground_station.simulator.motion import Motion, Mount
 from ground_station.simulator.plans import Reference
+from hw.flight import flight_model
 
 Array = npt.NDArray[np.float64]
 
-AIR_KG_M3 = 1.204  # dry air, 20 °C, 101.3 kPa, an ideal gas of 287.05 J/(kg K)
-HELIUM_KG_M3 = 0.170  # helium of 99 %, same state, slight overpressure
 GRAVITY_M_S2 = 9.81
 _STEP_S = 1 / 200
 
 
+def _built(name: str) -> Any:
+    """A field whose default is the number of the build that the simulator flies."""
+    return field(default_factory=lambda: getattr(flight_model(), name))
+
+
 @dataclass(frozen=True)
 class Blimp:
-    """A hull with semi-axes a, b, b, and what hangs under it."""
+    """A hull with semi-axes a, b, b, and what hangs under it; by default the build `atrium`."""
 
-    semi_length_m: float = 0.85
-    semi_width_m: float = 0.31
-    mass_kg: float = 0.352
+    semi_length_m: float = _built("semi_length_m")
+    semi_width_m: float = _built("semi_width_m")
+    mass_kg: float = _built("mass_kg")
     """Hull, payload and trim, without the helium: neutral."""
-    added_axial: float = 0.14
-    """Added mass over displaced mass along the nose: spheroid of fineness 2.74 (Lamb)."""
-    added_lateral: float = 0.78
-    drag_axial: float = 0.30
-    """On the frontal area; a hull with fins and gondola at Re of 5e4."""
-    drag_lateral: float = 0.90
-    """On the side area: a cylinder across the flow, less its rounded ends."""
-    weight_below_m: float = 0.10
+    added_axial: float = _built("added_axial")
+    """Added mass over displaced mass along the nose."""
+    added_lateral: float = _built("added_lateral")
+    drag_axial: float = _built("drag_axial")
+    """On the frontal area."""
+    drag_lateral: float = _built("drag_lateral")
+    """On the side area."""
+    weight_below_m: float = _built("weight_below_m")
     """Centre of gravity below centre of buoyancy."""
-    thrust_below_m: float = 0.10
+    thrust_below_m: float = _built("thrust_below_m")
     """Propellers below the centre of buoyancy: thrust pitches the hull."""
-    thrust_limit_N: float = 0.40
-    swing_damping: float = 0.12
+    thrust_limit_N: float = _built("thrust_limit_N")
+    swing_damping: float = _built("swing_damping")
     """Damping ratio of pitch and roll."""
+    air_kg_m3: float = _built("air_kg_m3")
+    helium_kg_m3: float = _built("helium_kg_m3")
+    camera_forward_m: float = _built("camera_forward_m")
+    camera_up_m: float = _built("camera_up_m")
+    camera_tilt_down_deg: float = _built("camera_tilt_down_deg")
     draught_m_s: float = 0.05
     """Deviation of the air's speed along each axis; ASHRAE 55 allows 0.2 m/s where people sit."""
     draught_time_s: float = 4.0
+
+    @classmethod
+    def of_build(cls, name: str) -> Blimp:
+        """Another build of `hw/builds.toml`; raises `HardwareError` with one line."""
+        return cls(**asdict(flight_model(name)))
+
+    @property
+    def mount(self) -> Mount:
+        """Where the build has its camera."""
+        return Mount(self.camera_forward_m, self.camera_up_m, self.camera_tilt_down_deg)
 
     @property
     def volume_m3(self) -> float:
@@ -58,12 +79,13 @@ class Blimp:
     @property
     def net_lift_N(self) -> float:
         """Buoyancy less all weight."""
-        return (self.volume_m3 * (AIR_KG_M3 - HELIUM_KG_M3) - self.mass_kg) * GRAVITY_M_S2
+        return (self.volume_m3 * (self.air_kg_m3 - self.helium_kg_m3) - self.mass_kg) * GRAVITY_M_S2
 
     @property
     def inertial_mass_kg(self) -> tuple[float, float, float]:
         """Mass, helium and added mass along body x, y, z."""
-        own, air = self.mass_kg + self.volume_m3 * HELIUM_KG_M3, self.volume_m3 * AIR_KG_M3
+        own = self.mass_kg + self.volume_m3 * self.helium_kg_m3
+        air = self.volume_m3 * self.air_kg_m3
         return (
             own + self.added_axial * air,
             own + self.added_lateral * air,
@@ -76,17 +98,17 @@ class Blimp:
         front = math.pi * self.semi_width_m**2
         side = math.pi * self.semi_length_m * self.semi_width_m
         return (
-            0.5 * AIR_KG_M3 * self.drag_axial * front,
-            0.5 * AIR_KG_M3 * self.drag_lateral * side,
-            0.5 * AIR_KG_M3 * self.drag_lateral * side,
+            0.5 * self.air_kg_m3 * self.drag_axial * front,
+            0.5 * self.air_kg_m3 * self.drag_lateral * side,
+            0.5 * self.air_kg_m3 * self.drag_lateral * side,
         )
 
     @property
     def swing_rate_rad_s(self) -> tuple[float, float]:
         """Undamped frequencies of pitch and roll: √(m g h / I), I of the air moved included."""
         a, b = self.semi_length_m, self.semi_width_m
-        hull = self.mass_kg + self.volume_m3 * HELIUM_KG_M3
-        air = self.volume_m3 * AIR_KG_M3
+        hull = self.mass_kg + self.volume_m3 * self.helium_kg_m3
+        air = self.volume_m3 * self.air_kg_m3
         pitch = (hull + 0.5 * air) * (a * a + b * b) / 5 + self.mass_kg * self.weight_below_m**2
         roll = hull * 2 * b * b / 5 + self.mass_kg * self.weight_below_m**2
         moment = self.mass_kg * GRAVITY_M_S2 * self.weight_below_m
@@ -187,4 +209,4 @@ def fly(
             want_turn[k] - state.rates_rad_s[0]
         )
         step(blimp, state, thrust, spin, (wind[0], wind[1], wind[2]), _STEP_S)
-    return Motion(times, rows[:, :3], rows[:, 3:], mount or Mount())
+    return Motion(times, rows[:, :3], rows[:, 3:], mount or blimp.mount)

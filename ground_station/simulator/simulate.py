@@ -41,7 +41,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What to fly. `duration_s` None is the plan's own; `bitrate_kbps` replaces `crf`."""
+    """What to fly. `duration_s` None is the plan's own; `bitrate_kbps` replaces `crf`.
+
+    `build` is one of `hw/builds.toml`; None: the one that `simulated` there names.
+    """
 
     out: Path
     scene: str = "atrium"
@@ -58,6 +61,7 @@ class SimulationSettings:
     supersampling: float = 1.25
     renders: int = 2
     camera: Camera = THESIS_CAMERA
+    build: str | None = None
 
     def __post_init__(self) -> None:
         limits = {
@@ -124,9 +128,12 @@ def prepare_flight(settings: SimulationSettings) -> Flight:
     count = max(1, round(duration * settings.rate_hz))
     phase = float(path.random())
     if plan.by_hand:
+        if settings.build is not None:
+            raise SimulatorError(f"build is {settings.build!r}; plan {settings.plan!r} flies none")
         motion = handheld.carry(Reference(plan, phase, _RUN_UP_S), duration, air)
     else:
-        motion = dynamics.fly(Reference(plan, phase), duration, air)
+        blimp = dynamics.Blimp.of_build(settings.build) if settings.build else dynamics.Blimp()
+        motion = dynamics.fly(Reference(plan, phase), duration, air, blimp)
     return Flight(scene, plan, motion, np.arange(count) / settings.rate_hz, noise, clicks)
 
 
@@ -267,6 +274,8 @@ def _write_head(
             "rate_hz": f"{settings.rate_hz:g}",
             "duration_s": f"{len(flight.times_s) / settings.rate_hz:g}",
             "version": metadata.version("blimp-localization"),
+            # The one that is flown without being asked for is not named, as ever.
+            **({"build": settings.build} if settings.build else {}),
         },
     )
     writer.write_calibration(
