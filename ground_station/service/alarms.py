@@ -18,6 +18,7 @@ from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
 HOLD_S = 3.0
 LOST_S, NO_FRAMES_S, NO_POSES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 4.0, 10.0
 SILENT_S, RESTARTED_S = 5.0, 30.0
+RESUMED_S = 120.0
 GONE_FOR_S = 600.0
 DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
 HOT_C, NO_MORE_HOT_C = 80.0, 76.0
@@ -173,6 +174,9 @@ def _of_recording(state: Mapping[str, Any], standing: frozenset[str]) -> Iterato
     recording = _table(state, "recording")
     if recording.get("problem"):
         yield Alarm("recording", ALARM, STATION, f"recording: {recording['problem']}")
+    resumed, lasts_s = recording.get("resumed"), _number(recording.get("duration_s")) or 0.0
+    if resumed and lasts_s < RESUMED_S:
+        yield Alarm("resumed", WARNING, STATION, f"recording: {resumed}")
     free_MB = _number(recording.get("free_MB"))
     # It ends at the setting's limit: the warning comes before.
     limit_MB = _number(_table(state, "station").get("min_free_MB")) or 0.0

@@ -21,6 +21,8 @@ STATION = "-"
 """Stands for a payload's id where a note is of none."""
 
 INFO, WARNING, ALARM = "info", "warning", "alarm"
+RECORDING_RESUMED = "recording-resumed"
+"""An event: a recording that was cut goes on in another file."""
 
 N = TypeVar("N", bound="Note")
 
@@ -140,6 +142,7 @@ class RecordingNote(Note):
     dropped: int = 0
     free_MB: float | None = None
     problem: str = ""
+    resumed: str = ""  # where it goes on from one that was cut: both files, and what is lost
 
 
 @dataclass(frozen=True)

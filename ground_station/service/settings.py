@@ -73,6 +73,9 @@ class RecordingSettings:
 
     folder: str = key("recordings", "where they go")
     at_start: bool = key(False, "records from the start")
+    resume_s: float = key(
+        600.0, "one cut so long ago at most goes on; 0: none", unit="s", low=0, high=86_400
+    )
     max_file_MB: int = key(1024, "a file ends at this size", unit="MB", low=1, high=4000)
     max_file_s: float = key(3600.0, "and at this age", unit="s", low=10, high=86_400)
     max_total_MB: int = key(20_000, "oldest are deleted beyond", unit="MB", low=1, high=10_000_000)

@@ -228,6 +228,12 @@ class Service:
         self.seen |= set(found.values())
         return found
 
+    def parent(self) -> Process:
+        """The program itself."""
+        one = process("serve", self.process.pid)
+        assert one is not None
+        return one
+
     def state(self) -> dict[str, Any]:
         """The whole snapshot, ten times a second at most: who waits must not be the load."""
         time.sleep(max(0.0, self._asked_s + _ASK_S - time.monotonic()))

@@ -162,6 +162,8 @@ def test_an_unknown_clock(told):
         ({"active": True, "free_MB": 2100.0}, {}),
         ({"active": False, "free_MB": 2000.0}, {}),
         ({"active": True, "free_MB": None}, {}),
+        ({"active": True, "resumed": "flight-000001.mcap was cut"}, {"resumed": "warning"}),
+        ({"active": True, "resumed": "flight-000001.mcap was cut", "duration_s": 121.0}, {}),
     ],
 )
 def test_the_recording(told, recording, found):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -77,6 +78,21 @@ def test_events_processes_and_points_are_bounded(snapshot):
     assert len(document["events"][-1]["text"]) == 500
     assert len(document["processes"]) == PROCESSES
     assert len(document["payloads"][P]["estimate"]["points_px"]) == 600
+
+
+def test_a_recording_that_went_on_before_anyone_listened_is_an_event_once(snapshot):
+    text = "flight-000001.mcap was cut"
+    for seconds in (3.0, 4.0):
+        snapshot.recording("-", station.recording(active=True, resumed=text, duration_s=seconds))
+    (event,) = snapshot.events()
+    assert (event["name"], event["level"], event["text"]) == ("recording-resumed", "warning", text)
+    assert 2e9 < time.time_ns() - event["time_ns"] < 60e9
+
+
+def test_a_recording_that_goes_on_while_one_listens_is_its_own_event(snapshot):
+    snapshot.recording("-", station.recording())
+    snapshot.recording("-", station.recording(active=True, resumed="flight-000001.mcap was cut"))
+    assert snapshot.events() == []  # the intake said it, and is heard
 
 
 def test_a_process_that_ended_is_forgotten_and_one_with_another_pid_was_restarted(snapshot, clock):

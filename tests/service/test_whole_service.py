@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -171,6 +172,7 @@ def refuses_a_port_in_use(service: Service) -> None:
     taken = {
         "http": (f"http.port={service.http}", str(service.http)),
         "video": (f"video.port={service.video}", str(service.video)),
+        "telemetry": (f"telemetry.listen={json.dumps([service.endpoint])}", service.endpoint),
     }
     for setting, named in taken.values():
         free = [
@@ -232,22 +234,44 @@ def test_after_sigkill_the_recording_opens_and_the_flight_goes_on(tracked: Flyin
     assert len(list(reader.json("/estimate/state"))) > 2
     began_s = time.monotonic()
     service.start()
-    page_s = time.monotonic() - began_s
+    back = [stage(service, began_s, "page")]
     eventually(lambda: frames(service) > 0)
-    video_s = time.monotonic() - began_s
+    back.append(stage(service, began_s, "video"))
     eventually(lambda: service.tracking(NAME))
-    pose_s = time.monotonic() - began_s
+    back.append(stage(service, began_s, "pose"))
     print(
         f"\nSIGKILL: lacks {lacks_s[0]:.2f} s of video, {lacks_s[1]:.2f} s of telemetry; after the"
-        f" start ({began_s - killed_s:.1f} s later) the page is there in {page_s:.1f} s, the video"
-        f" in {video_s:.1f} s, the pose in {pose_s:.1f} s"
+        f" start ({began_s - killed_s:.1f} s later): {', '.join(back)};"
+        f" load {os.getloadavg()[0]:.1f}"
     )
+    goes_on_recording(service, file)
     view = service.payload(NAME)["payload"]
     # The payload was not touched: the same process sends the same stream.
     assert tracked.payload.running and view["ssrc"] == ssrc
     assert frames(service, "sent") > sent and frames(service, "lost") == 0
     assert len(list(service.place.glob("blimp-*"))) == 1  # not the killed one's, too
     service.assert_no_accident()
+
+
+def stage(service: Service, began_s: float, name: str) -> str:
+    """What is there now, and what it took: a busy machine stretches the one, hardly the other."""
+    used_s = sum(one.cpu_s() for one in (*service.processes().values(), service.parent()))
+    return f"{name} in {time.monotonic() - began_s:.1f} s ({used_s:.1f} s of a processor)"
+
+
+def goes_on_recording(service: Service, cut: Path) -> None:
+    """What was recorded when it was killed is, again, in another file; the page tells of both."""
+    view = eventually(lambda: s if (s := service.state())["recording"]["active"] else None)
+    recording = view["recording"]
+    assert recording["file"] != cut.name and cut.name in recording["resumed"]
+    (alarm,) = [one for one in view["alarms"] if one["id"] == "resumed"]
+    assert cut.name in alarm["text"] and recording["file"] in alarm["text"]
+    said = [event for event in view["events"] if event["name"] == "recording-resumed"]
+    assert len(said) == 1 and recording["file"] in said[0]["text"]
+    eventually(lambda: service.state()["recording"]["duration_s"] > 4)
+    service.record(active=False)
+    path = service.recordings / recording["file"]
+    assert not RecordingReader(path).cut and len(list(RecordingReader(path).video())) > 60
 
 
 def test_an_intake_that_dies_comes_back_to_the_same_streams(tracked: Flying) -> None:

@@ -14,6 +14,7 @@ from ground_station.mapping.store import load_info
 from ground_station.service import notes
 from ground_station.service.bus import Bus
 from ground_station.service.ending import ending
+from ground_station.service.intake import resuming
 from ground_station.service.intake.process import Intake
 from ground_station.service.notes import EstimateNote, EventNote
 from ground_station.service.settings import MapSettings, load_run
@@ -38,19 +39,12 @@ def serve(folder: Path, stop: threading.Event) -> None:
         bus.serve("intake", intake.ask)
         bus.hear(notes.ESTIMATE, EstimateNote, intake.estimated)
         bus.hear(notes.EVENT, EventNote, intake.heard_event)
-        if settings.recording.at_start:
-            # A disk that hangs, or is full, does not hold up the video.
-            threading.Thread(target=_record, args=(intake,), daemon=True).start()
+        # A disk that hangs, or is full, does not hold up the video.
+        about = (intake.recorder, settings.recording, intake.say)
+        threading.Thread(target=resuming.begin, args=about, daemon=True).start()
         while not stop.wait(_STEP_S):
             intake.step()
             bus.beat()
-
-
-def _record(intake: Intake) -> None:
-    try:
-        intake.recorder.start()
-    except BlimpError as error:
-        intake.refuse(str(error))
 
 
 def main() -> int:

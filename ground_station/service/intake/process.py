@@ -86,7 +86,7 @@ class Intake:
         self._due_s = {"payloads": 0.0, "recording": 0.0}
         self._stack = contextlib.ExitStack()
         self.recorder = GroundRecorder(
-            settings.recording, self._recorder_said, camera=camera, force_idr=self._force_idrs
+            settings.recording, self.say, camera=camera, force_idr=self._force_idrs
         )
         self._stack.callback(self.recorder.close, _STOP_S)
         try:
@@ -166,9 +166,10 @@ class Intake:
             poses.publish(self._feed, payload_id, note)
         self.recorder.estimate(payload_id, note)
 
-    def refuse(self, reason: str) -> None:
-        """Says why no recording could begin."""
-        self._event("intake", notes.ALARM, messages.EVENT_RECORDING_ENDED, reason, notes.STATION)
+    def say(self, name: str, level: str, text: str) -> None:
+        """Says an event of the recorder's."""
+        self._event("intake", level, name, text, notes.STATION)
+        self._due_s["recording"] = 0.0
 
     def heard_event(self, payload_id: str, note: EventNote) -> None:
         """Takes another process's event, for the recording."""
@@ -270,10 +271,6 @@ class Intake:
         self._told[key] = problem
         level = notes.WARNING if problem else notes.INFO
         self._event("intake", level, name, problem or "is over", payload_id)
-
-    def _recorder_said(self, name: str, level: str, text: str) -> None:
-        self._event("intake", level, name, text, notes.STATION)
-        self._due_s["recording"] = 0.0
 
     def _event(self, source: str, level: str, name: str, text: str, payload_id: str) -> None:
         note = EventNote(time.time_ns(), source, level, name, text)

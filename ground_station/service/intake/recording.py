@@ -44,17 +44,33 @@ class GroundRecorder(Recorder):
         self.run_type = functools.partial(
             GroundRun, camera=camera, max_file_s=settings.max_file_s, sizes=self._sizes
         )
+        self.resumed = ""
+        """From which recording that was cut the one of now goes on, in words."""
+        self._refused = ""
         self._started_s = 0.0
         self._free_MB: float | None = None
         self._free = threading.Event()
         # A disk that hangs holds up this thread and nobody else.
         threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
 
+    @property
+    def problem(self) -> str:
+        """Why there is no recording although there should be one, in words."""
+        return "" if self.file else self._refused or super().problem
+
     def start(self) -> str:
         """As `Recorder.start`."""
         if not self.file:
             self._started_s = time.monotonic()
-        return super().start()
+            self.resumed = ""
+        file = super().start()
+        self._refused = ""
+        return file
+
+    def refuse(self, reason: str) -> None:
+        """Says that none could begin by itself, until one begins."""
+        self._refused = reason
+        self._announce(messages.EVENT_RECORDING_ENDED, reason)
 
     def frame(self, payload_id: str, frame: ReceivedFrame, log_ns: int) -> None:
         """Records a frame as it came; `log_ns` is when it was captured, by this machine's clock."""
@@ -113,6 +129,7 @@ class GroundRecorder(Recorder):
             dropped=self.dropped,
             free_MB=self._free_MB,
             problem=self.problem,
+            resumed=self.resumed if file else "",
         )
 
     def close(self, limit_s: float | None = None) -> None:

@@ -180,7 +180,17 @@ class Snapshot:
     def recording(self, _: str, note: RecordingNote) -> None:
         """How the recording is."""
         with self._lock:
+            if self._recording is None and note.resumed:
+                self._catch_up(note)
             self._recording, self._recording_ns = note, self._clock_ns()
+
+    def _catch_up(self, note: RecordingNote) -> None:
+        """The event that was said before this process listened; call with the lock held."""
+        text = str(note.resumed)[:TEXT]
+        if all(event["text"] != text for event in self._events):
+            time_ns = time.time_ns() - int(1e9 * note.duration_s)
+            event = EventNote(time_ns, "intake", notes.WARNING, notes.RECORDING_RESUMED, text)
+            self._events.append({**notes.as_document(event), "payload": notes.STATION})
 
     def process(self, _: str, note: ProcessNote) -> None:
         """A process lives. One with another id than before was started again."""

@@ -59,6 +59,7 @@
  * @property {number} since_ns
  *
  * @typedef {object} RecordingNote
+ * @property {string} [resumed]
  * @property {boolean} active
  * @property {string} [file]
  * @property {number} [size_MB]
