@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -166,21 +166,21 @@ class Tree:
     def link(self, path: str, target: str) -> None:
         self.add(path, Entry("link", 0o777, target=target))
 
-    def take_folder(self, source: Path, into: str = "") -> None:
-        """A folder of the disk: root's, 644, or 755 for what is executable, as git keeps them."""
-        for path in sorted(source.rglob("*")):
-            if "__pycache__" in path.parts:
-                continue
-            name = str(Path(into) / path.relative_to(source))
-            if path.is_symlink():
-                self.link(name, str(path.readlink()))
-            elif path.is_dir():
-                # A folder that the system has already keeps its own mode (/tmp, /root).
-                if name not in self:
-                    self.folder(name)
-            else:
-                mode = 0o755 if path.stat().st_mode & 0o100 else 0o644
-                self.add(name, Entry("file", mode, content=Content.at(path)))
+    def take(self, base: Path, files: Iterable[str], into: str = "") -> None:
+        """Files of the disk, by their names below `base`, to the same names below `into`."""
+        for name in files:
+            self.take_file(base / name, f"{into}/{name}")
+
+    def take_file(self, source: Path, path: str) -> None:
+        """A file of the disk: root's, 644 or 755 as git keeps it; a link stays one."""
+        if source.is_symlink():
+            self.link(path, str(source.readlink()))
+            return
+        try:
+            mode = 0o755 if source.stat().st_mode & 0o100 else 0o644
+            self.add(path, Entry("file", mode, content=Content.at(source)))
+        except OSError as error:
+            raise DeployError(f"{source}: {error.strerror or error}") from None
 
     def merge(self, other: Tree) -> None:
         """Takes another tree's entries over; a folder that is there keeps its own owner."""

@@ -13,6 +13,7 @@ from deploy.image.tree import Tree
 
 UNITS = "usr/lib/systemd/system"
 ENABLED = "etc/systemd/system"
+DEFAULT_TARGET = f"{ENABLED}/default.target"
 _PRESETS = ("etc/systemd/system-preset", "usr/lib/systemd/system-preset")
 _SUFFIXES = (".service", ".socket", ".target", ".path", ".timer", ".mount", ".automount", ".swap")
 _FOLDERS = {"WantedBy": "wants", "RequiredBy": "requires", "UpheldBy": "upholds"}
@@ -31,12 +32,15 @@ class Install:
 def apply_presets(tree: Tree) -> list[str]:
     """Enables and disables every unit as the first preset line that fits it says.
 
-    Links to /dev/null (masked units) stay. Returns the enabled units, sorted.
+    Masked units (links to /dev/null) and the default target stay.
+
+    Returns:
+        The enabled units, sorted.
     """
     rules = _rules(tree)
     masked = {path for path, entry in tree.below(ENABLED) if entry.target == "/dev/null"}
     for path, entry in list(tree.below(ENABLED)):
-        if entry.kind == "link" and path not in masked:
+        if entry.kind == "link" and path not in masked and path != DEFAULT_TARGET:
             tree.remove(path)
     installs = {
         name: install

@@ -1,0 +1,187 @@
+"""Puts a card together: root, boot and data partition, the image, its manifest and checksum.
+
+Everything is made beside the image in a folder of its own and renamed at the end, the image last:
+what lies under the final name is whole, with the files that describe it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.image import boot, ext4, fat, initrd, manifest, partitions, release, root
+from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two
+from deploy.image.sparse import sha256
+from deploy.image.tree import Tree
+from deploy.run import run
+
+NAMES = ("boot", "root", "data")
+ROOT_LABEL, DATA_LABEL = "blimp-root", "blimp-data"
+_MIB = 1 << 20
+DATA_BYTES = 64 * _MIB
+# The emulator takes only cards of a power of two; a real one's boot partition has room for the
+# kernels of later images, since its size cannot change on a card that is in use.
+BOOT_BYTES = {"qemu": 64 * _MIB}
+REAL_BOOT_BYTES = 256 * _MIB
+
+_NAMESPACE = uuid.UUID("9b5d3f1c-6a0e-4c57-9d0b-0f3a3c6b7a51")
+
+
+@dataclass(frozen=True)
+class Ingredients:
+    """What others made, as files.
+
+    Attributes:
+        rootfs: the packages' root, an uncompressed tar.
+        modules: a folder with `usr/lib/modules/RELEASE`, with depmod's tables.
+        kernel_release: as `uname -r` says on the card.
+        kernel: the name of the kernel's file in `boot`.
+        boot: a folder with what goes onto the boot partition: kernel, device trees, firmware.
+        site: a folder of unpacked wheels; None: none are needed.
+        machine, python: as `uname -m` says there, and as `3.13`.
+    """
+
+    rootfs: Path
+    modules: Path
+    kernel_release: str
+    kernel: str
+    boot: Path
+    site: Path | None
+    machine: str
+    python: str
+
+
+def identifiers(board: str, tree: Tree, epoch: int) -> Callable[[str], uuid.UUID]:
+    """Identifiers that follow from what is on the card: another content, another card."""
+    seed = hashlib.sha256(board.encode() + tree.digest(epoch)).hexdigest()
+    return lambda name: uuid.uuid5(_NAMESPACE, f"{seed} {name}")
+
+
+def build(
+    image: Path,
+    board: str,
+    given: Ingredients,
+    checkout: Path,
+    epoch: int,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
+
+    Args:
+        image: the final name; what is there stays until the new one is whole.
+        board: its name.
+        given: packages, kernel, wheels.
+        checkout: of this project, with git.
+        epoch: the time of everything in it that is not older, s since 1970.
+        say: takes a line of progress.
+
+    Raises:
+        DeployError: an ingredient is missing or broken, something does not fit, a tool fails.
+    """
+    if not fat.FIRST_SECOND <= epoch <= fat.LAST_SECOND:
+        raise DeployError(f"--epoch {epoch}: allowed: {fat.FIRST_SECOND} to {fat.LAST_SECOND}")
+    say("reading the packages' root")
+    tree = Tree.from_tar(given.rootfs)
+    modules = f"usr/lib/modules/{given.kernel_release}"
+    if not (given.modules / modules / "modules.dep").is_file():
+        raise DeployError(f"{given.modules}/{modules}: no modules.dep in it")
+    tree.take(given.modules, [f"{modules}/{n}" for n in _files(given.modules / modules)])
+    firmware = release.build(checkout, given.site, given.machine, given.python, epoch)
+    units = root.customise(tree, checkout, board, firmware, epoch)
+    new = identifiers(board, tree, epoch)
+    disk = new("disk").int & 0xFFFFFFFF or 1
+    say(f"root: {len(tree)} files, {len(units)} units enabled")
+    first = initrd.build(tree, given.kernel_release)
+    files = Tree()
+    files.take(given.boot, _files(given.boot))
+    if given.kernel not in files:
+        raise DeployError(f"{given.boot}: no kernel '{given.kernel}' in it")
+    where = f"UUID={new('root')}"
+    front = boot.contents(board, given.kernel, given.machine, files, first, where)
+    with building(image) as work:
+        parts = [work / name for name in NAMES]
+        say("boot partition")
+        serial = new("boot").int & 0xFFFFFFFF
+        size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
+        fat.make(parts[0], size, front, boot.LABEL, serial, epoch)
+        say("root partition")
+        size = align(ext4.bytes_needed(tree))
+        ext4.make(parts[1], size, tree, ext4.Ext4(ROOT_LABEL, new("root")), epoch)
+        make_data(parts[2], new("data"), epoch)
+        layout = [
+            Partition("boot", FAT32_LBA, parts[0], fat.used_ranges(parts[0])),
+            Partition("root", LINUX, parts[1], ext4.used_ranges(parts[1])),
+            Partition("data", LINUX, parts[2], ext4.used_ranges(parts[2])),
+        ]
+        total = partitions.ALIGN_BYTES + sum(align(part.size) for part in layout)
+        say("image, block map and checksums")
+        whole = work / image.name
+        partitions.assemble(whole, layout, disk, power_of_two(total) if board == "qemu" else None)
+        describe(whole)
+        manifest.write(
+            whole,
+            beside(whole, ".manifest.json"),
+            board=board,
+            checkout=checkout,
+            epoch=epoch,
+            packages=manifest.packages_of(tree),
+            site=given.site,
+            names=NAMES,
+            units=units,
+        )
+
+
+def make_data(place: Path, identifier: uuid.UUID, epoch: int) -> None:
+    """The data partition's file system, empty; the card makes its folders and grows it."""
+    kind = ext4.Ext4(DATA_LABEL, identifier, journal=True)
+    ext4.make(place, DATA_BYTES, Tree(), kind, epoch)
+
+
+class building:
+    """A folder for the work on an image; what lies in it under its name is put into place."""
+
+    def __init__(self, image: Path) -> None:
+        self._image = image
+
+    def __enter__(self) -> Path:
+        try:
+            self._image.parent.mkdir(parents=True, exist_ok=True)
+            work = tempfile.mkdtemp(prefix=f".{self._image.name}.part-", dir=self._image.parent)
+        except OSError as error:
+            raise DeployError(f"{self._image}: {error.strerror or error}") from None
+        self._work = Path(work)
+        return self._work
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
+        try:
+            if kind is None:
+                # The old image goes before its description does: no image beside another's.
+                self._image.unlink(missing_ok=True)
+                for suffix in (".bmap", ".manifest.json", ".sha256", ""):
+                    name = self._image.name + suffix
+                    (self._work / name).replace(self._image.with_name(name))
+        finally:
+            shutil.rmtree(self._work, ignore_errors=True)
+
+
+def beside(image: Path, suffix: str) -> Path:
+    return image.with_name(image.name + suffix)
+
+
+def describe(image: Path) -> None:
+    """Block map and checksum of a finished image."""
+    run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
+    beside(image, ".sha256").write_text(f"{sha256(image)}  {image.name}\n")
+
+
+def _files(folder: Path) -> list[str]:
+    found = release.folder_files(folder)
+    if not found:
+        raise DeployError(f"{folder}: no files in it")
+    return found

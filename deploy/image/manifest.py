@@ -1,0 +1,117 @@
+"""What an image was made of and what it is: the JSON file beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from deploy.image import checkout as git
+from deploy.image.partitions import table
+from deploy.image.release import folder_files, utc
+from deploy.image.sparse import Range, sha256
+from deploy.image.tree import Tree
+from deploy.run import run
+
+SCHEMA = "blimp.image/1"
+
+# The tools whose work is in the bytes, and how each says its version.
+_TOOLS = {
+    "debugfs": ["debugfs", "-V"],
+    "mcopy": ["mcopy", "--version"],
+    "mke2fs": ["mke2fs", "-V"],
+    "mkfs.vfat": ["mkfs.vfat", "--help"],
+    "sfdisk": ["sfdisk", "--version"],
+}
+
+
+def write(
+    image: Path,
+    to: Path,
+    *,
+    board: str,
+    checkout: Path,
+    epoch: int,
+    packages: Sequence[tuple[str, str, str]],
+    site: Path | None,
+    names: Sequence[str],
+    units: Sequence[str],
+    base: Path | None = None,
+) -> None:
+    """Writes an image's manifest.
+
+    Args:
+        image: finished.
+        to: the manifest's file.
+        board, checkout, epoch: what it was made for, of and at.
+        packages: name, version, architecture of what is installed.
+        site: the unpacked wheels.
+        names: of the partitions, in order.
+        units: that are enabled.
+        base: the image that it was made from, if any.
+    """
+    partitions = []
+    for name, part in zip(names, table(image), strict=True):
+        span = Range(part["start"], part["start"] + part["size"])
+        partitions.append({"name": name, **part, "sha256": sha256(image, span)})
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "board": board,
+        "version": git.version(checkout),
+        "revision": git.revision(checkout),
+        "epoch": epoch,
+        "made": utc(epoch),
+        "image": {"size": image.stat().st_size, "sha256": sha256(image)},
+        "partitions": partitions,
+        "units": list(units),
+        "packages": [
+            {"name": name, "version": version, "architecture": architecture}
+            for name, version, architecture in packages
+        ],
+        "wheels": wheels(site),
+        "tools": {name: _version(words) for name, words in _TOOLS.items()},
+    }
+    if base is not None:
+        document["base"] = {"name": base.name, "sha256": sha256(base)}
+    to.write_text(json.dumps(document, indent=2) + "\n")
+
+
+def installed(status: str) -> list[tuple[str, str, str]]:
+    """Name, version and architecture of every package that dpkg's status calls installed."""
+    found = []
+    for stanza in status.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in stanza.splitlines() if ": " in line[1:])
+        if fields.get("Status", "").endswith(" installed"):
+            found.append((fields["Package"], fields["Version"], fields["Architecture"]))
+    return sorted(found)
+
+
+def packages_of(tree: Tree) -> list[tuple[str, str, str]]:
+    """What is installed in a tree; nothing where dpkg never was."""
+    path = "var/lib/dpkg/status"
+    return installed(tree.read(path).decode("utf-8", "replace")) if path in tree else []
+
+
+def wheels(site: Path | None) -> list[dict[str, str]]:
+    """Name, version and a hash over all files of each unpacked wheel."""
+    if site is None:
+        return []
+    result = []
+    for info in sorted(site.glob("*.dist-info")):
+        name, _, version = info.name.removesuffix(".dist-info").rpartition("-")
+        record = info / "RECORD"
+        data = record.read_bytes() if record.is_file() else b""
+        result.append(
+            {"name": name, "version": version, "record_sha256": hashlib.sha256(data).hexdigest()}
+        )
+    whole = hashlib.sha256()
+    for path in folder_files(site):
+        whole.update(f"{sha256(site / path)}  {path}\n".encode())
+    return [*result, {"name": "(all files)", "version": "", "sha256": whole.hexdigest()}]
+
+
+def _version(words: list[str]) -> str:
+    said = run(words, merge=True, ok=(0, 1)).decode(errors="replace")
+    return next((line.strip() for line in said.splitlines() if line.strip()), "")
