@@ -1,0 +1,80 @@
+"""A cache of things that are made once for their inputs, each there whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from deploy.errors import DeployError
+
+_KEY_DIGITS = 16
+
+
+def key(*inputs: Any) -> str:
+    """A short name for inputs: records, texts, numbers, and files by what is in them."""
+    digest = hashlib.sha256()
+    for item in inputs:
+        digest.update(json.dumps(_plain(item), sort_keys=True).encode())
+        digest.update(b"\0")
+    return digest.hexdigest()[:_KEY_DIGITS]
+
+
+@contextlib.contextmanager
+def made(target: Path) -> Iterator[Path | None]:
+    """Makes `target`, a file or a folder, unless it is there.
+
+    Gives None where it is there, else a new folder beside it: what stands in it under the target's
+    own name when the block ends is renamed to it. One process makes, others wait for it. Left by
+    an exception, Ctrl-C included, nothing remains.
+
+    Raises:
+        DeployError: the cache cannot be written.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(target.parent / f".{target.name}.lock", os.O_CREAT | os.O_RDWR, 0o644)
+    except OSError as error:
+        raise DeployError(f"{target}: {error.strerror}") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if target.exists():
+            yield None
+            return
+        _clear(target)
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
+        try:
+            yield work
+            (work / target.name).rename(target)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        raise DeployError(f"{error.filename or target}: {error.strerror or error}") from None
+    finally:
+        os.close(lock)
+
+
+def _clear(target: Path) -> None:
+    """What a killed process left of this target; its lock is ours now."""
+    for left in target.parent.glob(f".{target.name}.part-*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _plain(item: Any) -> Any:
+    if isinstance(item, Path):
+        return hashlib.sha256(item.read_bytes()).hexdigest()
+    if dataclasses.is_dataclass(item) and not isinstance(item, type):
+        return _plain(dataclasses.asdict(item))
+    if isinstance(item, dict):
+        return {str(name): _plain(value) for name, value in item.items()}
+    if isinstance(item, list | tuple):
+        return [_plain(value) for value in item]
+    return item

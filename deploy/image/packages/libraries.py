@@ -1,0 +1,135 @@
+"""Checks that every program on the card finds the shared libraries that it names.
+
+    python -m deploy.image.packages.libraries ROOT
+
+Packages' files are left out on purpose (`left_out`); this says when one too many was. It reads the
+ELF files themselves (System V gABI, chapters 4 and 5), so that no program of the board is run.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from deploy.errors import DeployError
+
+# Where a program, or what a program loads by name, lies; libraries are looked for from these on.
+_PROGRAMS = ("usr/bin", "usr/sbin", "usr/libexec", "usr/lib/systemd", "usr/lib/openssh")
+_LOADED = ("gstreamer-1.0", "gstreamer1.0", "libcamera", "security")
+_PYTHON = ("usr/lib/python3", "usr/lib/python3.*")
+
+_PT_LOAD, _PT_DYNAMIC = 1, 2
+_DT_NULL, _DT_NEEDED, _DT_STRTAB = 0, 1, 5
+
+
+def needed(path: Path) -> tuple[str, ...] | None:
+    """The libraries that an ELF file names (DT_NEEDED); None for any other file.
+
+    Raises `DeployError` for an ELF file that is cut.
+    """
+    with path.open("rb") as file:
+        ident = file.read(16)
+        if ident[:4] != b"\x7fELF":
+            return None
+        data = ident + file.read()
+    try:
+        return tuple(_names(data))
+    except (struct.error, ValueError, IndexError, RuntimeError, StopIteration):
+        raise DeployError(f"{path}: the ELF file is cut or damaged") from None
+
+
+def _names(data: bytes) -> Iterator[str]:
+    wide, order = data[4] == 2, "<" if data[5] == 1 else ">"
+    (table,) = struct.unpack_from(f"{order}{'Q' if wide else 'I'}", data, 32 if wide else 28)
+    size, count = struct.unpack_from(f"{order}HH", data, 54 if wide else 42)
+    segments = [_segment(data, table + i * size, wide, order) for i in range(count)]
+    entry = struct.Struct(f"{order}QQ" if wide else f"{order}II")
+    tags: list[tuple[int, int]] = []
+    for kind, offset, _, length in segments:
+        if kind == _PT_DYNAMIC:
+            tags += (entry.unpack_from(data, offset + i) for i in range(0, length, entry.size))
+    ends = next((i for i, (tag, _) in enumerate(tags) if tag == _DT_NULL), len(tags))
+    names = [value for tag, value in tags[:ends] if tag == _DT_NEEDED]
+    if not names:
+        return
+    address = next(value for tag, value in tags[:ends] if tag == _DT_STRTAB)
+    strings = next(
+        offset + address - start
+        for kind, offset, start, length in segments
+        if kind == _PT_LOAD and start <= address < start + length
+    )
+    for name in names:
+        yield data[strings + name : data.index(b"\0", strings + name)].decode()
+
+
+def _segment(data: bytes, at: int, wide: bool, order: str) -> tuple[int, int, int, int]:
+    """A program header: type, offset in the file, address, length in the file, bytes."""
+    if wide:
+        kind, _, offset, address, _, length = struct.unpack_from(f"{order}IIQQQQ", data, at)
+    else:
+        kind, offset, address, _, length = struct.unpack_from(f"{order}IIIII", data, at)
+    return kind, offset, address, length
+
+
+def missing(root: Path) -> list[str]:
+    """What programs, plugins and modules under `root` want and don't find, as `FILE: LIBRARY`."""
+    folders = [folder for folder in root.glob("usr/lib/*-linux-gnu*") if folder.is_dir()]
+    libraries: dict[str, Path] = {}
+    inner = [path for folder in folders for path in folder.iterdir() if path.is_dir()]
+    for place in (*folders, *inner):
+        for path in place.glob("*.so*"):
+            if _resolved(root, path) is not None:
+                libraries.setdefault(path.name, path)
+    waiting = [(path, path) for path in _first(root, folders)]
+    seen: set[Path] = set()
+    lacking: set[str] = set()
+    while waiting:
+        path, first = waiting.pop()
+        real = _resolved(root, path)
+        if real is None or real in seen:
+            continue
+        seen.add(real)
+        for name in needed(real) or ():
+            if name in libraries:
+                waiting.append((libraries[name], first))
+            elif not name.startswith("ld-linux"):
+                lacking.add(f"/{first.relative_to(root)}: {name}")
+    return sorted(lacking)
+
+
+def _first(root: Path, folders: list[Path]) -> Iterator[Path]:
+    for name in _PROGRAMS:
+        yield from (path for path in (root / name).rglob("*") if path.is_file())
+    for folder in folders:
+        for name in _LOADED:
+            yield from (folder / name).rglob("*.so")
+            yield from (p for p in (folder / name).rglob("*") if p.is_file() and not p.suffix)
+        yield from folder.glob("libnss_*.so.2")
+    for pattern in _PYTHON:
+        for folder in root.glob(pattern):
+            yield from folder.rglob("*.so")
+
+
+def _resolved(root: Path, path: Path) -> Path | None:
+    """The file behind links, of which absolute ones start at `root`; None where there is none."""
+    for _ in range(8):
+        if not path.is_symlink():
+            return path if path.is_file() else None
+        target = path.readlink()
+        absolute = target.is_absolute()
+        path = root / target.relative_to("/") if absolute else path.parent / target
+    return None
+
+
+def main(arguments: list[str]) -> int:
+    """Prints what is missing under the folder; 1 when anything is."""
+    lacking = missing(Path(arguments[0]).resolve())
+    for line in lacking:
+        print(f"E: misses a library: {line}", file=sys.stderr)
+    return 1 if lacking else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

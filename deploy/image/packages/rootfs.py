@@ -1,0 +1,130 @@
+"""The card's root file system from packages, as one tar: mmdebstrap with the board's archives."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.image.packages import apt, cache, foreign
+from deploy.image.packages.board import Board
+from deploy.image.packages.long import run_long
+
+_HERE = Path(__file__).parent
+# A change of these makes another tar.
+_MADE_BY = ("rootfs.py", "finish.sh", "bytecode.py", "apt.py")
+_STATUS = "./var/lib/dpkg/status"
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that is installed in a root file system."""
+
+    name: str
+    version: str
+    architecture: str
+
+
+def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
+    """The tar of the board's root file system: made once, then taken from the cache.
+
+    It holds Debian's essential packages, the board's and what they depend on; no kernel, no apt,
+    no device nodes, no user, no key, an empty machine id. Its bytes follow from the packages'
+    versions and the inputs: no file is younger than `epoch`.
+
+    Args:
+        board: whose; its archives must be in reach when the cache has no tar.
+        cache_folder: where tars are kept, as `rootfs-BOARD-KEY.tar`.
+        epoch: seconds since 1970, SOURCE_DATE_EPOCH. It is part of the key: one that moves with
+            each commit builds each time.
+
+    Raises:
+        DeployError: not root, a tool is missing, an archive is out of reach or not trusted, a
+            package isn't there; nothing half-made is left. What the tools said then stands in
+            `rootfs-BOARD.log` there.
+    """
+    made_by = [_HERE / name for name in _MADE_BY]
+    inputs = (board.architecture, board.suite, board.archives, board.packages, board.left_out)
+    target = cache_folder / f"rootfs-{board.name}-{cache.key(*inputs, epoch, *made_by)}.tar"
+    with cache.made(target) as work:
+        if work is None:
+            return target
+        if os.geteuid() != 0:
+            raise DeployError(
+                f"a root file system is built as root: sudo (once; it then lies in {cache_folder})"
+            )
+        emulated = foreign.prefix(board.architecture)
+        # What cannot be had is said in seconds, before the minutes of building.
+        with apt.opened(board) as archives:
+            archives.plan(board.package_names)
+        log = cache_folder / f"rootfs-{board.name}.log"
+        words = [*emulated, *_mmdebstrap(board, work, work / target.name)]
+        environment = {
+            **foreign.environment(),
+            "SOURCE_DATE_EPOCH": str(epoch),
+            "TMPDIR": str(work),
+            # Byte code of the same sources is then the same.
+            "PYTHONHASHSEED": "0",
+        }
+        run_long(words, log, f"root file system of {board.name}", environment)
+    return target
+
+
+def installed_packages(tar: Path) -> list[Package]:
+    """What is installed in the root file system in a tar, sorted by name: the card's manifest.
+
+    Raises `DeployError` for a tar that is cut or has no dpkg in it.
+    """
+    try:
+        with tarfile.open(tar) as file:
+            member = file.extractfile(_STATUS)
+            text = member.read().decode() if member is not None else ""
+    except (OSError, KeyError, tarfile.TarError, UnicodeDecodeError) as error:
+        raise DeployError(f"{tar}: no root file system: {error}") from None
+    found = []
+    for stanza in text.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in stanza.splitlines() if ": " in line[1:])
+        if fields.get("Status", "").endswith(" installed"):
+            found.append(Package(fields["Package"], fields["Version"], fields["Architecture"]))
+    return sorted(found, key=lambda package: package.name)
+
+
+def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:
+    """The command that builds `tar`; its inputs are written into `work`."""
+    sources, pins = work / "board.sources", work / "board.pref"
+    sources.write_text(apt.sources(board.archives))
+    pins.write_text(apt.preferences(board.archives))
+    shutil.copy(_HERE / "finish.sh", work)
+    rules = [
+        f"path-include={name[1:]}" if name.startswith("!") else f"path-exclude={name}"
+        for group in board.left_out
+        for name in group.names
+    ]
+    copy_pins = f'cp {shlex.quote(str(pins))} "$1/etc/apt/preferences.d/board.pref"'
+    finish = f'sh {shlex.quote(str(work / "finish.sh"))} "$1"'
+    python = f"{shlex.quote(sys.executable)} -m deploy.image.packages"
+    return [
+        "mmdebstrap",
+        "--mode=root",
+        "--variant=essential",
+        f"--architectures={board.architecture}",
+        '--aptopt=APT::Install-Recommends "false"',
+        '--aptopt=APT::Sandbox::User "root"',
+        '--aptopt=Acquire::Languages "none"',
+        '--aptopt=Acquire::Retries "3"',
+        *(f"--dpkgopt={rule}" for rule in rules),
+        f"--include={','.join(board.package_names)}",
+        f'--setup-hook=mkdir -p "$1/etc/apt/preferences.d"; {copy_pins}',
+        f'--customize-hook={python}.libraries "$1"',
+        f'--customize-hook={python}.bytecode "$1"',
+        f"--customize-hook={finish}",
+        "--format=tar",
+        board.suite,
+        str(tar),
+        str(sources),
+    ]
