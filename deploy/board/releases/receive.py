@@ -6,10 +6,11 @@ was read back from the card. A stream that ends early, or a full card, leaves al
 
 from __future__ import annotations
 
+import compileall
 import contextlib
 import hashlib
-import json
 import os
+import py_compile
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,17 +51,18 @@ def _receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
     manifest.verify(data, signature, at.signers)
     listed = manifest.parse(data)
     factory = manifest.load_release(at.factory)
-    current, running = shelf.in_force(at)
+    _, running = shelf.in_force(at)
     manifest.check_against(listed, factory, running)
     name = listed.release.version
     if name == running.version:
-        return _again(at, current, running, listed, data)
+        return _again(at, running, listed)
     _make_room(at, listed)
     part = at.releases / f"{name}.part"
     try:
         _unpack(at, part, members, listed, data)
         if wrong := shelf.hash_fault(part, listed):
             raise DeployError(wrong)
+        _compile(part, at.folder(name))
         if at.folder(name).is_dir():  # not the one in force
             shelf.discard(at.folder(name))
         part.rename(at.folder(name))
@@ -80,16 +82,12 @@ def _named(members: Iterator[Member], name: str) -> Member:
     return member
 
 
-def _again(
-    at: Places, current: str, running: Release, listed: Manifest, data: bytes
-) -> dict[str, Any]:
+def _again(at: Places, running: Release, listed: Manifest) -> dict[str, Any]:
     """Of a bundle of the very version that runs: nothing to do, when it is the same."""
-    same = running.made == listed.release.made
-    if current != FACTORY:
-        held = places.read(at.folder(current) / MANIFEST) or {}
-        same = held.get("files") == json.loads(data)["files"]
-    if not same:
-        raise DeployError(f"{running.version} runs, with other files than this bundle's")
+    held = holds(at)
+    for file in listed.files:
+        if file.path != RELEASE and held.get(file.path) != file.sha256:
+            raise DeployError(f"{running.version} runs already, with another {file.path}")
     return {"version": running.version, "id": ""}
 
 
@@ -134,6 +132,19 @@ def _unpack(
         raise DeployError(f"the bundle's {RELEASE} is not the one that its list tells")
     (part / MANIFEST).write_bytes(data)
     os.sync()  # one for all: each file's own costs the card a journal entry
+
+
+def _compile(part: Path, folder: Path) -> None:
+    """Byte code beside the sources: the firmware's user cannot write it, and a slow board would
+    compile all of them at each start."""
+    compileall.compile_dir(
+        part,
+        quiet=2,
+        stripdir=str(part),
+        prependdir=str(folder),
+        invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
+    )
+    os.sync()
 
 
 def _write(target: Path, chunks: Iterator[bytes], file: File) -> None:

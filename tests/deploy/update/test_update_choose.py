@@ -1,0 +1,182 @@
+"""Which release a card starts, whatever is on it: some release always is."""
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from card_stand import CHECKOUT, NEW, NOW, OLD, Card, contents
+
+from deploy.board import start
+from deploy.board.releases import choose
+from deploy.board.releases.choose import STARTS, Choice, State
+
+TRIAL = {"id": "t", "release": NEW, "previous": OLD, "boot_id": "b", "started_s": 1.0}
+OF_IMAGE = TRIAL | {"previous": ""}
+BACK = {"id": "t", "release": NEW, "previous": OLD, "outcome": "fell back", "reason": "why"}
+GOOD = BACK | {"outcome": "healthy", "reason": ""}
+NEVER = f"{NEW}: started {STARTS} times without getting healthy"
+
+
+@pytest.mark.parametrize(
+    ("state", "broken", "expected"),
+    [
+        (State(), (), Choice("", "factory")),
+        (State(NEW), (), Choice(NEW, "update")),
+        (State(NEW, OLD, last=GOOD), (), Choice(NEW, "update")),
+        # On trial: so many starts, then the one before.
+        (State(NEW, trial=TRIAL), (), Choice(NEW, "update")),
+        (State(NEW, trial=TRIAL, starts=STARTS - 1), (), Choice(NEW, "update")),
+        (State(NEW, trial=TRIAL, starts=STARTS), (), Choice(OLD, "fell back", NEVER)),
+        (State(NEW, trial=OF_IMAGE, starts=STARTS), (), Choice("", "fell back", NEVER)),
+        (State(NEW, trial=TRIAL, starts=STARTS), (OLD,), Choice("", "fell back", NEVER)),
+        (
+            State(NEW, trial=TRIAL, starts=-1),
+            (),
+            Choice(OLD, "fell back", f"{NEW}: its starts cannot be counted on /data/state"),
+        ),
+        # A trial of another release than the one in force is over, or has not begun.
+        (State(OLD, trial=TRIAL, starts=STARTS), (), Choice(OLD, "update")),
+        # Damaged ones are passed over; the first reason is told.
+        (State(NEW, OLD), (NEW,), Choice(OLD, "fell back", f"{NEW}: broken")),
+        (State(NEW, OLD), (NEW, OLD), Choice("", "fell back", f"{NEW}: broken")),
+        (State(NEW), (NEW,), Choice("", "fell back", f"{NEW}: broken")),
+        (State(NEW, trial=TRIAL), (NEW,), Choice(OLD, "fell back", f"{NEW}: broken")),
+        # An update that failed is told until another is in force.
+        (State(OLD, last=BACK), (), Choice(OLD, "fell back", "why")),
+        (State("", last=BACK | {"previous": ""}), (), Choice("", "fell back", "why")),
+        (State(NEW, last=BACK | {"previous": ""}), (), Choice(NEW, "update")),
+    ],
+)
+def test_the_choice(state: State, broken: tuple[str, ...], expected: Choice) -> None:
+    assert choose.choose(state, lambda name: "broken" if name in broken else "") == expected
+
+
+def test_a_card_without_updates_starts_the_images_release(card: Card) -> None:
+    assert card.choice() == Choice("", "factory")
+    card.at.releases.rmdir()
+    assert card.choice() == Choice("", "factory")
+
+
+@pytest.mark.parametrize("target", ["gone", "../../etc", "/etc", "a b", "9.part", "."])
+def test_a_link_to_no_release_is_the_images(card: Card, target: str) -> None:
+    (card.at.releases / "current").symlink_to(target)
+    assert card.choice().name == ""
+
+
+def damage(card: Card, name: str, what: str) -> None:
+    folder = card.at.folder(name)
+    if what == "cut file":
+        with (folder / "site/native.so").open("r+b") as file:
+            file.truncate(100)
+    elif what == "missing file":
+        (folder / "pi_firmware/__main__.py").unlink()
+    elif what == "no list":
+        (folder / "manifest.json").unlink()
+    elif what == "list of nonsense":
+        (folder / "manifest.json").write_text('{"files": [[1, 2], null]}')
+    elif what == "empty list":
+        (folder / "manifest.json").write_bytes(b"")
+    elif what == "a link in its place":
+        folder.rename(folder.with_name("7.0"))
+        folder.symlink_to("7.0")
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "cut file",
+        "missing file",
+        "no list",
+        "list of nonsense",
+        "empty list",
+        "a link in its place",
+    ],
+)
+def test_a_damaged_release_is_not_started(card: Card, what: str) -> None:
+    card.take(card.bundle(contents(NEW)))
+    card.at.trial.unlink()
+    assert card.choice() == Choice(NEW, "update")
+    damage(card, NEW, what)
+    chosen = card.choice()
+    assert (chosen.name, chosen.how) == ("", "fell back") and chosen.reason.startswith(NEW)
+
+
+def test_starts_of_a_trial_are_counted_across_power_cuts(card: Card) -> None:
+    card.take(card.bundle(contents(NEW)))
+    assert [card.choice().name for _ in range(STARTS + 2)] == [NEW] * STARTS + ["", ""]
+    assert card.choice() == Choice("", "fell back", NEVER)
+
+
+def test_another_trial_of_the_same_release_counts_from_zero(card: Card) -> None:
+    card.take(card.bundle(contents(NEW)))
+    for _ in range(STARTS + 1):
+        card.choice()
+    trial = json.loads(card.at.trial.read_text())
+    card.at.trial.write_text(json.dumps(trial | {"id": "another"}))
+    assert card.choice().name == NEW
+
+
+def test_a_trial_that_cannot_be_counted_is_not_started(card: Card) -> None:
+    card.take(card.bundle(contents(NEW)))
+    card.at.starts.parent.rmdir()
+    assert card.choice().name == "" and "cannot be counted" in card.choice().reason
+
+
+@pytest.mark.parametrize("body", [b"", b"\xff", b"[]", b"[" * 9999, b"{}", b'{"id": 1}'])
+def test_state_files_of_nonsense_are_as_none(card: Card, body: bytes) -> None:
+    card.take(card.bundle(contents(NEW)))
+    for path in (card.at.trial, card.at.last, card.at.starts):
+        path.write_bytes(body)
+    assert card.choice() == Choice(NEW, "update")
+
+
+def test_start_becomes_the_firmware_of_the_chosen_release(card: Card) -> None:
+    program = b"""
+import json, os, sys
+import pi_firmware, library
+told = {name: os.environ.get(name) for name in ("BLIMP_RELEASE", "PYTHONDONTWRITEBYTECODE")}
+print(json.dumps([pi_firmware.__version__, library.NAME, os.getpid(), sys.argv[1:], told]))
+"""
+    more = {"pi_firmware/__main__.py": program, "site/library.py": b"NAME = 'of the update'\n"}
+    card.take(card.bundle(contents(NEW, more)))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "deploy.board.start", "--root", str(card.root), "--set", "a.b=1"],
+        cwd=card.root,
+        env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    out, _ = process.communicate(timeout=60)
+    first, second = out.splitlines()
+    version, library, pid, arguments, told = json.loads(second)
+    assert first == f"start: release {NEW} (update)"
+    assert (version, library, pid) == (NEW, "of the update", process.pid)
+    assert arguments == ["--config", str(card.at.config), "--set", "a.b=1"]
+    assert json.loads(told["BLIMP_RELEASE"]) == {"version": NEW, "how": "update", "reason": ""}
+    assert told["PYTHONDONTWRITEBYTECODE"] == "1"
+    running: dict[str, Any] = json.loads(card.at.running.read_text())
+    assert (running["name"], running["version"], running["how"]) == (NEW, NEW, "update")
+    assert running["trial"] == json.loads(card.at.trial.read_text())["id"]
+
+
+def test_start_tells_the_version_of_the_images_release(card: Card) -> None:
+    variables = start.environment(card.at, card.choice(), {"A": "b"})
+    assert json.loads(variables["BLIMP_RELEASE"])["version"] == NOW and variables["A"] == "b"
+    (card.at.factory / "release.json").unlink()
+    told = json.loads(start.environment(card.at, card.choice(), {})["BLIMP_RELEASE"])
+    assert told == {"version": "", "how": "factory", "reason": ""}
+
+
+def test_a_start_loads_little() -> None:
+    """Each of these would cost a Pi Zero a good part of a second, at each start."""
+    heavy = ["subprocess", "shutil", "tempfile", "dataclasses", "argparse", "hashlib"]
+    code = (
+        f"import sys; sys.path.insert(0, {str(CHECKOUT)!r}); import deploy.board.start;"
+        f" print([name for name in {heavy} if name in sys.modules])"
+    )
+    command = [sys.executable, "-S", "-E", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
