@@ -22,6 +22,7 @@ from pi_firmware.wire.systemd import Notifier
 VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
 _FEED_S = 1.0
 _CLOCK_S = 10.0
+_SILENCE_S = 5.0  # before that a ground station may only be slow
 TELEMETRY_UP, TELEMETRY_DOWN = "telemetry up", "telemetry down"
 """What systemd's status line says; whoever tries out a new release looks for it."""
 _GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
@@ -75,6 +76,7 @@ class Supervision:
         self._measured_s = self._started_s
         self._clock = OffsetFilter()
         self._ground_offset_s: float | None = None
+        self._refusals: set[str] = set()
 
     def begin(self) -> bool:
         """Counts this process; whether the board is to be rebooted because the last ones failed."""
@@ -99,6 +101,10 @@ class Supervision:
             trip = telemetry.ask_time()
             offset = self._clock.add(trip) if trip is not None else None
             self._ground_offset_s = offset.offset_ns / 1e9 if offset else None
+            if trip is not None:
+                self._refusals.clear()
+            elif time.monotonic() - self._started_s > _SILENCE_S:
+                self._tell_refusals(telemetry)
 
         self._threads = [
             PeriodicThread(self.table, HEALTH, publish, _complain),
@@ -171,6 +177,13 @@ class Supervision:
         status = f"{self.release}; {heard}"
         if self._ready and status != self._status and self.notifier.status(status):
             self._status = status
+
+    def _tell_refusals(self, telemetry: Telemetry) -> None:
+        """Who is there and takes no part is told once, until somebody takes part."""
+        for line in telemetry.refusals():
+            if line not in self._refusals:
+                self._refusals.add(line)
+                _complain(f"telemetry: {line}")
 
     def _may_reboot(self, *, ending: bool) -> bool:
         if not self._settings.supervision.reboot_command:

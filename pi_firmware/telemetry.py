@@ -12,9 +12,11 @@ from pi_firmware.settings import TelemetrySettings
 from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.clock_offset import Clock, RoundTrip, ask, serve
 from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.refusal import refusal
 from pi_firmware.wire.telemetry import Session, open_session
 
 M = TypeVar("M", bound=messages.Message)
+_REFUSALS_LIMIT_S = 5.0
 _HOST = re.compile(r"^[a-z]+/(\[[^\]]+\]|[^/:]+):\d+")
 
 Tap = Callable[[str, messages.Message], None]
@@ -40,7 +42,8 @@ class Telemetry:
         self._alive: Any = None
         self._clock: Any = None
         self._commands: Any = None
-        self._certified = bool(settings.certificates)
+        self._held: credentials.Credentials | None = None
+        self._connect = tuple(settings.connect)
         self._now = clock
         self._payload_id = payload_id
         self._subscribers: list[Any] = []
@@ -49,7 +52,7 @@ class Telemetry:
         import zenoh
 
         if settings.certificates:
-            held = credentials.load(settings.certificates)
+            self._held = held = credentials.load(settings.certificates)
             if held.name != f"{credentials.PAYLOAD}.{payload_id}":
                 raise TelemetryError(
                     f"certificates in {settings.certificates} are {held.name}'s,"
@@ -160,7 +163,7 @@ class Telemetry:
         hosts = set()
         for link in self._session.zenoh.info.links():
             identity = str(link.auth_identifier or "")
-            if not self._certified or identity == f"{credentials.GROUND}.{ground}":
+            if self._held is None or identity == f"{credentials.GROUND}.{ground}":
                 match = _HOST.search(str(link.dst))
                 if match:
                     hosts.add(match[1].strip("[]"))
@@ -171,6 +174,24 @@ class Telemetry:
         if self._session is None:
             return None
         return ask(self._session.zenoh, keys.key(self._payload_id, keys.TIME), self._now)
+
+    def refusals(self) -> list[str]:
+        """Why the ground stations that it connects to take no part, a line for each that tells.
+
+        Looks only while it speaks to nobody, and takes some seconds.
+        """
+        if self._session is None or self._held is None:
+            return []
+        # A link is made with whoever our authority signed; who is not listed says nothing over it.
+        linked = {str(link.auth_identifier) for link in self._session.zenoh.info.links()}
+        if linked & set(self._held.peers):
+            return []
+        until_s = time.monotonic() + _REFUSALS_LIMIT_S
+        found = []
+        for endpoint in self._connect:
+            if time.monotonic() < until_s and (why := refusal(endpoint, self._held)):
+                found.append(why)
+        return found
 
     def close(self) -> None:
         """Withdraws the liveliness token and closes the session."""

@@ -79,6 +79,7 @@ class Machine:
             raise DeployError(f"{self._qemu}: not there; `sh deploy/emulator/tools.sh` makes it")
         self.folder.mkdir(parents=True, exist_ok=True)
         self.power_ons += 1
+        self.log.unlink(missing_ok=True)
         with (self.folder / f"qemu-{self.power_ons}.log").open("wb") as log:
             self.started_s = time.monotonic()
             self._process = subprocess.Popen(
