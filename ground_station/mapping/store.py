@@ -232,6 +232,13 @@ def load(folder: str | Path) -> Map:
     return Map(info, landmarks, keyframes, folder)
 
 
+def load_positions(folder: str | Path) -> F64:
+    """The landmarks' positions (M, 3) and nothing else of a map; raises as `load`."""
+    name = "position_m"
+    arrays, _ = _read(Path(folder) / "landmarks.safetensors", {name: _LANDMARKS[name]})
+    return arrays[name]
+
+
 def _read(path: Path, wanted: _Layout) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
     try:
         with safe_open(path, framework="numpy") as file:

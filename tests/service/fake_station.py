@@ -121,6 +121,7 @@ class FakeStation:
     demo: bool = True
     map: str = "atrium"
     floorplan: bool = True
+    camera: dict[str, Any] | None = None
     refuse: str = ""
     """Commands are refused with this reason."""
     answer_s: float = 0.0
@@ -358,7 +359,8 @@ def make_app(station: FakeStation) -> FastAPI:
         has_plan = station.floorplan and name == "atrium"
         plan = {**_PLAN, "url": f"/api/maps/{name}/floorplan.png"} if has_plan else None
         bounds = {"min": [-3.0, -40.0, -1.0], "max": [60.0, 30.0, 9.0]}  # with what a window shows
-        return {"name": name, "registered": True, "floorplan": plan, "bounds": bounds}
+        facts = {"registered": True, "floorplan": plan, "bounds": bounds}
+        return {"name": name, "camera": station.camera, **facts}
 
     @app.get("/api/maps/{name}/floorplan.png")
     def floorplan(name: str) -> Response:

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from fake_station import FRAMES, STATIC, FakeStation, Payload, Served, sample_flight, sample_station
 
+from ground_station.geometry.camera import Camera
+
 LIMIT_MS = 20_000
 SIZES = {"desk": (1440, 900), "landscape": (1024, 768), "portrait": (768, 1024)}
 # It reports a refused connection itself, whoever waits for it; it advises on reading canvases back,
@@ -177,6 +179,30 @@ def test_the_picture_is_the_newest_and_its_landmarks_lie_on_it(
                 shown.page.evaluate(PIXEL, ["video-points", *place])[:3] == [240, 228, 66]
             )
         )
+
+
+def test_the_frustum_is_the_cameras_own(shown: Watched) -> None:
+    own = Camera(width_px=640, height_px=480, k1=0.1673, k2=-0.2605, p1=-1.3e-5, p2=-0.00203)
+    told = {
+        "width_px": 640,
+        "height_px": 480,
+        "K": own.matrix.tolist(),
+        "distortion": own.distortion.tolist(),
+    }
+    load = "import('/static/js/view_rays.js').then((m) =>"
+    rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told)
+    per_side = shown.page.evaluate(f"() => {load} m.PER_SIDE)")
+    along = np.arange(per_side) / per_side
+    u = np.concatenate([along, np.ones(per_side), 1 - along, np.zeros(per_side)])
+    v = np.concatenate([np.zeros(per_side), along, np.ones(per_side), 1 - along])
+    border = np.stack([u * 640 - 0.5, v * 480 - 0.5], axis=1)
+    assert np.allclose(rays, own.undistort(border), atol=1e-6)
+    # Without a camera it is about that one's; with one that is none, a pinhole's.
+    plain = np.array(shown.page.evaluate(f"() => {load} m.viewRays(null))"))
+    assert np.allclose(plain, rays, atol=0.05)
+    told["distortion"] = [50.0, -900.0, 3.0, 3.0, 1000.0]
+    wild = np.array(shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told))
+    assert np.isfinite(wild).all() and np.abs(wild).max() < 2
 
 
 def test_the_scene_shows_the_map_and_can_be_turned(shown: Watched) -> None:

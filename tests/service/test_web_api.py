@@ -13,7 +13,9 @@ import pytest
 import web_station as station
 from prometheus_client.parser import text_string_to_metric_families
 
+from ground_station.mapping.store import load_info
 from ground_station.service import notes
+from ground_station.service.settings import MapSettings
 from ground_station.service.web import maps
 from ground_station.service.web.app import build
 from pi_firmware.wire.errors import BlimpError
@@ -253,6 +255,22 @@ def test_the_sample_map(served):
     assert len(points) == details["landmarks"]
     assert np.allclose(points.min(axis=0), details["bounds"]["min"], atol=1e-3)
     assert np.allclose(np.ptp(points, axis=0), details["extent_m"], atol=2e-3)
+    own = load_info(station.ATRIUM).camera
+    told = details["camera"]
+    assert (told["width_px"], told["height_px"]) == (own.width_px, own.height_px)
+    assert told["K"] == own.matrix.tolist() and told["distortion"] == own.distortion.tolist()
+
+
+def test_a_configured_camera_takes_the_place_of_the_maps(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text(
+        "width_px = 320\nheight_px = 240\nfx_px = 250.0\nfy_px = 251.0\ncx_px = 160.0\n"
+        "cy_px = 120.0\nk1 = 0.1\n"
+    )
+    shelf = maps.Maps(MapSettings(folder=str(station.ATRIUM), camera=str(path)))
+    camera = shelf.details("atrium")["camera"]
+    assert camera["K"][0] == [250.0, 0.0, 160.0] and camera["distortion"][0] == 0.1
+    assert (camera["width_px"], camera["height_px"]) == (320, 240)
 
 
 def test_what_is_the_same_is_not_sent_again(served):
@@ -282,8 +300,6 @@ def save_map(folder, positions, plan=b""):
 
 
 def shelf_of(tmp_path):
-    from ground_station.service.settings import MapSettings
-
     return maps.Maps(MapSettings(folder=str(station.ATRIUM), shelf=str(tmp_path / "shelf")))
 
 

@@ -17,10 +17,10 @@ from foxglove import Context
 from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, PointCloudChannel
 
 from ground_station.errors import GroundStationError
-from ground_station.geometry.camera import Camera, load_camera
-from ground_station.mapping import store
+from ground_station.geometry.camera import Camera
 from ground_station.service import notes
 from ground_station.service.bus import Bus
+from ground_station.service.cameras import camera_of
 from ground_station.service.foxglove import checks, documents, drawing, log, world
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.payload import Payload
@@ -165,10 +165,7 @@ class Publishing:
     @functools.cached_property
     def _calibrated(self) -> Camera | None:
         try:
-            chosen = self._settings.map
-            if chosen.camera:
-                return load_camera(chosen.camera)
-            return store.load_info(chosen.folder).camera
+            return camera_of(self._settings.map, self._settings.map.folder)
         except BlimpError as error:
             self._complain("camera", f"no calibration: {error}")
             return None

@@ -9,29 +9,23 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first imported
 
-from ground_station.geometry.camera import Camera, load_camera
-from ground_station.mapping.store import load_info
 from ground_station.service import notes
 from ground_station.service.bus import Bus
+from ground_station.service.cameras import camera_of
 from ground_station.service.ending import ending
 from ground_station.service.intake import resuming
 from ground_station.service.intake.process import Intake
 from ground_station.service.notes import EstimateNote, EventNote
-from ground_station.service.settings import MapSettings, load_run
+from ground_station.service.settings import load_run
 from pi_firmware.wire.errors import BlimpError
 
 _STEP_S = 0.1
 
 
-def camera_of(settings: MapSettings) -> Camera:
-    """The payloads' camera: the one given, or the map's."""
-    return load_camera(settings.camera) if settings.camera else load_info(settings.folder).camera
-
-
 def serve(folder: Path, stop: threading.Event) -> None:
     """Runs until `stop` is set; raises a `BlimpError` with one line when it cannot."""
     settings = load_run(folder).station
-    camera = camera_of(settings.map)
+    camera = camera_of(settings.map, settings.map.folder)
     with (
         Bus(folder, "intake") as bus,
         Intake(settings, bus.say, folder=folder, camera=camera) as intake,

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from ground_station.errors import MapError
 from ground_station.features import extractors
-from ground_station.geometry.camera import load_camera
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import for_live, load_preset
 from ground_station.mapping import store
+from ground_station.service.cameras import camera_of
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire.errors import BlimpError
 
@@ -47,7 +47,7 @@ def prepare(folder: Path, settings: StationSettings) -> Localizer:
     map_ = store.load(folder)
     if not map_.info.registered:
         raise MapError(f"{folder}: it is not registered, so its poses are not in metres")
-    camera = load_camera(settings.map.camera) if settings.map.camera else map_.info.camera
+    camera = camera_of(settings.map, map_.info)
     features = live.features
     extractor = extractors.create(features.extractor, features.max_features)
     return Localizer(map_, camera, extractor, live)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from fastapi import APIRouter, Request, Response
 
 from ground_station.errors import MapError
@@ -34,6 +33,7 @@ class Maps:
 
     def __init__(self, settings: MapSettings) -> None:
         self._shelf, self._configured = Path(settings.shelf), Path(settings.folder)
+        self._settings = settings
         self._lock = threading.Lock()
         self._kept: OrderedDict[tuple[str, str], tuple[tuple[int, ...], Any]] = OrderedDict()
 
@@ -73,9 +73,11 @@ class Maps:
 
         def read() -> dict[str, Any]:
             from ground_station.mapping import store
+            from ground_station.service.cameras import camera_of
 
             info = store.load_info(folder)
-            positions = _positions(folder)
+            camera = camera_of(self._settings, info)
+            positions = store.load_positions(folder)
             low = positions.min(axis=0) if len(positions) else np.zeros(3)
             high = positions.max(axis=0) if len(positions) else np.zeros(3)
             return {
@@ -85,6 +87,12 @@ class Maps:
                 "extent_m": (high - low).round(3).tolist(),
                 "bounds": {"min": low.round(3).tolist(), "max": high.round(3).tolist()},
                 "features": info.features,
+                "camera": {
+                    "width_px": camera.width_px,
+                    "height_px": camera.height_px,
+                    "K": camera.matrix.tolist(),
+                    "distortion": camera.distortion.tolist(),
+                },
             }
 
         details = self._once(name, "details", ("map.toml", "landmarks.safetensors"), read)
@@ -102,7 +110,9 @@ class Maps:
         folder = self._folder(name)
 
         def read() -> bytes:
-            positions = _positions(folder)
+            from ground_station.mapping import store
+
+            positions = store.load_positions(folder)
             if len(positions) > LANDMARKS:
                 positions = positions[np.arange(LANDMARKS) * len(positions) // LANDMARKS]
             return positions.astype("<f4").tobytes()
@@ -173,22 +183,6 @@ class Maps:
                 self._kept.popitem(last=False)
             value: T = kept[1]
             return value
-
-
-def _positions(folder: Path) -> npt.NDArray[np.float64]:
-    """The landmarks' positions (M, 3) and nothing else of the file."""
-    from safetensors import SafetensorError, safe_open
-
-    path = folder / "landmarks.safetensors"
-    try:
-        with safe_open(path, framework="numpy") as file:
-            positions = file.get_tensor("position_m")
-    except (SafetensorError, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise MapError(f"{path}: {reason}") from None
-    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-        raise MapError(f"{path}: 'position_m' must be finite (N, 3)")
-    return np.asarray(positions, np.float64)
 
 
 def router(maps: Maps) -> APIRouter:

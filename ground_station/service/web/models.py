@@ -173,8 +173,23 @@ class BoundsModel(BaseModel):
     max: list[float]
 
 
+class CameraModel(BaseModel):
+    """A camera: `K` (3, 3) in pixels, `distortion` OpenCV's k1, k2, p1, p2, k3.
+
+    The centre of the top-left pixel is (0, 0).
+    """
+
+    width_px: int
+    height_px: int
+    K: list[list[float]]
+    distortion: list[float]
+
+
 class MapDetailsModel(BaseModel):
-    """A map with its floor plan and bounds."""
+    """A map with its floor plan and bounds.
+
+    `camera` is the one that payloads are localized with in it: the configured one, or its own.
+    """
 
     name: str
     registered: bool
@@ -182,6 +197,7 @@ class MapDetailsModel(BaseModel):
     extent_m: list[float]
     bounds: BoundsModel
     features: str
+    camera: CameraModel
     floorplan: FloorPlanModel | None
 
 

@@ -4,6 +4,7 @@ import { byId, canvasById, fitCanvas, setAttribute, setText, show, watchBox } fr
 import { listen } from "./gestures.js";
 import { Orbit } from "./orbit.js";
 import { floorGrid, frustum, landmarkPoints, trailLines } from "./scene_shapes.js";
+import { viewRays } from "./view_rays.js";
 import { Renderer, Shape } from "./webgl.js";
 
 const POINT_PX = 45;
@@ -22,6 +23,7 @@ export class Scene {
     this.map = null;
     /** @type {import("./plan_bitmap.js").PlanBitmap|null} */
     this.bitmap = null;
+    this.rays = viewRays(null);
     this.is_following = false;
     this.is_fitted = true;
     this.trail_drawn = "";
@@ -66,6 +68,7 @@ export class Scene {
     if (map?.name !== this.map?.name) this.is_fitted = true;
     this.map = map;
     this.bitmap = bitmap;
+    this.rays = viewRays(map?.details.camera);
     this.fill();
     this.resized();
   }
@@ -131,7 +134,7 @@ export class Scene {
       this.trail_drawn = version;
     }
     const state = store.stateOf(payload);
-    const shapes = placed ? frustum(placed, state, theme, 0) : { faces: new Float32Array(), lines: new Float32Array() };
+    const shapes = placed ? frustum(placed, this.rays, state, theme, 0) : { faces: new Float32Array(), lines: new Float32Array() };
     this.faces.set(shapes.faces);
     this.edges.set(shapes.lines);
     const ratio = fitCanvas(this.canvas, this.box);

@@ -2,9 +2,8 @@
 /** The scene's shapes as vertices for `webgl.Shape`: x, y, z, red, green, blue, alpha. */
 import { rotate } from "./mat4.js";
 import { lookOf, TRAIL_KEYS } from "./states.js";
+import { PER_SIDE } from "./view_rays.js";
 
-// Half widths of the view at 1 m, where a map does not give its camera: the Pi camera at 640x480.
-const HALF_VIEW = [0.638, 0.475];
 const FRUSTUM_M = 1.2;
 
 /** @param {Float32Array} xyz @param {{min: number[], max: number[]}} bounds @param {import("./theme.js").Theme} theme */
@@ -37,18 +36,18 @@ export function trailLines(trail, theme) {
 
 /**
  * The camera's view as a pyramid, its plumb line to the floor and the place below.
- * @param {import("./types.js").Estimate} estimate @param {string} state
+ * @param {import("./types.js").Estimate} estimate @param {number[][]} rays of `viewRays` @param {string} state
  * @param {import("./theme.js").Theme} theme @param {number} floor_m
  * @returns {{faces: Float32Array, lines: Float32Array}}
  */
-export function frustum(estimate, state, theme, floor_m) {
+export function frustum(estimate, rays, state, theme, floor_m) {
   const eye = estimate.position_m;
   const turn = estimate.quaternion_xyzw;
   if (!eye || !turn) return { faces: new Float32Array(), lines: new Float32Array() };
   const colour = theme.rgb(lookOf(state).key);
   const ink = theme.rgb("ink");
-  const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => {
-    const ray = rotate(turn, [u * HALF_VIEW[0] * FRUSTUM_M, v * HALF_VIEW[1] * FRUSTUM_M, FRUSTUM_M]);
+  const border = rays.map(([x, y]) => {
+    const ray = rotate(turn, [x * FRUSTUM_M, y * FRUSTUM_M, FRUSTUM_M]);
     return ray.map((value, axis) => eye[axis] + value);
   });
   /** @type {number[]} */
@@ -57,10 +56,10 @@ export function frustum(estimate, state, theme, floor_m) {
   const lines = [];
   /** @param {number[]} to @param {number[][]} points @param {number[]} rgb @param {number} alpha */
   const add = (to, points, rgb, alpha) => points.forEach((p) => to.push(p[0], p[1], p[2], rgb[0], rgb[1], rgb[2], alpha));
-  corners.forEach((corner, k) => {
-    const next = corners[(k + 1) % 4];
-    add(faces, [eye, corner, next], colour, k === 0 ? 0.55 : 0.28); // the upper edge is marked
-    add(lines, [eye, corner, corner, next], ink, 1);
+  border.forEach((point, k) => {
+    const next = border[(k + 1) % border.length];
+    add(faces, [eye, point, next], colour, k < PER_SIDE ? 0.55 : 0.28); // the upper side is marked
+    add(lines, k % PER_SIDE === 0 ? [eye, point, point, next] : [point, next], ink, 1);
   });
   const foot = [eye[0], eye[1], floor_m];
   add(lines, [eye, foot], ink, 0.5);

@@ -112,6 +112,13 @@
  * @property {string} name
  * @property {{resolution_m: number, origin: number[], width_px: number, height_px: number, url: string}|null} [floorplan]
  * @property {{min: number[], max: number[]}|null} [bounds] metres
+ * @property {Camera|null} [camera] the payloads'
+ *
+ * @typedef {object} Camera
+ * @property {number} width_px
+ * @property {number} height_px
+ * @property {number[][]} K 3x3, pixels
+ * @property {number[]} distortion k1, k2, p1, p2, k3
  *
  * @typedef {object} Answer of a command
  * @property {boolean} done
