@@ -6,11 +6,12 @@ what lies under the final name is whole, with the files that describe it.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from deploy.run import run
 
 NAMES = ("boot", "root", "data")
 ROOT_LABEL, DATA_LABEL = "blimp-root", "blimp-data"
+DESCRIPTIONS = (".bmap", ".manifest.json", ".sha256")
+Say = Callable[[str], None]
 _MIB = 1 << 20
 DATA_BYTES = 64 * _MIB
 # The emulator takes only cards of a power of two; a real one's boot partition has room for the
@@ -45,6 +48,8 @@ class Ingredients:
         boot: a folder with what goes onto the boot partition: kernel, device trees, firmware.
         site: a folder of unpacked wheels; None: none are needed.
         machine, python: as `uname -m` says there, and as `3.13`.
+        compile: puts byte code beside all Python in a folder, which will lie at a path on the card;
+            None: the card compiles at each start.
     """
 
     rootfs: Path
@@ -55,6 +60,7 @@ class Ingredients:
     site: Path | None
     machine: str
     python: str
+    compile: Callable[[Path, str], None] | None = None
 
 
 def identifiers(board: str, tree: Tree, epoch: int) -> Callable[[str], uuid.UUID]:
@@ -69,7 +75,7 @@ def build(
     given: Ingredients,
     checkout: Path,
     epoch: int,
-    say: Callable[[str], None] = lambda line: None,
+    say: Say = lambda line: None,
 ) -> None:
     """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
 
@@ -94,6 +100,9 @@ def build(
     tree.take(given.modules, [f"{modules}/{n}" for n in _files(given.modules / modules)])
     firmware = release.build(checkout, given.site, given.machine, given.python, epoch)
     units = root.customise(tree, checkout, board, firmware, epoch)
+    if given.compile is not None:
+        say("byte code of the card's programs")
+        root.add_byte_code(tree, given.compile)
     new = identifiers(board, tree, epoch)
     disk = new("disk").int & 0xFFFFFFFF or 1
     say(f"root: {len(tree)} files, {len(units)} units enabled")
@@ -143,34 +152,28 @@ def make_data(place: Path, identifier: uuid.UUID, epoch: int) -> None:
     ext4.make(place, DATA_BYTES, Tree(), kind, epoch)
 
 
-class building:
-    """A folder for the work on an image; what lies in it under its name is put into place."""
-
-    def __init__(self, image: Path) -> None:
-        self._image = image
-
-    def __enter__(self) -> Path:
-        try:
-            self._image.parent.mkdir(parents=True, exist_ok=True)
-            work = tempfile.mkdtemp(prefix=f".{self._image.name}.part-", dir=self._image.parent)
-        except OSError as error:
-            raise DeployError(f"{self._image}: {error.strerror or error}") from None
-        self._work = Path(work)
-        return self._work
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        try:
-            if kind is None:
-                # The old image goes before its description does: no image beside another's.
-                self._image.unlink(missing_ok=True)
-                for suffix in (".bmap", ".manifest.json", ".sha256", ""):
-                    name = self._image.name + suffix
-                    (self._work / name).replace(self._image.with_name(name))
-        finally:
-            shutil.rmtree(self._work, ignore_errors=True)
+@contextlib.contextmanager
+def building(image: Path) -> Iterator[Path]:
+    """A folder for the work on an image; at the end, what describes it and it go into place."""
+    try:
+        image.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{image.name}.part-", dir=image.parent))
+    except OSError as error:
+        raise DeployError(f"{image}: {error.strerror or error}") from None
+    try:
+        yield work
+        # The old image goes before its description does: no image beside another's.
+        image.unlink(missing_ok=True)
+        for suffix in (*DESCRIPTIONS, ""):
+            beside(work / image.name, suffix).replace(beside(image, suffix))
+    except OSError as error:
+        raise DeployError(f"{error.filename or image}: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def beside(image: Path, suffix: str) -> Path:
+    """The file that describes an image: `.bmap`, `.manifest.json` or `.sha256` behind its name."""
     return image.with_name(image.name + suffix)
 
 

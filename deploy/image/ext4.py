@@ -22,6 +22,7 @@ from deploy.run import run
 
 BLOCK_BYTES = 4096
 _INODE_BYTES = 256
+_JOURNAL_MIB = 16
 
 # Named here and not in the machine's /etc/mke2fs.conf, so that every builder makes the same.
 _FEATURES = (
@@ -67,7 +68,9 @@ def make(image: Path, size: int, tree: Tree, kind: Ext4, epoch: int) -> None:
         file.truncate(size)
     features = _FEATURES + (",has_journal,resize_inode" if kind.journal else "")
     extended = f"hash_seed={kind.identifier},lazy_itable_init=0,lazy_journal_init=0,root_owner=0:0"
-    inodes = ["-i", "16384"] if kind.journal else ["-N", str(_inodes(tree))]
+    # A journal and a share of inodes for the card's size, which this grows into.
+    grows = ["-J", f"size={_JOURNAL_MIB}", "-i", "65536"]
+    inodes = grows if kind.journal else ["-N", str(_inodes(tree))]
     options = ["-b", str(BLOCK_BYTES), "-I", str(_INODE_BYTES), "-O", features, "-m", "0", *inodes]
     names = ["-L", kind.label, "-U", str(kind.identifier), "-E", extended]
     # A configuration of ours: /etc/mke2fs.conf is another on another machine.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from deploy.errors import DeployError
@@ -12,8 +14,9 @@ from deploy.image.tree import Tree
 from deploy.image.units import DEFAULT_TARGET, apply_presets
 from deploy.image.users import Accounts
 
-RELEASE = "usr/lib/blimp/release"
-PROGRAMS = "usr/lib/blimp/deploy"
+OURS = "usr/lib/blimp"
+RELEASE = f"{OURS}/release"
+PROGRAMS = f"{OURS}/deploy"
 ACCOUNTS = "usr/lib/sysusers.d/blimp.conf"
 CLOCK_EPOCH = "usr/lib/clock-epoch"
 
@@ -69,6 +72,20 @@ def customise(tree: Tree, checkout: Path, board: str, release: Tree, epoch: int)
     for folder in ("etc", "var"):
         tree.write(f"{folder}/.updated", f"TIMESTAMP_NSEC={epoch}000000000\n")
     return apply_presets(tree)
+
+
+def add_byte_code(tree: Tree, compile: Callable[[Path, str], None]) -> None:
+    """Adds what `compile` puts beside the card's own Python: the root is read-only at boot."""
+    with tempfile.TemporaryDirectory(prefix="blimp-bytecode-") as work:
+        folder = Path(work) / "blimp"
+        for path, entry in tree.below(OURS):
+            if entry.kind == "file" and path.endswith(".py"):
+                place = folder / path.removeprefix(f"{OURS}/")
+                place.parent.mkdir(parents=True, exist_ok=True)
+                place.write_bytes(entry.content.read())
+        compile(folder, f"/{OURS}")
+        for place in sorted(folder.rglob("*.pyc")):
+            tree.write(f"{OURS}/{place.relative_to(folder)}", place.read_bytes())
 
 
 def _programs(tree: Tree, checkout: Path) -> None:

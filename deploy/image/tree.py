@@ -95,10 +95,11 @@ class Tree:
         if not name:
             return
         mode = member.mode & 0o7777
+        # Capabilities, but no access lists: the only ones are of /var/log, which is not shipped.
         xattrs = tuple(
             (key.removeprefix("SCHILY.xattr."), value.encode("utf-8", "surrogateescape"))
             for key, value in sorted(member.pax_headers.items())
-            if key.startswith("SCHILY.xattr.")
+            if key.startswith("SCHILY.xattr.security.")
         )
         owned = Entry("file", mode, member.uid, member.gid, int(member.mtime), xattrs=xattrs)
         if member.isdir():

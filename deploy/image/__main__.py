@@ -1,0 +1,7 @@
+"""`python -m deploy.image`."""
+
+import sys
+
+from deploy.image.command import main
+
+sys.exit(main())
