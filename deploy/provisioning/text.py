@@ -46,6 +46,23 @@ def parse(text: bytes) -> Provisioning:
         raise DeployError(f"{FILE}: {error}") from None
 
 
+def parse_wifi(text: bytes, name: str, country: str | None = None) -> Wifi:
+    """Reads a file that holds the table [wifi] of `blimp.toml` and nothing else.
+
+    `name` stands in errors; `country` is used instead of the file's. Raises `DeployError`.
+    """
+    try:
+        document = _document(text)
+        if unknown := sorted(set(document) - {"wifi"}):
+            raise DeployError(f"unknown key {_shown(unknown[0])} (known: wifi)")
+        if "wifi" not in document:
+            raise DeployError("the table [wifi] is missing")
+        table = _table(document["wifi"], "wifi")
+        return _wifi(table | {"country": country} if country is not None else table)
+    except DeployError as error:
+        raise DeployError(f"{name}: {error}") from None
+
+
 def _document(text: bytes) -> dict[str, Any]:
     if len(text) > MAX_BYTES:
         raise DeployError(f"it has {len(text)} bytes; allowed: at most {MAX_BYTES}")

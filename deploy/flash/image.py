@@ -1,0 +1,176 @@
+"""A card image, checked before anything is written: whole, ours, and for this board."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import lzma
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from deploy.errors import DeployError
+from deploy.flash import bmap
+from deploy.flash.bmap import CHUNK_BYTES, Stretch
+from deploy.flash.boot import BOARD_FILE, BootPartition
+from deploy.flash.progress import Progress
+
+_SUM = re.compile(r"([0-9a-fA-F]{64})(?: [ *](.+))?", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image's bytes in a file that can be read anywhere, and which of them mean something."""
+
+    path: Path
+    file: BinaryIO
+    size: int
+    stretches: list[Stretch]
+    boot: BootPartition
+    board: str
+    version: str
+
+
+@contextlib.contextmanager
+def opened(path: Path, *, checksum: bool, board: str = "") -> Iterator[Image]:
+    """Opens and checks IMG or IMG.xz with the `.sha256` and `.bmap` beside it.
+
+    Args:
+        path: the image.
+        checksum: whether a missing `.sha256` is refused; a wrong one always is.
+        board: the one it must be for ("": any).
+
+    Raises:
+        DeployError: it is missing, cut, damaged, not ours or for another board.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            source = stack.enter_context(open(path, "rb"))
+            file = _checked(path, source, stack, checksum)
+            size = file.seek(0, os.SEEK_END)
+            boot = BootPartition.find(file.fileno(), path.name)
+            found, version = _identity(path, boot)
+            if board and found != board:
+                raise DeployError(
+                    f"{path}: an image for {found or 'a board that it does not tell'};"
+                    f" this card is to be for {board}"
+                )
+            yield Image(path, file, size, _stretches(path, file, size), boot, found, version)
+        except OSError as error:
+            raise DeployError(f"{path}: {error.strerror or error}") from None
+
+
+def _checked(path: Path, source: BinaryIO, stack: contextlib.ExitStack, required: bool) -> BinaryIO:
+    """The image's content as a file, unpacked where needed; raises on a wrong checksum."""
+    packed = path.suffix == ".xz"
+    wanted = _checksums(path)
+    if not wanted and required:
+        raise DeployError(
+            f"{path}: no {path.name}.sha256 beside it to check it by (--no-checksum goes on)"
+        )
+    if not packed and not wanted:
+        return source
+    content, total = source, os.fstat(source.fileno()).st_size
+    with Progress("unpacking" if packed else "checking", total) as progress:
+        if packed:
+            # Unnamed, so that nothing stays behind however this program ends.
+            folder = os.environ.get("TMPDIR", "/var/tmp")
+            unnamed = tempfile.TemporaryFile(dir=folder, prefix="blimp-")  # noqa: SIM115
+            content = stack.enter_context(unnamed)
+            sums = {path.name: _unpack(path, source, content, progress)}
+            if path.stem in wanted:
+                sums[path.stem] = _hash(content)
+        else:
+            sums = {path.name: _hash(source, progress)}
+    for name, expected in wanted.items():
+        if sums[name] != expected:
+            raise DeployError(
+                f"{path}: its checksum is wrong: {name} has {sums[name][:16]}…, expected"
+                f" {expected[:16]}…; it is cut, damaged or another one"
+            )
+    return content
+
+
+def _checksums(path: Path) -> dict[str, str]:
+    """What the `.sha256` beside an image says, by the name it says it of; empty when there is none.
+
+    Of a packed image either the file's own or its content's is there.
+    """
+    found = {}
+    for subject in dict.fromkeys((path, path.with_suffix("") if path.suffix == ".xz" else path)):
+        for place in (subject.with_name(subject.name + ".sha256"), subject.with_suffix(".sha256")):
+            try:
+                lines = place.read_text(errors="replace").splitlines()
+            except FileNotFoundError:
+                continue
+            matches = [match for line in lines if (match := _SUM.fullmatch(line.strip()))]
+            for match in matches:
+                if match[2] is None or Path(match[2]).name == subject.name:
+                    found[subject.name] = match[1].lower()
+            if subject.name not in found and place.name == subject.name + ".sha256":
+                raise DeployError(f"{place}: it tells no checksum of {subject.name}")
+    return found
+
+
+def _hash(file: BinaryIO, progress: Progress | None = None) -> str:
+    whole = hashlib.sha256()
+    for _, data in bmap.chunks(file, Stretch(0, file.seek(0, os.SEEK_END))):
+        whole.update(data)
+        if progress is not None:
+            progress.advance(len(data))
+    return whole.hexdigest()
+
+
+def _unpack(path: Path, source: BinaryIO, content: BinaryIO, progress: Progress) -> str:
+    """Unpacks with holes where zeros are; gives the packed file's checksum."""
+    whole = hashlib.sha256()
+    unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ)
+    try:
+        while packed := source.read(CHUNK_BYTES):
+            whole.update(packed)
+            progress.advance(len(packed))
+            data = packed
+            while not unpacker.eof and (data or not unpacker.needs_input):
+                piece = unpacker.decompress(data, CHUNK_BYTES)
+                data = b""
+                if piece.count(0) == len(piece):
+                    content.seek(len(piece), os.SEEK_CUR)
+                else:
+                    content.write(piece)
+    except lzma.LZMAError:
+        raise DeployError(f"{path}: not an .xz file, or damaged") from None
+    if not unpacker.eof:
+        raise DeployError(f"{path}: the .xz file is cut")
+    content.truncate(content.tell())
+    content.flush()
+    return whole.hexdigest()
+
+
+def _stretches(path: Path, file: BinaryIO, size: int) -> list[Stretch]:
+    """What must be written: what the map beside the image says, or all of it."""
+    stem = path.with_suffix("") if path.suffix == ".xz" else path
+    for place in (stem.with_name(stem.name + ".bmap"), stem.with_suffix(".bmap")):
+        if place.is_file():
+            stretches = bmap.read(place, size)
+            wrong = bmap.verify(file, stretches)
+            if wrong is not None:
+                raise DeployError(
+                    f"{place}: not the map of this image (byte {wrong}); delete it, or build anew"
+                )
+            return stretches
+    return [Stretch(0, size)]
+
+
+def _identity(path: Path, boot: BootPartition) -> tuple[str, str]:
+    """The board and the version that the image names, "" where it does not."""
+    try:
+        document = json.loads(boot.read(BOARD_FILE)) if boot.has(BOARD_FILE) else {}
+        board, version = str(document.get("board", "")), str(document.get("image", ""))
+    except (ValueError, AttributeError, RecursionError):
+        raise DeployError(f"{path}: its {BOARD_FILE} is damaged") from None
+    return board, version

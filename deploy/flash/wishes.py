@@ -1,0 +1,162 @@
+"""What the person asked for, read from options and files and checked before a card is touched."""
+
+from __future__ import annotations
+
+import dataclasses
+import getpass
+import os
+import pwd
+import stat
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.provisioning import GroundStation, Provisioning, Wifi, keeps_password
+from deploy.provisioning.model import OPEN, WPA2
+from deploy.provisioning.text import parse_wifi
+
+MAX_FILE_BYTES = 64 * 1024
+
+
+@dataclass(frozen=True)
+class WifiWish:
+    """Wi-Fi as the options name it; None: not named, so it stays as it is."""
+
+    ssid: str | None = None
+    file: Path | None = None
+    password_file: Path | None = None
+    country: str | None = None
+    security: str | None = None
+    hidden: bool = False
+    none: bool = False
+
+
+def read_wifi(wish: WifiWish, ask: Callable[[str], str] | None = None) -> Wifi | None:
+    """The network asked for; None without one. Raises `DeployError` with one line.
+
+    The password is asked for on the terminal where no file holds it: on a command line every user
+    of the machine could read it.
+    """
+    if [wish.ssid is not None, wish.file is not None, wish.none].count(True) > 1:
+        raise DeployError("expected one of --wifi-ssid, --wifi and --no-wifi")
+    if wish.file is not None:
+        named = parse_wifi(read_file(wish.file), wish.file.name, wish.country)
+        if wish.password_file is None:
+            return named
+        return dataclasses.replace(named, password=_password_in(wish.password_file))
+    if wish.ssid is None:
+        if wish.password_file is not None:
+            raise DeployError("--wifi-password-file is given without --wifi-ssid")
+        return None
+    if wish.country is None:
+        raise DeployError("--country is missing: two capital letters, as DE")
+    security = wish.security or WPA2
+    # Checked first without the password, so that nobody types it for nothing.
+    network = Wifi(os.fsencode(wish.ssid), wish.country, "", security, wish.hidden)
+    if wish.password_file is not None:
+        password = _password_in(wish.password_file)
+    elif security == OPEN:
+        password = ""
+    else:
+        password = (ask or _ask)(wish.ssid)
+    return dataclasses.replace(network, password=password)
+
+
+def merge(
+    existing: Provisioning | None,
+    payload: str | None,
+    wifi: Wifi | None,
+    *,
+    no_wifi: bool = False,
+    ground: str | None = None,
+    ssh: tuple[str, ...] | None = None,
+    country: str | None = None,
+) -> Provisioning:
+    """What the card holds with what was asked for in its place; raises `DeployError`.
+
+    An empty password keeps the card's own, where it is for the same network. None keeps, too.
+    """
+    if existing is None:
+        if payload is None:
+            raise DeployError("--payload is missing: the payload's name, as blimp-1")
+        existing = Provisioning(payload)
+    old = existing.wifi
+    if wifi is not None and wifi.security != OPEN and not wifi.password:
+        if old is None or (old.ssid, old.security) != (wifi.ssid, wifi.security):
+            raise DeployError("the Wi-Fi password is empty, and the card holds none for it")
+        wifi = dataclasses.replace(wifi, password=old.password)
+    if wifi is None and not no_wifi and old is not None:
+        wifi = dataclasses.replace(old, country=country or old.country)
+    return Provisioning(
+        payload_id=payload or existing.payload_id,
+        wifi=wifi,
+        ground_station=GroundStation(ground) if ground is not None else existing.ground_station,
+        authorized_keys=existing.authorized_keys if ssh is None else ssh,
+    )
+
+
+def check_complete(provisioning: Provisioning) -> None:
+    """Raises `DeployError` when a new card would lack the password, which it cannot keep."""
+    if keeps_password(provisioning):
+        raise DeployError("the Wi-Fi password is empty, and a new card holds none to keep")
+
+
+def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """A small regular file's bytes; raises `DeployError` with one line."""
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise DeployError(f"{path}: not a file")
+            data = file.read(limit + 1)
+    except OSError as error:
+        raise DeployError(f"{path}: {error.strerror or error}") from None
+    if len(data) > limit:
+        raise DeployError(f"{path}: more than {limit} bytes")
+    return data
+
+
+def home() -> Path:
+    """The home of the person at the keyboard, also under sudo."""
+    user = os.environ.get("SUDO_USER")
+    if user and os.geteuid() == 0:
+        try:
+            return Path(pwd.getpwnam(user).pw_dir)
+        except KeyError:
+            pass
+    return Path.home()
+
+
+def default_keys() -> Path:
+    """The folder of `blimp keys`."""
+    data = os.environ.get("XDG_DATA_HOME")
+    return (Path(data) if data else home() / ".local/share") / "blimp/keys"
+
+
+def _password_in(path: Path) -> str:
+    """A file's text without the line's end that an editor puts after it."""
+    data = read_file(path)
+    for end in (b"\r\n", b"\n"):
+        if data.endswith(end):
+            data = data.removesuffix(end)
+            break
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise DeployError(f"{path}: not UTF-8") from None
+
+
+def _ask(ssid: str) -> str:
+    """Asks without echo, twice: nobody sees what they typed."""
+    if not sys.stdin.isatty():
+        raise DeployError("no password: give --wifi-password-file, or run it on a terminal")
+    shown = "".join(character if character.isprintable() else "?" for character in ssid)
+    try:
+        first = getpass.getpass(f"Password of the network '{shown}' (empty: the card's): ")
+        again = getpass.getpass("Once more: ") if first else ""
+    except EOFError:
+        raise DeployError("no password was given") from None
+    if first != again:
+        raise DeployError("the two passwords differ")
+    return first
