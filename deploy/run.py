@@ -43,6 +43,7 @@ _PACKAGES = {
     "ssh": "openssh-client",
     "ssh-keygen": "openssh-client",
     "systemd-analyze": "systemd",
+    "tune2fs": "e2fsprogs",
     "xz": "xz-utils",
     "zstd": "zstd",
 }

@@ -63,10 +63,18 @@ class Ingredients:
     compile: Callable[[Path, str], None] | None = None
 
 
-def identifiers(board: str, tree: Tree, epoch: int) -> Callable[[str], uuid.UUID]:
+class Identifiers:
     """Identifiers that follow from what is on the card: another content, another card."""
-    seed = hashlib.sha256(board.encode() + tree.digest(epoch)).hexdigest()
-    return lambda name: uuid.uuid5(_NAMESPACE, f"{seed} {name}")
+
+    def __init__(self, *inputs: bytes) -> None:
+        self._seed = hashlib.sha256(b"".join(inputs)).hexdigest()
+
+    def uuid(self, name: str) -> uuid.UUID:
+        return uuid.uuid5(_NAMESPACE, f"{self._seed} {name}")
+
+    def number(self, name: str) -> int:
+        """32 bits, not 0."""
+        return self.uuid(name).int & 0xFFFFFFFF or 1
 
 
 def build(
@@ -90,8 +98,7 @@ def build(
     Raises:
         DeployError: an ingredient is missing or broken, something does not fit, a tool fails.
     """
-    if not fat.FIRST_SECOND <= epoch <= fat.LAST_SECOND:
-        raise DeployError(f"--epoch {epoch}: allowed: {fat.FIRST_SECOND} to {fat.LAST_SECOND}")
+    check_epoch(epoch)
     say("reading the packages' root")
     tree = Tree.from_tar(given.rootfs)
     modules = f"usr/lib/modules/{given.kernel_release}"
@@ -103,39 +110,25 @@ def build(
     if given.compile is not None:
         say("byte code of the card's programs")
         root.add_byte_code(tree, given.compile)
-    new = identifiers(board, tree, epoch)
-    disk = new("disk").int & 0xFFFFFFFF or 1
+    new = Identifiers(board.encode(), tree.digest(epoch))
     say(f"root: {len(tree)} files, {len(units)} units enabled")
     first = initrd.build(tree, given.kernel_release)
     files = Tree()
     files.take(given.boot, _files(given.boot))
     if given.kernel not in files:
         raise DeployError(f"{given.boot}: no kernel '{given.kernel}' in it")
-    where = f"UUID={new('root')}"
+    where = f"UUID={new.uuid('root')}"
     front = boot.contents(board, given.kernel, given.machine, files, first, where)
     with building(image) as work:
-        parts = [work / name for name in NAMES]
-        say("boot partition")
-        serial = new("boot").int & 0xFFFFFFFF
-        size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
-        fat.make(parts[0], size, front, boot.LABEL, serial, epoch)
         say("root partition")
+        place = work / "root"
         size = align(ext4.bytes_needed(tree))
-        ext4.make(parts[1], size, tree, ext4.Ext4(ROOT_LABEL, new("root")), epoch)
-        make_data(parts[2], new("data"), epoch)
-        layout = [
-            Partition("boot", FAT32_LBA, parts[0], fat.used_ranges(parts[0])),
-            Partition("root", LINUX, parts[1], ext4.used_ranges(parts[1])),
-            Partition("data", LINUX, parts[2], ext4.used_ranges(parts[2])),
-        ]
-        total = partitions.ALIGN_BYTES + sum(align(part.size) for part in layout)
-        say("image, block map and checksums")
-        whole = work / image.name
-        partitions.assemble(whole, layout, disk, power_of_two(total) if board == "qemu" else None)
-        describe(whole)
+        ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
+        say("boot and data partition, image, block map and checksums")
+        finish(work / image.name, board, front, place, new, epoch)
         manifest.write(
-            whole,
-            beside(whole, ".manifest.json"),
+            work / image.name,
+            beside(work / image.name, ".manifest.json"),
             board=board,
             checkout=checkout,
             epoch=epoch,
@@ -146,10 +139,35 @@ def build(
         )
 
 
-def make_data(place: Path, identifier: uuid.UUID, epoch: int) -> None:
-    """The data partition's file system, empty; the card makes its folders and grows it."""
-    kind = ext4.Ext4(DATA_LABEL, identifier, journal=True)
-    ext4.make(place, DATA_BYTES, Tree(), kind, epoch)
+def finish(
+    image: Path, board: str, front: Tree, root_place: Path, new: Identifiers, epoch: int
+) -> None:
+    """Puts an image together from a boot partition's files and a root partition's file system.
+
+    Adds the data partition, empty: the card makes its folders and grows it. Writes block map and
+    checksum, too.
+    """
+    boot_place, data_place = image.with_name("boot"), image.with_name("data")
+    size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
+    fat.make(boot_place, size, front, boot.LABEL, new.number("boot"), epoch)
+    kind = ext4.Ext4(DATA_LABEL, new.uuid("data"), journal=True)
+    ext4.make(data_place, DATA_BYTES, Tree(), kind, epoch)
+    layout = [
+        Partition("boot", FAT32_LBA, boot_place, fat.used_ranges(boot_place)),
+        Partition("root", LINUX, root_place, ext4.used_ranges(root_place)),
+        Partition("data", LINUX, data_place, ext4.used_ranges(data_place)),
+    ]
+    total = partitions.ALIGN_BYTES + sum(align(part.size) for part in layout)
+    whole = power_of_two(total) if board == "qemu" else None
+    partitions.assemble(image, layout, new.number("disk"), whole)
+    run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
+    beside(image, ".sha256").write_text(f"{sha256(image)}  {image.name}\n")
+
+
+def check_epoch(epoch: int) -> None:
+    """Refuses a time that FAT cannot tell."""
+    if not fat.FIRST_SECOND <= epoch <= fat.LAST_SECOND:
+        raise DeployError(f"--epoch {epoch}: allowed: {fat.FIRST_SECOND} to {fat.LAST_SECOND}")
 
 
 @contextlib.contextmanager
@@ -175,12 +193,6 @@ def building(image: Path) -> Iterator[Path]:
 def beside(image: Path, suffix: str) -> Path:
     """The file that describes an image: `.bmap`, `.manifest.json` or `.sha256` behind its name."""
     return image.with_name(image.name + suffix)
-
-
-def describe(image: Path) -> None:
-    """Block map and checksum of a finished image."""
-    run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
-    beside(image, ".sha256").write_text(f"{sha256(image)}  {image.name}\n")
 
 
 def _files(folder: Path) -> list[str]:

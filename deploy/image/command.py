@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -11,10 +12,11 @@ from functools import partial
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import card, checkout
-from deploy.image.packages import build_rootfs, fetch_wheels, load_board, unpack_kernel
+from deploy.image import card, checkout, raspios
+from deploy.image.packages import build_rootfs, cache, fetch_wheels, load_board, unpack_kernel
 from deploy.image.packages.board import Board, with_archives
 from deploy.image.packages.python import byte_compile
+from deploy.image.sparse import sha256
 
 _CHECKOUT = Path(__file__).parents[2]
 _BOARDS = ("qemu", "zero2w", "zerow")
@@ -86,15 +88,16 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
     if bool(board.base) != (options.base is not None):
         wants = f"needs --base: {board.base}" if board.base else "takes no --base"
         raise DeployError(f"--board {board.name}: {wants}")
-    cache = options.cache or _CHECKOUT / "out/cache/image"
+    cache_folder = options.cache or _CHECKOUT / "out/cache/image"
     say("wheels")
-    site = fetch_wheels(board, cache)
+    site = fetch_wheels(board, cache_folder)
     if board.base:
-        raise DeployError("not yet")
+        raspios.build(image, board, options.base, site, _CHECKOUT, epoch, say)
+        return
     say("kernel")
-    kernel = unpack_kernel(board, cache)
+    kernel = unpack_kernel(board, cache_folder)
     say("packages (the first time this takes a quarter of an hour)")
-    rootfs = build_rootfs(board, cache, _ROOTFS_EPOCH)
+    rootfs = build_rootfs(board, cache_folder, _ROOTFS_EPOCH)
     assert board.kernel is not None  # unpack_kernel refuses a board without
     given = card.Ingredients(
         rootfs=rootfs,
@@ -105,14 +108,29 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
         site=site,
         machine=board.machine,
         python=board.python,
-        compile=partial(_compile, board, rootfs),
+        compile=partial(_compile, board, rootfs, cache_folder),
     )
     card.build(image, board.name, given, _CHECKOUT, epoch, say)
     say("done")
 
 
-def _compile(board: Board, rootfs: Path, folder: Path, at: str) -> None:
-    byte_compile(board, rootfs, folder, at)
+def _compile(board: Board, rootfs: Path, cache_folder: Path, folder: Path, at: str) -> None:
+    """Byte code for a folder, from the cache where its sources are there: emulation is slow."""
+    sources = sorted(path.relative_to(folder) for path in folder.rglob("*.py"))
+    if not sources:
+        return
+    hashes = [f"{name} {sha256(folder / name)}" for name in sources]
+    key = cache.key(at, rootfs.name, *hashes)
+    target = cache_folder / f"bytecode-{board.name}-{key}"
+    with cache.made(target) as work:
+        if work is not None:
+            copy = work / target.name
+            shutil.copytree(folder, copy)
+            byte_compile(board, rootfs, copy, at)
+    for path in target.rglob("*.pyc"):
+        place = folder / path.relative_to(target)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, place)
 
 
 def _epoch(options: argparse.Namespace) -> int:

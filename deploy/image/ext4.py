@@ -76,7 +76,7 @@ def make(image: Path, size: int, tree: Tree, kind: Ext4, epoch: int) -> None:
     # A configuration of ours: /etc/mke2fs.conf is another on another machine.
     run(
         ["mke2fs", "-q", "-F", *options, *names, image],
-        env={**_clock(epoch), "MKE2FS_CONFIG": "/dev/null"},
+        env={**clock(epoch), "MKE2FS_CONFIG": "/dev/null"},
     )
     fill(image, tree, epoch)
 
@@ -94,7 +94,7 @@ def fill(image: Path, tree: Tree, epoch: int, before: Tree | None = None) -> Non
         commands = _Commands(tree, before or Tree(), Path(work), epoch)
         script.write_text("\n".join([*commands.removals(), *commands.additions()]) + "\n")
         debugfs(image, script, epoch)
-    run(["e2fsck", "-fn", image], env=_clock(epoch))
+    run(["e2fsck", "-fn", image], env=clock(epoch))
 
 
 def used_ranges(image: Path) -> list[Range]:
@@ -103,9 +103,10 @@ def used_ranges(image: Path) -> list[Range]:
     Without these, an inode table or a journal that an earlier system left on the card at the same
     place would be taken for this one's.
     """
-    said = run(["dumpe2fs", image], env={"TZ": "UTC"}).decode(errors="replace")
-    block = int(_field(said, "Block size"))
-    size = int(_field(said, "Block count")) * block
+    said = _dumped(image)
+    facts = _facts(said)
+    block = int(facts["Block size"])
+    size = int(facts["Block count"]) * block
     used: list[Range] = []
     position = 0
     for line in said.splitlines():
@@ -120,11 +121,22 @@ def used_ranges(image: Path) -> list[Range]:
     return [item for item in used if item.start < item.stop]
 
 
-def _field(said: str, name: str) -> str:
-    found = re.search(rf"^{name}: +(\S+)$", said, re.MULTILINE)
-    if found is None:
-        raise DeployError(f"dumpe2fs: says no {name.lower()}")
-    return found[1]
+def facts(image: Path) -> dict[str, str]:
+    """What the superblock says, by dumpe2fs's names."""
+    return _facts(_dumped(image))
+
+
+def _dumped(image: Path) -> str:
+    return run(["dumpe2fs", image], env={"TZ": "UTC"}).decode(errors="replace")
+
+
+def _facts(said: str) -> dict[str, str]:
+    head = said.partition("\n\n")[0]
+    return {
+        name: value.strip()
+        for name, colon, value in (line.partition(":") for line in head.splitlines())
+        if colon
+    }
 
 
 class _Commands:
@@ -189,7 +201,7 @@ class _Commands:
 
 def debugfs(image: Path, script: Path, epoch: int) -> None:
     """Runs a script of debugfs commands; it exits with 0 whatever fails, so its words are read."""
-    said = run(["debugfs", "-w", "-f", script, image], env=_clock(epoch), merge=True)
+    said = run(["debugfs", "-w", "-f", script, image], env=clock(epoch), merge=True)
     for line in said.decode(errors="replace").splitlines():
         if not _CHATTER.match(line):
             raise DeployError(f"{image.name}: debugfs: {line.strip()}")
@@ -201,7 +213,8 @@ def _quotable(text: str) -> str:
     return text
 
 
-def _clock(epoch: int) -> dict[str, str]:
+def clock(epoch: int) -> dict[str, str]:
+    """The environment in which e2fsprogs takes this for the present."""
     return {"E2FSPROGS_FAKE_TIME": str(epoch), "TZ": "UTC"}
 
 

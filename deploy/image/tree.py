@@ -12,7 +12,7 @@ import tarfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from deploy.errors import DeployError
 
@@ -42,7 +42,8 @@ class Content:
     def read(self) -> bytes:
         if self.data is not None:
             return self.data
-        assert self.path is not None
+        if self.path is None:
+            raise DeployError("a file's content is asked for that was not read")
         try:
             with open(self.path, "rb") as file:
                 file.seek(self.offset)
@@ -195,10 +196,14 @@ class Tree:
         for name in [n for n in self._entries if n == place or n.startswith(place + "/")]:
             del self._entries[name]
 
-    def replace(self, path: str, **changes: int) -> None:
-        """Changes an entry's mode, uid, gid or mtime."""
-        place = self.resolve(path)
-        self._entries[place] = replace(self[place], **changes)  # type: ignore[arg-type]
+    def replace(self, path: str, **changes: Any) -> None:
+        """Changes an entry's fields, by their names."""
+        place = path if path in self._entries else self.resolve(path)
+        self._entries[place] = replace(self[place], **changes)
+
+    def put(self, path: str, entry: Entry) -> None:
+        """Puts an entry under exactly this path, as a file system that is read has it."""
+        self._entries[_checked(path)] = entry
 
     def __contains__(self, path: str) -> bool:
         return self.resolve(path) in self._entries
@@ -235,6 +240,14 @@ class Tree:
         """The entries inside a folder, by their path from the root."""
         place = self.resolve(folder) + "/"
         return ((path, entry) for path, entry in self.items() if path.startswith(place))
+
+    def changed(self, before: Tree) -> Tree:
+        """The entries that are not the very ones of another tree."""
+        result = Tree()
+        for path, entry in self.items():
+            if before._entries.get(path) is not entry:
+                result.put(path, entry)
+        return result
 
     def digest(self, epoch: int) -> bytes:
         """SHA-256 over every path, owner, mode, time and content."""

@@ -13,6 +13,8 @@ from deploy.image.tree import Tree
 
 # No password fits "*", and unlike "!" sshd does not take it for a locked account: keys work.
 NO_PASSWORD = "*"
+# Debian's range of users that are persons (adduser.conf's FIRST_UID and LAST_UID).
+_PEOPLE = range(1000, 60000)
 _FILES = ("passwd", "group", "shadow", "gshadow")
 
 
@@ -25,6 +27,14 @@ class Accounts:
             name: [line.split(":") for line in _text(tree, name).splitlines() if line]
             for name in _FILES
         }
+
+    def remove_people(self) -> None:
+        """Takes away who is no part of the system: a base image's own user, and his group."""
+        for file in ("passwd", "group"):
+            for row in [row for row in self._rows[file] if int(row[2]) in _PEOPLE]:
+                self._rows[file].remove(row)
+                shadow = "shadow" if file == "passwd" else "gshadow"
+                self._rows[shadow] = [kept for kept in self._rows[shadow] if kept[0] != row[0]]
 
     def apply(self, path: str) -> None:
         """Makes what a sysusers.d file of the tree names and the tree does not have yet.

@@ -1,0 +1,179 @@
+"""A card for the Zero W out of a Raspberry Pi OS Lite image: the root changed in place, unmounted.
+
+Debian's own armhf needs ARMv7, which the Zero W is not; Raspberry Pi OS has both its kernel and its
+packages. The base must hold the packages of `boards/zerow.toml` already. Not verified on hardware:
+it was tested with small images that have the layout of the real one.
+
+The root partition is taken out, changed with debugfs, checked, and put into a card of the same
+layout as the other boards'. The boot partition is made anew from the base's files.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.image import boot, card, ext4, ext4_read, initrd, manifest, partitions, release, root
+from deploy.image.card import Identifiers, beside, building
+from deploy.image.packages.board import Board
+from deploy.image.partitions import FAT32_LBA, LINUX
+from deploy.image.sparse import Range, cut_out, sha256
+from deploy.image.tree import Tree
+from deploy.run import run
+
+_OS_RELEASE = "usr/lib/os-release"
+_STATUS = "var/lib/dpkg/status"
+_KERNEL, _KERNEL_SUFFIX = "kernel.img", "-rpi-v6"
+# What of the root is looked at: accounts, units, the kernel's tables and what goes into the initrd.
+_WANTED = ("etc/", "usr/lib/systemd/system", "usr/lib/sysusers.d/", "usr/lib/modules/")
+_WANTED_FILES = (_OS_RELEASE, _STATUS, "usr/bin/busybox")
+# Its first boot's and its own first root.
+_NOT_TAKEN = ("config.txt", "cmdline.txt", "issue.txt", "initramfs*", "firstrun.sh", "userconf*",
+              "custom.toml", "user-data", "meta-data", "network-config")  # fmt: skip
+# Room for what the file system itself needs when files are added.
+_SPARE_BYTES = 16 << 20
+
+
+def build(
+    image: Path,
+    board: Board,
+    base: Path,
+    site: Path | None,
+    checkout: Path,
+    epoch: int,
+    say: card.Say = lambda line: None,
+) -> None:
+    """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
+
+    Args:
+        image: the final name; what is there stays until the new one is whole.
+        board: the Zero W.
+        base: a Raspberry Pi OS Lite image, 32 bit, trixie; `.xz` is unpacked.
+        site: a folder of unpacked wheels for it.
+        checkout: of this project, with git.
+        epoch: the time of everything that is ours, s since 1970.
+        say: takes a line of progress.
+
+    Raises:
+        DeployError: the base is not what it should be, with what it is; a tool fails.
+    """
+    card.check_epoch(epoch)
+    with building(image) as work:
+        say(f"taking {base.name} apart")
+        boot_place, root_place = work / "base-boot", work / "root"
+        _take_apart(base, work, boot_place, root_place)
+        contents = work / "contents"
+        contents.mkdir()
+        run(["e2fsck", "-fp", root_place], ok=(0, 1), env=ext4.clock(epoch))
+        before = ext4_read.read_tree(root_place, _is_wanted, contents)
+        packages = _check(base, before, board)
+        tree = Tree()
+        for path, entry in before.items():
+            tree.put(path, entry)
+        firmware = release.build(checkout, site, board.machine, board.python, epoch)
+        units = root.customise(tree, checkout, board.name, firmware, epoch)
+        ours = tree.changed(before)
+        new = Identifiers(board.name.encode(), sha256(base).encode(), ours.digest(epoch))
+        first = initrd.build(tree, _kernel_release(base, tree))
+        say(f"root: {len(ours)} files and folders of ours, {len(units)} units enabled")
+        _grow(root_place, ext4.bytes_needed(ours) + _SPARE_BYTES, epoch)
+        run(["tune2fs", "-L", card.ROOT_LABEL, root_place], env=ext4.clock(epoch))
+        ext4.fill(root_place, tree, epoch, before)
+        where = f"UUID={ext4.facts(root_place)['Filesystem UUID']}"
+        files = _boot_files(base, boot_place, work / "base-files")
+        front = boot.contents(board.name, _KERNEL, board.machine, files, first, where)
+        say("boot and data partition, image, block map and checksums")
+        card.finish(work / image.name, board.name, front, root_place, new, epoch)
+        manifest.write(
+            work / image.name,
+            beside(work / image.name, ".manifest.json"),
+            board=board.name,
+            checkout=checkout,
+            epoch=epoch,
+            packages=packages,
+            site=site,
+            names=card.NAMES,
+            units=units,
+            base=base,
+        )
+
+
+def _take_apart(base: Path, work: Path, boot_place: Path, root_place: Path) -> None:
+    if not base.is_file():
+        raise DeployError(f"{base}: no such image")
+    whole = base
+    if base.suffix == ".xz":
+        whole = work / "base"
+        shutil.copy(base, work / "base.xz")
+        run(["xz", "-d", work / "base.xz"])
+    try:
+        found = partitions.table(whole)
+    except DeployError:
+        raise DeployError(f"{base}: no partition table of a Raspberry Pi OS image") from None
+    kinds = [part["type"] for part in found]
+    if kinds != [FAT32_LBA, LINUX]:
+        wants = f"{FAT32_LBA} and {LINUX}"
+        raise DeployError(f"{base}: partitions of type {', '.join(kinds)}; expected {wants}")
+    for part, place in zip(found, (boot_place, root_place), strict=True):
+        end = part["start"] + part["size"]
+        if end > whole.stat().st_size:
+            raise DeployError(f"{base}: cut at {whole.stat().st_size} of {end} bytes")
+        cut_out(whole, Range(part["start"], end), place)
+    if whole is not base:
+        whole.unlink()
+
+
+def _is_wanted(path: str) -> bool:
+    return path.startswith(_WANTED) or path in _WANTED_FILES
+
+
+def _check(base: Path, tree: Tree, board: Board) -> list[tuple[str, str, str]]:
+    """Refuses another system than the board's; gives the installed packages."""
+    if _OS_RELEASE not in tree or _STATUS not in tree:
+        raise DeployError(f"{base}: no /{_OS_RELEASE} and /{_STATUS} in it")
+    lines = tree.read(_OS_RELEASE).decode("utf-8", "replace").splitlines()
+    says = {key: value.strip('"') for key, _, value in (line.partition("=") for line in lines)}
+    codename = says.get("VERSION_CODENAME", "")
+    if codename != board.suite:
+        raise DeployError(f"{base}: of '{codename}'; expected '{board.suite}'")
+    packages = manifest.packages_of(tree)
+    architectures = {row[2] for row in packages if row[0] == "base-files"}
+    if architectures != {board.architecture}:
+        found = ", ".join(architectures) or "no package base-files"
+        raise DeployError(f"{base}: for {found}; expected {board.architecture}")
+    missing = sorted(set(board.package_names) - {row[0] for row in packages})
+    if missing:
+        raise DeployError(f"{base}: install there first: {' '.join(missing)}")
+    return packages
+
+
+def _kernel_release(base: Path, tree: Tree) -> str:
+    names = {path.split("/")[3] for path, _ in tree.below("usr/lib/modules")}
+    found = sorted(name for name in names if name.endswith(_KERNEL_SUFFIX))
+    if len(found) != 1:
+        there = ", ".join(sorted(names)) or "none"
+        raise DeployError(f"{base}: one kernel *{_KERNEL_SUFFIX} expected, there: {there}")
+    return found[0]
+
+
+def _grow(place: Path, needed: int, epoch: int) -> None:
+    facts = ext4.facts(place)
+    free = int(facts["Free blocks"]) * int(facts["Block size"])
+    if free < needed:
+        with open(place, "r+b") as file:
+            file.truncate(partitions.align(place.stat().st_size + needed - free))
+        run(["resize2fs", place], env=ext4.clock(epoch))
+
+
+def _boot_files(base: Path, place: Path, folder: Path) -> Tree:
+    folder.mkdir()
+    run(["mcopy", "-s", "-n", "-i", place, "::*", folder])
+    tree = Tree()
+    tree.take(folder, release.folder_files(folder))
+    for path, _ in list(tree.items()):
+        if any(Path(path).match(pattern) for pattern in _NOT_TAKEN):
+            tree.remove(path)
+    if _KERNEL not in tree:
+        raise DeployError(f"{base}: no {_KERNEL} on its boot partition")
+    return tree
