@@ -54,10 +54,16 @@ def most_battery(build: Build, required_g: float = 0.0) -> Part:
         raise HardwareError(
             f"the margin of build {build.name!r} leaves {mass:.1f} g for the cell; allowed: above 0"
         )
-    factor = mass / cell.mass_g
+    return cell_of(build, cell.capacity_mAh * mass / cell.mass_g)
+
+
+def cell_of(build: Build, capacity_mAh: float) -> Part:
+    """A cell of the payload's kind with another capacity: mass and rating go with it."""
+    cell = payload_cell(build)
+    factor = capacity_mAh / cell.capacity_mAh
     return replace(
-        cell, mass_g=mass, spread_g=cell.spread_g * factor,
-        capacity_mAh=cell.capacity_mAh * factor, max_discharge_A=cell.max_discharge_A * factor,
+        cell, mass_g=cell.mass_g * factor, spread_g=cell.spread_g * factor,
+        capacity_mAh=capacity_mAh, max_discharge_A=cell.max_discharge_A * factor,
     )  # fmt: skip
 
 

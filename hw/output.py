@@ -1,0 +1,33 @@
+"""Files of this room, written beside and renamed, so that a killed program leaves the old whole."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hw.errors import HardwareError
+
+
+def write(path: Path, produce: Callable[[Path], object]) -> None:
+    """Lets `produce` write beside `path` and renames; a disk's refusal is a `HardwareError`."""
+    part = path.with_name(f".{path.name}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        produce(part)
+        part.replace(path)
+    except OSError as error:
+        raise HardwareError(f"{path}: {error.strerror or error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes text in UTF-8."""
+    write(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Writes a document as JSON."""
+    write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
