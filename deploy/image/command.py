@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
-import shutil
 import sys
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.image import card, checkout, raspios
-from deploy.image.packages import build_rootfs, cache, fetch_wheels, load_board, unpack_kernel
-from deploy.image.packages.board import Board, with_archives
-from deploy.image.packages.python import byte_compile
-from deploy.image.sparse import sha256
+from deploy.image.packages import build_rootfs, fetch_wheels, load_board, unpack_kernel
+from deploy.image.packages.board import with_archives
+from deploy.image.packages.python import compiled
 
 _CHECKOUT = Path(__file__).parents[2]
 _BOARDS = ("qemu", "zero2w", "zerow")
@@ -108,29 +105,10 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
         site=site,
         machine=board.machine,
         python=board.python,
-        compile=partial(_compile, board, rootfs, cache_folder),
+        compile=lambda folder, at: compiled(board, rootfs, folder, at, cache_folder),
     )
     card.build(image, board.name, given, _CHECKOUT, epoch, say)
     say("done")
-
-
-def _compile(board: Board, rootfs: Path, cache_folder: Path, folder: Path, at: str) -> None:
-    """Byte code for a folder, from the cache where its sources are there: emulation is slow."""
-    sources = sorted(path.relative_to(folder) for path in folder.rglob("*.py"))
-    if not sources:
-        return
-    hashes = [f"{name} {sha256(folder / name)}" for name in sources]
-    key = cache.key(at, rootfs.name, *hashes)
-    target = cache_folder / f"bytecode-{board.name}-{key}"
-    with cache.made(target) as work:
-        if work is not None:
-            copy = work / target.name
-            shutil.copytree(folder, copy)
-            byte_compile(board, rootfs, copy, at)
-    for path in target.rglob("*.pyc"):
-        place = folder / path.relative_to(target)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, place)
 
 
 def _epoch(options: argparse.Namespace) -> int:

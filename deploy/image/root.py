@@ -75,7 +75,7 @@ def customise(tree: Tree, checkout: Path, board: str, release: Tree, epoch: int)
     return apply_presets(tree)
 
 
-def add_byte_code(tree: Tree, compile: Callable[[Path, str], None]) -> None:
+def add_byte_code(tree: Tree, compile: Callable[[Path, str], Path]) -> None:
     """Adds what `compile` puts beside the card's own Python: the root is read-only at boot."""
     for room in (f"{RELEASE}/site", f"{RELEASE}/pi_firmware", PROGRAMS):
         with tempfile.TemporaryDirectory(prefix="blimp-bytecode-") as work:
@@ -85,9 +85,9 @@ def add_byte_code(tree: Tree, compile: Callable[[Path, str], None]) -> None:
                     place = folder / path.removeprefix(f"{room}/")
                     place.parent.mkdir(parents=True, exist_ok=True)
                     place.write_bytes(entry.content.read())
-            compile(folder, f"/{room}")
-            for place in sorted(folder.rglob("*.pyc")):
-                tree.write(f"{room}/{place.relative_to(folder)}", place.read_bytes())
+            made = compile(folder, f"/{room}")
+            for place in sorted(made.rglob("*.pyc")):
+                tree.write(f"{room}/{place.relative_to(made)}", place.read_bytes())
 
 
 def _programs(tree: Tree, checkout: Path) -> None:
