@@ -48,8 +48,8 @@ class Ingredients:
         boot: a folder with what goes onto the boot partition: kernel, device trees, firmware.
         site: a folder of unpacked wheels; None: none are needed.
         machine, python: as `uname -m` says there, and as `3.13`.
-        compile: makes a copy of a folder, which will lie at a path on the card, with byte code
-            beside all Python; None: the card compiles at each start.
+        compile: puts byte code beside all Python in a folder, which will lie at a path on the card;
+            None: the card compiles at each start.
     """
 
     rootfs: Path
@@ -60,7 +60,7 @@ class Ingredients:
     site: Path | None
     machine: str
     python: str
-    compile: Callable[[Path, str], Path] | None = None
+    compile: Callable[[Path, str], None] | None = None
 
 
 class Identifiers:

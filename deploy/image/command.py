@@ -11,9 +11,14 @@ from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.image import card, checkout, raspios
-from deploy.image.packages import build_rootfs, fetch_wheels, load_board, unpack_kernel
-from deploy.image.packages.board import with_archives
-from deploy.image.packages.python import compiled
+from deploy.image.packages import (
+    build_rootfs,
+    byte_compile,
+    fetch_wheels,
+    load_board,
+    unpack_kernel,
+    with_archives,
+)
 
 _CHECKOUT = Path(__file__).parents[2]
 _BOARDS = ("qemu", "zero2w", "zerow")
@@ -105,7 +110,7 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
         site=site,
         machine=board.machine,
         python=board.python,
-        compile=lambda folder, at: compiled(board, rootfs, folder, at, cache_folder),
+        compile=lambda folder, at: byte_compile(board, rootfs, folder, at, cache_folder),
     )
     card.build(image, board.name, given, _CHECKOUT, epoch, say)
     say("done")

@@ -75,19 +75,18 @@ def customise(tree: Tree, checkout: Path, board: str, release: Tree, epoch: int)
     return apply_presets(tree)
 
 
-def add_byte_code(tree: Tree, compile: Callable[[Path, str], Path]) -> None:
+def add_byte_code(tree: Tree, compile: Callable[[Path, str], None]) -> None:
     """Adds what `compile` puts beside the card's own Python: the root is read-only at boot."""
-    for room in (f"{RELEASE}/site", f"{RELEASE}/pi_firmware", PROGRAMS):
-        with tempfile.TemporaryDirectory(prefix="blimp-bytecode-") as work:
-            folder = Path(work)
-            for path, entry in tree.below(room):
-                if entry.kind == "file" and path.endswith(".py"):
-                    place = folder / path.removeprefix(f"{room}/")
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    place.write_bytes(entry.content.read())
-            made = compile(folder, f"/{room}")
-            for place in sorted(made.rglob("*.pyc")):
-                tree.write(f"{room}/{place.relative_to(made)}", place.read_bytes())
+    with tempfile.TemporaryDirectory(prefix="blimp-bytecode-") as work:
+        folder = Path(work)
+        for path, entry in tree.below(OURS):
+            if entry.kind == "file" and path.endswith(".py"):
+                place = folder / path.removeprefix(f"{OURS}/")
+                place.parent.mkdir(parents=True, exist_ok=True)
+                place.write_bytes(entry.content.read())
+        compile(folder, f"/{OURS}")
+        for place in sorted(folder.rglob("*.pyc")):
+            tree.write(f"{OURS}/{place.relative_to(folder)}", place.read_bytes())
 
 
 def _programs(tree: Tree, checkout: Path) -> None:
