@@ -5,67 +5,80 @@ On a read-only root no byte code can be kept, so each start would compile the fi
 
 from __future__ import annotations
 
+import os
 import shutil
 import tarfile
+import tempfile
 from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.image.packages import cache
 from deploy.image.packages.board import Board
 from deploy.image.packages.foreign import interpreter
-from deploy.image.packages.tree import settle_times
 from deploy.run import run
-
-_HERE = Path(__file__).parent
 
 # Of a root file system, what Python needs to compile: itself and the libraries it is linked with.
 _LIBRARIES = ("ld-linux", "libc.so", "libm.so", "libz.so", "libexpat.so")
 
 
-def compiled(board: Board, rootfs: Path, tree: Path, installed_at: str, cache_folder: Path) -> Path:
-    """A copy of `tree` with byte code beside all its Python, of the kind that never looks there.
+def byte_compile(
+    board: Board, rootfs: Path, tree: Path, installed_at: str, cache_folder: Path | None = None
+) -> None:
+    """Puts byte code beside all Python in `tree`, of the kind that never looks at its source.
 
-    The same sources give the same bytes (PEP 552, unchecked hashes); times are fixed. Emulated it
-    takes about half a second a file, so it is done once for a content.
+    The same sources give the same bytes (PEP 552, unchecked hashes). Emulated, a file takes about
+    half a second; with a cache, only those do whose content or place is new.
 
     Args:
         board: whose.
         rootfs: its root file system's tar, which brings the Python.
-        tree: a folder of Python; what of it is no `__pycache__` is copied.
+        tree: a folder of Python.
         installed_at: where the folder will lie on the card, which tracebacks then name.
-        cache_folder: where copies are kept, as `compiled-BOARD-KEY/`.
+        cache_folder: where byte code is kept, in `bytecode/`.
 
     Raises:
-        DeployError: the tar has no such Python, the emulator is missing, or a file has an error;
-            nothing half-made is left.
+        DeployError: the tar has no such Python, the emulator is missing, or a file has an error.
     """
-    files = sorted(path for path in tree.rglob("*") if path.is_file() and path.suffix != ".pyc")
-    content = [(path.relative_to(tree).as_posix(), path) for path in files]
-    inputs = (board.architecture, board.python, installed_at, content, _HERE / "python.py")
-    target = cache_folder / f"compiled-{board.name}-{cache.key(*inputs)}"
-    with cache.made(target) as work:
-        if work is not None:
-            copy = work / target.name
-            shutil.copytree(tree, copy, ignore=shutil.ignore_patterns("__pycache__"))
-            _compile(board, rootfs, copy, installed_at, work / "python")
-            settle_times(copy)
-    return target
+    # `cpython-313`: PEP 3147's name of the interpreter that reads it.
+    ending = f".cpython-{board.python.replace('.', '')}.pyc"
+    wanted = {}
+    for source in sorted(tree.rglob("*.py")):
+        target = source.parent / "__pycache__" / (source.stem + ending)
+        target.parent.mkdir(exist_ok=True)
+        place = f"{installed_at}/{source.relative_to(tree)}"
+        inputs = (board.architecture, board.python, place, source)
+        kept = (cache_folder or tree) / "bytecode" / cache.key(*inputs)
+        if cache_folder is not None and kept.is_file():
+            shutil.copyfile(kept, target)
+        else:
+            wanted[source] = (target, kept)
+    if wanted:
+        _compile(board, rootfs, tree, list(wanted), installed_at)
+    for target, kept in wanted.values():
+        if cache_folder is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            part = kept.with_suffix(f".{os.getpid()}")
+            shutil.copyfile(target, part)
+            part.replace(kept)
 
 
-def _compile(board: Board, rootfs: Path, tree: Path, installed_at: str, root: Path) -> None:
-    _take(board, rootfs, root)
-    python = root / f"usr/bin/python{board.python}"
-    if not python.is_file():
-        raise DeployError(f"{rootfs}: has no /usr/bin/python{board.python}")
-    words: list[str | Path] = [
-        *(interpreter(board.architecture), "-L", root, python, "-I", "-S", "-m", "compileall"),
-        *("-q", "-f", "--invalidation-mode", "unchecked-hash"),
-        *("-s", tree.absolute(), "-p", installed_at, tree.absolute()),
-    ]
-    try:
-        run(words, env={"PYTHONHASHSEED": "0"})
-    except DeployError as error:
-        raise DeployError(f"byte code of {tree} for Python {board.python}: {error}") from None
+def _compile(board: Board, rootfs: Path, tree: Path, files: list[Path], installed_at: str) -> None:
+    with tempfile.TemporaryDirectory(prefix="blimp-python-") as folder:
+        root = Path(folder)
+        _take(board, rootfs, root)
+        python = root / f"usr/bin/python{board.python}"
+        if not python.is_file():
+            raise DeployError(f"{rootfs}: has no /usr/bin/python{board.python}")
+        words: list[str | Path] = [
+            *(interpreter(board.architecture), "-L", root, python, "-I", "-S", "-m", "compileall"),
+            *("-q", "-f", "--invalidation-mode", "unchecked-hash", "-i", "-"),
+            *("-s", tree.absolute(), "-p", installed_at),
+        ]
+        names = "".join(f"{path.absolute()}\n" for path in files)
+        try:
+            run(words, env={"PYTHONHASHSEED": "0"}, input=names.encode())
+        except DeployError as error:
+            raise DeployError(f"byte code for Python {board.python}: {error}") from None
 
 
 def _take(board: Board, rootfs: Path, root: Path) -> None:
