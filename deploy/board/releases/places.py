@@ -27,6 +27,7 @@ class Places:
     def __init__(self, root: str | Path = "/") -> None:
         root = Path(root)
         self.factory = root / "usr/lib/blimp/release"
+        self.board = root / "usr/share/blimp/board.json"
         self.releases = root / "data/releases"
         self.trial = self.releases / "trial.json"
         self.last = self.releases / "last.json"

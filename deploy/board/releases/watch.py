@@ -89,6 +89,7 @@ def status(at: Places) -> dict[str, Any]:
     trial = choose.read_trial(at)
     return {
         "schema": "blimp.releases/1",
+        "board": str((places.read(at.board) or {}).get("board", "")),
         "in_force": {"name": current, **release._asdict()},
         "factory": manifest.load_release(at.factory)._asdict(),
         "running": places.read(at.running),

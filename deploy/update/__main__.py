@@ -1,0 +1,123 @@
+"""`python -m deploy.update --payload NAME`: this checkout's firmware onto a payload's card."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from deploy.board.releases import manifest
+from deploy.errors import DeployError
+from deploy.flash.progress import Progress
+from deploy.image.packages import fetch_wheels, load_board
+from deploy.update import bundle as bundles
+from deploy.update.card import Card, is_healthy
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+_CACHE = CHECKOUT / "out/cache/image"  # where the image builder keeps them, too
+_EXAMPLE = """example:
+  python -m deploy.update --payload blimp-1 --host 192.168.4.20
+
+The exit status is 0 when the new release is in force, 1 when the payload went back to the one
+before (the reason is told), 2 when nothing was changed or it is not known."""
+_NAME = re.compile(r"[a-z0-9_-]{1,32}", re.ASCII)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m deploy.update",
+        description="Sends this checkout's firmware to a payload, which goes back by itself when no"
+        " frames come of it within two minutes.",
+        epilog=_EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--payload", required=True, metavar="NAME", help="the payload's id")
+    parser.add_argument("--host", help="its address (default: its id as a name in the network)")
+    parser.add_argument("--port", type=int, default=22, help="of its sshd (default: 22)")
+    parser.add_argument(
+        "--keys", type=Path, metavar="DIR", help="the folder of `blimp keys` (default: its own)"
+    )
+    parser.add_argument(
+        "--identity", type=Path, metavar="FILE", help="the pilot's SSH key (default: SSH's own)"
+    )
+    parser.add_argument(
+        "--site", type=Path, metavar="DIR", help="unpacked wheels (default: those of the lock)"
+    )
+    parser.add_argument(
+        "--allow-older", action="store_true", help="may replace the newer version that runs now"
+    )
+    return parser
+
+
+def main() -> int:
+    """Status 0, 1 or 2 as the help says."""
+    try:
+        return _update(_parser().parse_args())
+    except DeployError as error:
+        print(f"update: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("update: stopped; the card decides by itself", file=sys.stderr)
+        return 2
+
+
+def _update(given: argparse.Namespace) -> int:
+    if not _NAME.fullmatch(given.payload):
+        raise DeployError(f"--payload is {given.payload[:60]!r}; allowed: 1 to 32 of a-z 0-9 - _")
+    host = given.host or given.payload
+    if host.startswith("-"):
+        raise DeployError(f"--host is {host!r}, which is no address")
+    if not 1 <= given.port <= 65_535:
+        raise DeployError(f"--port is {given.port}; allowed: 1 to 65535")
+    for option, path in (("identity", given.identity), ("site", given.site)):
+        if path is not None and not path.exists():
+            raise DeployError(f"--{option} {path}: not there")
+    key = _release_key(given.keys)
+    card = Card(given.payload, host, key.parents[1], given.identity, given.port)
+    state = card.ask("status")
+    try:
+        factory = manifest.Release(**state["factory"])
+        running, board = str(state["in_force"]["version"]), str(state["board"])
+    except (KeyError, TypeError):
+        raise DeployError(f"{host}: tells its releases otherwise than this checkout") from None
+    _say(f"{given.payload} ({board or 'an unknown board'}) runs {running}")
+    site = given.site or fetch_wheels(load_board(board), _CACHE)
+    files = bundles.release_of(CHECKOUT, site, factory.machine, factory.python)
+    made = bundles.make(files, key, running if given.allow_older else "")
+    held = {str(path): str(sha256) for path, sha256 in card.ask("holds").items()}
+    size = bundles.size_to_send(made, held)
+    version = made.listed.release.version
+    with Progress(f"sending {version}", size) as progress:
+        answer = card.give(made, held, progress.advance)
+    if not answer.get("id"):
+        _say(f"{version} is in force already")
+        return 0
+    _say(f"{version} is on the card and on trial: frames must come within two minutes")
+    last = card.follow(str(answer["id"]), _say)
+    if is_healthy(last):
+        _say(f"{version} is in force")
+        return 0
+    _say(f"{given.payload} went back to {last['previous'] or factory.version}: {last['reason']}")
+    return 1
+
+
+def _release_key(keys: Path | None) -> Path:
+    """The key that signs, made by `blimp keys` when this authority has none yet."""
+    folder = ["--folder", str(keys)] if keys else []
+    words = [sys.executable, "-m", "ground_station.cli", "keys", *folder, "release"]
+    done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise DeployError((done.stderr.strip() or "blimp keys failed").splitlines()[-1])
+    if done.stderr.strip():
+        _say(done.stderr.strip().splitlines()[-1])
+    return Path(done.stdout.strip().splitlines()[-1]).absolute()
+
+
+def _say(text: str) -> None:
+    print(f"update: {text}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
