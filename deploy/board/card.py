@@ -10,7 +10,7 @@ import pwd
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from deploy.board.disk import Owner, read_bounded
 from deploy.errors import DeployError
@@ -94,8 +94,7 @@ def writable(card: Card) -> Iterator[None]:
         run(["mount", "-o", "remount,ro", card.partition], timeout_s=60)
 
 
-@dataclass(frozen=True)
-class Owners:
+class Owners(NamedTuple):
     """Who owns what below /data/blimp: the firmware reads it and changes nothing there."""
 
     root: Owner = Owner()

@@ -22,8 +22,10 @@ class Owner(NamedTuple):
 class Disk:
     """A file system, or a folder of one in tests. Raises `OSError` as the system does."""
 
-    def write(self, path: Path, data: bytes, mode: int = 0o644, owner: Owner | None = None) -> None:
-        """A whole new file of that content; it is beside its final name until `rename`."""
+    def write(
+        self, path: Path, data: bytes, mode: int | None = None, owner: Owner | None = None
+    ) -> None:
+        """A whole file of that content. Without a mode, which a FAT has not, none is set."""
         self._step()
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
         descriptor = os.open(path, flags, 0o600)
@@ -117,7 +119,8 @@ def read_bounded(path: Path, most: int) -> bytes | None:
         return file.read(most + 1)
 
 
-def _own(descriptor: int, owner: Owner | None, mode: int) -> None:
+def _own(descriptor: int, owner: Owner | None, mode: int | None) -> None:
     if owner is not None and owner != Owner():
         os.fchown(descriptor, owner.uid, owner.gid)
-    os.fchmod(descriptor, mode)
+    if mode is not None:
+        os.fchmod(descriptor, mode)
