@@ -123,15 +123,21 @@ class Apt:
             "$(REPO_URI)\t$(ORIGIN)",
             "Created-By: Packages",
         ).splitlines()
-        origins = {tuple(line.split("\t", 1)) for line in lines}
+        origins: dict[str, set[str]] = {}
+        for line in lines:
+            uri, _, origin = line.partition("\t")
+            origins.setdefault(_same(uri), set()).add(origin)
         for archive in self._board.archives:
-            url = archive.url.rstrip("/")
-            for uri, origin in sorted(origins):
-                if uri.rstrip("/") == url and origin != archive.origin:
-                    raise DeployError(
-                        f"archive {archive.name}: its index calls itself {origin!r}, "
-                        f"{archive.origin!r} was expected"
-                    )
+            found = origins.get(_same(archive.url), set())
+            if not found:
+                raise DeployError(
+                    f"archive {archive.name}: has nothing for {self._board.architecture}"
+                )
+            for origin in sorted(found - {archive.origin}):
+                raise DeployError(
+                    f"archive {archive.name}: its index calls itself {origin!r}, "
+                    f"{archive.origin!r} was expected"
+                )
 
     def plan(self, names: Sequence[str]) -> list[Candidate]:
         """What installing `names` into an empty system would install, sorted by name."""
@@ -161,6 +167,11 @@ class Apt:
 
     def _run(self, *words: str, cwd: Path | None = None) -> str:
         return run(words, env={"APT_CONFIG": str(self._configuration)}, cwd=cwd).decode()
+
+
+def _same(url: str) -> str:
+    """A URL as apt writes it back."""
+    return re.sub(r"^(file|copy):/+", r"\1:/", url).rstrip("/")
 
 
 @contextmanager

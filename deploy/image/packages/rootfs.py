@@ -16,8 +16,8 @@ from deploy.image.packages.board import Board
 from deploy.image.packages.long import run_long
 
 _HERE = Path(__file__).parent
-# A change of these makes another tar.
-_MADE_BY = ("rootfs.py", "finish.sh", "bytecode.py", "apt.py")
+# Raised when this module makes another tar of the same inputs.
+_RECIPE = 1
 _STATUS = "./var/lib/dpkg/status"
 
 
@@ -48,7 +48,7 @@ def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
             package isn't there; nothing half-made is left. What the tools said then stands in
             `rootfs-BOARD.log` there.
     """
-    made_by = [_HERE / name for name in _MADE_BY]
+    made_by = (_RECIPE, _HERE / "finish.sh", _HERE / "bytecode.py")
     inputs = (board.architecture, board.suite, board.archives, board.packages, board.left_out)
     target = cache_folder / f"rootfs-{board.name}-{cache.key(*inputs, epoch, *made_by)}.tar"
     with cache.made(target) as work:
