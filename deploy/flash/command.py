@@ -102,7 +102,6 @@ def _run(options: argparse.Namespace) -> None:
     ):
         refusals.check_size(device, target.size, card.size)
         content = _content(options, None)
-        wishes.check_complete(content.provisioning)
         customise.check_room(card.boot, content)
         print(f"image: {card.path.name}{_of_board(card)}")
         _confirm(options, disk, target, "overwrite all of it")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.provisioning import GroundStation, Provisioning, Wifi, keeps_password
+from deploy.provisioning import GroundStation, Provisioning, Wifi
 from deploy.provisioning.model import OPEN, WPA2
 from deploy.provisioning.text import parse_wifi
 
@@ -95,12 +95,6 @@ def merge(
         ground_station=GroundStation(ground) if ground is not None else existing.ground_station,
         authorized_keys=existing.authorized_keys if ssh is None else ssh,
     )
-
-
-def check_complete(provisioning: Provisioning) -> None:
-    """Raises `DeployError` when a new card would lack the password, which it cannot keep."""
-    if keeps_password(provisioning):
-        raise DeployError("the Wi-Fi password is empty, and a new card holds none to keep")
 
 
 def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:

@@ -95,7 +95,7 @@ def sum_of(image: Path) -> None:
     image.with_name(image.name + ".sha256").write_text(f"{digest}  {image.name}\n")
 
 
-def make_image(path: Path, *, boot_mib: int = 8, root_mib: int = 24, label: str = "BLIMPBOOT",
+def make_image(path: Path, *, boot_mib: int = 8, root_mib: int = 8, label: str = "BLIMPBOOT",
                folder: bool = True, board: bool = True) -> None:  # fmt: skip
     """A card image as the builder's: FAT, ext4 with files, a gap, an empty ext4 for data."""
     work = path.parent / (path.name + ".work")

@@ -13,7 +13,7 @@ from card_bench import BOOT_OFFSET, GAP_MIB, MEBI, Bench, make_image, refused, r
 from deploy.provisioning import parse, wpa_supplicant_conf
 from deploy.provisioning.wpa import psk
 
-BOOT_MIB, ROOT_MIB = 8, 24
+BOOT_MIB, ROOT_MIB = 8, 8
 BOOT_END = BOOT_OFFSET + BOOT_MIB * MEBI
 GAP = slice(BOOT_END + ROOT_MIB * MEBI, BOOT_END + (ROOT_MIB + GAP_MIB) * MEBI)
 KEYS = ("ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key", "ssh_ed25519")
@@ -212,7 +212,7 @@ def test_no_wifi_is_said_and_no_password_is_on_a_command_line(bench: Bench) -> N
 def test_an_image_with_a_fat32_and_odd_names_works(bench: Bench) -> None:
     odd = bench.folder / "my card's @@1 $(x) ü.img"
     plain = bench.folder / "plain"  # mtools itself cannot take such a name
-    make_image(plain, boot_mib=40, root_mib=24)
+    make_image(plain, boot_mib=40)
     plain.rename(odd)
     words = [str(odd) if word == str(bench.image) else word for word in bench.command()]
     card = bench.folder / "-i @@ card.img"
