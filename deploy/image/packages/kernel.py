@@ -16,7 +16,8 @@ from deploy.image.packages import apt, cache
 from deploy.image.packages.board import Board, KernelChoice
 from deploy.run import run
 
-_HERE = Path(__file__).parent
+# Raised when this module makes something else of the same inputs.
+_RECIPE = 1
 _FACTS = "kernel.json"
 _VERSIONED = r"linux-image-\d[a-z0-9.+~-]*"
 
@@ -61,8 +62,7 @@ def unpack_kernel(board: Board, cache_folder: Path) -> Kernel:
     choice = board.kernel
     if choice is None:
         raise DeployError(f"board {board.name}: its kernel comes with its base image")
-    made_by = (_HERE / "kernel.py", _HERE / "apt.py")
-    name = cache.key(board.architecture, board.suite, board.archives, choice, *made_by)
+    name = cache.key(board.architecture, board.suite, board.archives, choice, _RECIPE)
     target = cache_folder / f"kernel-{board.name}-{name}"
     with cache.made(target) as work:
         if work is not None:

@@ -15,8 +15,9 @@ from deploy.image.packages.board import Board, Wheel
 from deploy.image.packages.tree import settle_times
 from deploy.run import run
 
-_HERE = Path(__file__).parent
-_LOCK = _HERE.parents[2] / "requirements.lock"
+# Raised when this module makes another folder of the same inputs.
+_RECIPE = 1
+_LOCK = Path(__file__).parents[3] / "requirements.lock"
 _START = re.compile(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==([^ ;\\]+)")
 _NETWORK_TRIES, _NETWORK_LIMIT_S = "3", "60"
 
@@ -43,7 +44,7 @@ def fetch_wheels(board: Board, cache_folder: Path, lock: Path = _LOCK) -> Path:
     """
     pinned = {wheel.name: requirement(lock, wheel.name) for wheel in board.wheels}
     inputs = (board.machine, board.python, board.platforms, board.wheels, pinned)
-    name = cache.key(*inputs, _HERE / "wheels.py", _HERE / "tree.py")
+    name = cache.key(*inputs, _RECIPE)
     target = cache_folder / f"site-{board.name}-{name}"
     with cache.made(target) as work:
         if work is None:
