@@ -23,6 +23,8 @@ from deploy.run import run
 BLOCK_BYTES = 4096
 _INODE_BYTES = 256
 _JOURNAL_MIB = 16
+# A name is bytes; Python's way to carry those that are no UTF-8 through a text.
+_NAMES = ("utf-8", "surrogateescape")
 
 # Named here and not in the machine's /etc/mke2fs.conf, so that every builder makes the same.
 _FEATURES = (
@@ -92,7 +94,8 @@ def fill(image: Path, tree: Tree, epoch: int, before: Tree | None = None) -> Non
     with tempfile.TemporaryDirectory(dir=image.parent, prefix=".fill-") as work:
         script = Path(work) / "script"
         commands = _Commands(tree, before or Tree(), Path(work), epoch)
-        script.write_text("\n".join([*commands.removals(), *commands.additions()]) + "\n")
+        lines = [*commands.removals(), *commands.additions()]
+        script.write_bytes("".join(f"{line}\n" for line in lines).encode(*_NAMES))
         debugfs(image, script, epoch)
     run(["e2fsck", "-fn", image], env=clock(epoch))
 

@@ -79,7 +79,8 @@ def _entries(folder: str, lines: Iterable[str]) -> Iterator[tuple[str, Entry]]:
 def _each(image: Path, work: Path, commands: list[str]) -> list[list[str]]:
     """What debugfs says to each command."""
     script = work / "questions"
-    script.write_text("".join(f"{command}\n" for command in commands))
+    lines = "".join(f"{command}\n" for command in commands)
+    script.write_bytes(lines.encode("utf-8", "surrogateescape"))
     said = run(["debugfs", "-f", script, image], merge=True).decode("utf-8", "surrogateescape")
     answers: list[list[str]] = []
     for line in said.splitlines():

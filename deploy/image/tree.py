@@ -89,6 +89,8 @@ class Tree:
                     tree._take(path, member)
         except (OSError, tarfile.TarError) as error:
             raise DeployError(f"{path}: no readable tar: {error}") from None
+        for name in list(tree._entries):
+            tree._above(name)
         return tree
 
     def _take(self, tar: Path, member: tarfile.TarInfo) -> None:
@@ -145,15 +147,20 @@ class Tree:
         place = self.resolve(path)
         if not place:
             raise DeployError(f"'{path}' names no file")
-        parent = place.rpartition("/")[0]
-        if parent and parent not in self._entries:
-            self.add(parent, Entry("folder", 0o755))
-        elif parent and self._entries[parent].kind != "folder":
-            raise DeployError(f"{path}: {parent} is no folder")
+        self._above(place)
         old = self._entries.get(place)
         if old is not None and old.kind == "folder" and entry.kind != "folder":
             raise DeployError(f"{path}: a folder is there already")
         self._entries[place] = entry
+
+    def _above(self, place: str) -> None:
+        """Makes the folders above a place that are not there."""
+        parent = place.rpartition("/")[0]
+        if parent and parent not in self._entries:
+            self._entries[parent] = Entry("folder", 0o755)
+            self._above(parent)
+        elif parent and self._entries[parent].kind != "folder":
+            raise DeployError(f"{place}: {parent} is no folder")
 
     def write(
         self, path: str, data: bytes | str, mode: int = 0o644, uid: int = 0, gid: int = 0

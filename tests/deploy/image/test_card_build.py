@@ -1,0 +1,373 @@
+"""A whole card from small ingredients, read back with the tools of others."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from card_parts import (
+    CAPABILITY,
+    EPOCH,
+    RELEASE,
+    ImageReader,
+    make_checkout,
+    make_ingredients,
+    missing_tools,
+)
+
+from deploy.errors import DeployError
+from deploy.image import card, sparse
+
+pytestmark = pytest.mark.skipif(
+    (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
+)
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    return make_checkout(tmp_path_factory.mktemp("checkout"))
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory, checkout):
+    folder = tmp_path_factory.mktemp("image")
+    place = folder / "out/blimp-qemu.img"
+    card.build(place, "qemu", make_ingredients(folder / "in"), checkout, EPOCH)
+    return place
+
+
+@pytest.fixture(scope="module")
+def reader(image, tmp_path_factory):
+    return ImageReader(image, tmp_path_factory.mktemp("parts"))
+
+
+def test_three_partitions_that_begin_at_whole_erase_units(image, reader):
+    parts = reader.table["partitions"]
+    assert [part["type"] for part in parts] == ["c", "83", "83"]
+    assert all(part["start"] * 512 % (4 << 20) == 0 for part in parts)
+    assert parts[0]["bootable"] and reader.table["label"] == "dos"
+    size = image.stat().st_size
+    assert size & (size - 1) == 0, "QEMU takes cards of a power of two"
+
+
+def test_file_systems_are_clean_and_named_as_fstab_and_the_kernel_line_name_them(reader):
+    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+    for part in (reader.root, reader.data):
+        subprocess.run([shutil.which("e2fsck", path=path), "-fn", part], check=True)
+    subprocess.run([shutil.which("fsck.vfat", path=path), "-n", reader.boot], check=True)
+    labels = {reader.facts(part)["Filesystem volume name"] for part in (reader.root, reader.data)}
+    assert labels == {"blimp-root", "blimp-data"}
+    assert reader.boot.read_bytes()[71:82] == b"BLIMPBOOT  "
+    mounted = {
+        line.split()[0] for line in reader.read("etc/fstab").splitlines() if line[:5] == "LABEL"
+    }
+    assert mounted == {"LABEL=blimp-data", "LABEL=BLIMPBOOT"}
+    assert f"root=UUID={reader.facts(reader.root)['Filesystem UUID']}" in reader.boot_text(
+        "cmdline.txt"
+    )
+    assert "has_journal" in reader.facts(reader.data)["Filesystem features"]
+    assert "has_journal" not in reader.facts(reader.root)["Filesystem features"]
+
+
+def test_the_boot_partition_has_what_the_first_stages_read(reader):
+    names = reader.boot_names()
+    assert {"vmlinuz", "bcm2837-rpi-3-b.dtb", "overlays/disable-bt.dtbo", "initrd.img"} <= names
+    assert {"config.txt", "cmdline.txt", "blimp/blimp-example.toml", "blimp/README.txt"} <= names
+    assert "blimp/blimp.toml" not in names, "nobody has provisioned it"
+    config = reader.boot_text("config.txt").splitlines()
+    for line in ("kernel=vmlinuz", "initramfs initrd.img followkernel", "camera_auto_detect=1",
+                 "dtparam=i2c_arm=on", "enable_uart=1", "dtoverlay=disable-bt",
+                 "dtparam=watchdog=on"):  # fmt: skip
+        assert line in config
+    words = reader.boot_text("cmdline.txt").split()
+    assert {"ro", "panic=10", "rootfstype=ext4"} <= set(words)
+    assert not any(word.startswith(("console=serial", "console=ttyAMA")) for word in words)
+
+
+def test_the_example_on_the_boot_partition_is_a_valid_provisioning(reader):
+    from deploy.provisioning import parse
+
+    text = reader.boot_text("blimp/blimp-example.toml")
+    assert parse(text.encode()).payload_id == "blimp-1"
+
+
+def test_owners_modes_times_and_capabilities_are_the_tars(reader):
+    assert reader.stat("usr/bin/ip")["mode"] == "04755"
+    assert reader.stat("tmp")["mode"] == "01777" and reader.stat("root")["mode"] == "0700"
+    odd = reader.stat("usr/share/über uns/a b.txt")
+    assert (odd["uid"], odd["gid"]) == ("1", "44")
+    assert reader.read("usr/share/über uns/a b.txt") == "übrig"
+    assert reader.stat("lib")["target"] == "usr/lib"
+    older, newer = reader.stat("usr/lib/os-release"), reader.stat("usr/bin/busybox")
+    assert older["mtime"].startswith(f"{1_700_000_000:#x}")
+    assert newer["mtime"].startswith(f"{EPOCH:#x}"), "nothing is younger than the epoch"
+    said = reader.debugfs('ea_get -x "/usr/bin/iw" security.capability')
+    assert CAPABILITY.hex() in said.replace(" ", "")
+
+
+def test_the_clock_of_a_board_without_one_starts_at_the_epoch(reader):
+    assert reader.stat("usr/lib/clock-epoch")["mtime"].startswith(f"{EPOCH:#x}")
+
+
+def test_firmware_wheels_programs_and_board_are_in_their_places(reader, checkout):
+    release = json.loads(reader.read("usr/lib/blimp/release/release.json"))
+    assert release["schema"] == "blimp.release/1" and release["machine"] == "aarch64"
+    assert release["version"].startswith("0.") and ".dirty" not in release["version"]
+    firmware = reader.read("usr/lib/blimp/release/pi_firmware/__main__.py")
+    assert firmware == (checkout / "pi_firmware/__main__.py").read_text()
+    assert reader.read("usr/lib/blimp/release/site/mcap/__init__.py") == "x = 1\n"
+    for name in ("__init__.py", "errors.py", "board/start.py", "provisioning/__init__.py"):
+        assert reader.exists(f"usr/lib/blimp/deploy/{name}")
+    for name in ("image", "flash", "board/root"):
+        assert not reader.exists(f"usr/lib/blimp/deploy/{name}")
+    assert json.loads(reader.read("usr/share/blimp/board.json"))["board"] == "qemu"
+    settings = (checkout / "deploy/board/payload/qemu.toml").read_text()
+    assert reader.read("usr/share/blimp/payload.toml") == settings
+    assert reader.stat("etc/sudoers.d/blimp")["mode"] == "0440"
+    assert reader.stat("data")["type"] == reader.stat("boot/firmware")["type"] == "directory"
+
+
+def test_no_account_has_a_password_or_an_empty_one(reader):
+    passwd = [line.split(":") for line in reader.read("etc/passwd").splitlines()]
+    shadow = {
+        row[0]: row for row in (line.split(":") for line in reader.read("etc/shadow").splitlines())
+    }
+    assert {row[0] for row in passwd} == set(shadow)
+    assert all(row[1] == "x" for row in passwd)
+    assert all(row[1] == "*" and row[2] == "" for row in shadow.values())
+    assert "$6$" not in reader.read("etc/shadow") + reader.read("etc/gshadow")
+    shadow_file = reader.stat("etc/shadow")
+    assert (shadow_file["mode"], shadow_file["uid"], shadow_file["gid"]) == ("0640", "0", "42")
+    numbers = {row[0]: (row[2], row[3]) for row in passwd}
+    assert numbers["blimp"] == ("901", "901") and numbers["pilot"] == ("1000", "1000")
+    assert "somebody" not in numbers, "a person of the base"
+    groups = {
+        row[0]: row[3]
+        for row in (line.split(":") for line in reader.read("etc/group").splitlines())
+    }
+    assert "blimp" in groups["video"] and "blimp" in groups["i2c"] and "blimp" in groups["dialout"]
+
+
+def test_what_is_of_one_machine_or_day_is_not_on_the_card(reader):
+    for path in ("etc/ssh/ssh_host_ed25519_key", "etc/passwd-", "var/log/dpkg.log", "dev/null",
+                 "var/cache/apt"):  # fmt: skip
+        assert not reader.exists(path), path
+
+
+def test_units_are_enabled_by_the_preset_alone(reader):
+    wants = "etc/systemd/system/multi-user.target.wants"
+    assert reader.stat(f"{wants}/blimp-payload.service")["target"] == (
+        "/usr/lib/systemd/system/blimp-payload.service"
+    )
+    assert reader.exists(f"{wants}/systemd-networkd.service")
+    assert reader.exists("etc/systemd/system/sockets.target.wants/systemd-networkd.socket")
+    assert reader.exists("etc/systemd/system/dbus-net.service")
+    assert not reader.exists(f"{wants}/other.service"), "another's preset comes after ours"
+    assert reader.stat("etc/systemd/system/getty@.service")["target"] == "/dev/null"
+
+
+@pytest.fixture(scope="module")
+def unpacked(reader, tmp_path_factory):
+    """The image's root as a folder, without owners."""
+    folder = tmp_path_factory.mktemp("root")
+    reader.debugfs(f"rdump / {folder}")
+    return folder
+
+
+def test_systemd_finds_no_fault_in_the_enabled_units(unpacked):
+    analyze = shutil.which("systemd-analyze")
+    if analyze is None:
+        pytest.skip("no systemd-analyze here")
+    system = unpacked / "usr/lib/systemd/system"
+    units = sorted(path.name for path in system.glob("blimp-*") if "@" not in path.name)
+    done = subprocess.run(
+        [analyze, "verify", f"--root={unpacked}", "--man=no", "--recursive-errors=no", *units],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert "blimp-payload.service" in units
+    assert done.returncode == 0, done.stderr
+
+
+def test_systemctl_would_enable_the_same(unpacked, tmp_path):
+    systemctl = shutil.which("systemctl")
+    if systemctl is None:
+        pytest.skip("no systemctl here")
+    root = tmp_path / "root"
+    shutil.copytree(unpacked, root, symlinks=True)
+
+    def links() -> dict[str, str]:
+        enabled = root / "etc/systemd/system"
+        return {
+            str(path.relative_to(enabled)): Path(str(path.readlink())).name
+            for path in sorted(enabled.rglob("*"))
+            if path.is_symlink()
+        }
+
+    ours = links()
+    done = subprocess.run(
+        [systemctl, f"--root={root}", "preset-all"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    # The default target, too, falls to `disable *`; ours stays.
+    assert links() | {"default.target": "multi-user.target"} == ours
+
+
+def test_the_initrd_loads_modules_in_the_order_of_their_dependencies(reader, tmp_path):
+    archive = tmp_path / "initrd"
+    reader._run("mcopy", "-n", "-i", str(reader.boot), "::initrd.img", str(archive))
+    listed = subprocess.run(
+        ["cpio", "-i", "--to-stdout", "--quiet", "modules/*", "init"],
+        input=gzip.decompress(archive.read_bytes()), capture_output=True, check=True,
+    ).stdout  # fmt: skip
+    names = subprocess.run(
+        ["cpio", "-t", "--quiet"],
+        input=gzip.decompress(archive.read_bytes()), capture_output=True, check=True, text=False,
+    ).stdout.decode().split()  # fmt: skip
+    modules = [name.partition("-")[2] for name in names if name.startswith("modules/")]
+    assert modules == ["crc32c_generic.ko", "crc16.ko", "jbd2.ko", "ext4.ko"]
+    assert f"ext4 of {RELEASE}".encode() in listed, "unpacked for insmod"
+    assert "init" in names and "bin/busybox" in names and "bin/switch_root" in names
+
+
+def test_manifest_checksum_and_block_map_are_of_this_image(image, reader):
+    digest = hashlib.sha256(image.read_bytes()).hexdigest()
+    assert card.beside(image, ".sha256").read_text() == f"{digest}  {image.name}\n"
+    document = json.loads(card.beside(image, ".manifest.json").read_text())
+    assert document["image"] == {"size": image.stat().st_size, "sha256": digest}
+    assert document["packages"] == [
+        {"name": "base-files", "version": "13.8", "architecture": "arm64"}
+    ]
+    assert {"name": "mcap", "version": "1.2.0"}.items() <= document["wheels"][0].items()
+    assert document["epoch"] == EPOCH and len(document["revision"]) == 40
+    assert "blimp-payload.service" in document["units"]
+    hashes = [hashlib.sha256(part.read_bytes()).hexdigest() for part in reader.parts]
+    assert [part["sha256"] for part in document["partitions"]] == hashes
+    assert all(document["tools"].values())
+
+
+def test_a_card_that_held_something_else_is_whole_after_its_mapped_blocks_are_written(
+    image, tmp_path
+):
+    used = tmp_path / "used-card"
+    used.write_bytes(b"\xa5" * image.stat().st_size)
+    bmap = card.beside(image, ".bmap")
+    subprocess.run(["bmaptool", "-q", "copy", "--bmap", bmap, image, used], check=True)
+    reader = ImageReader(used, tmp_path / "parts")
+    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+    for part in (reader.root, reader.data):
+        subprocess.run([shutil.which("e2fsck", path=path), "-fn", part], check=True)
+    subprocess.run([shutil.which("fsck.vfat", path=path), "-n", reader.boot], check=True)
+    journal = _journal(reader)
+    assert b"\xa5" * 16 not in journal, "an old journal would be played back after a power cut"
+
+
+def _journal(reader: ImageReader) -> bytes:
+    place = reader.data.with_name("journal")
+    reader.debugfs(f"dump <8> {place}", reader.data)
+    data = place.read_bytes()
+    assert len(data) >= 4 << 20
+    return data
+
+
+def test_the_image_is_stored_without_its_empty_parts(image):
+    assert image.stat().st_blocks * 512 < image.stat().st_size / 3
+
+
+def test_the_same_inputs_give_the_same_bytes(image, checkout, tmp_path):
+    again = tmp_path / "elsewhere/blimp-qemu.img"
+    umask = os.umask(0o077)
+    try:
+        given = make_ingredients(tmp_path / "in", reverse=True)
+        card.build(again, "qemu", given, checkout, EPOCH)
+    finally:
+        os.umask(umask)
+    assert sparse.sha256(again) == sparse.sha256(image)
+    for suffix in card.DESCRIPTIONS:
+        assert card.beside(again, suffix).read_text() == card.beside(image, suffix).read_text()
+
+
+def test_another_content_gives_another_card(image, reader, checkout, tmp_path):
+    given = make_ingredients(tmp_path / "in")
+    (tmp_path / "in/site/mcap/__init__.py").write_text("x = 2\n")
+    place = tmp_path / "blimp-qemu.img"
+    card.build(place, "qemu", given, checkout, EPOCH)
+    other = ImageReader(place, tmp_path / "parts")
+    assert other.table["id"] != reader.table["id"]
+    assert (
+        other.facts(other.root)["Filesystem UUID"] != reader.facts(reader.root)["Filesystem UUID"]
+    )
+
+
+def _break_tar(given, folder):
+    data = given.rootfs.read_bytes()
+    given.rootfs.write_bytes(data[: len(data) // 2])
+
+
+def _no_tar(given, folder):
+    given.rootfs.unlink()
+
+
+def _no_kernel(given, folder):
+    (given.boot / "vmlinuz").unlink()
+
+
+def _no_tables(given, folder):
+    (given.modules / f"usr/lib/modules/{RELEASE}/modules.dep").unlink()
+
+
+def _no_overlay(given, folder):
+    (given.modules / f"usr/lib/modules/{RELEASE}/modules.builtin").write_text("")
+
+
+def _fat_kernel(given, folder):
+    with open(given.boot / "vmlinuz", "wb") as file:
+        file.truncate(70 << 20)
+
+
+@pytest.mark.parametrize(
+    ("harm", "says"),
+    [
+        (_break_tar, "no readable tar"),
+        (_no_tar, "no readable tar"),
+        (_no_kernel, "no kernel 'vmlinuz'"),
+        (_no_tables, "no modules.dep"),
+        (_no_overlay, "no overlay, neither as a module nor built in"),
+        (_fat_kernel, r"BLIMPBOOT: contents need \d+ MiB and get 64 MiB"),
+    ],
+)
+def test_what_is_broken_or_too_big_is_one_line_and_the_old_image_stays(
+    harm, says, checkout, tmp_path
+):
+    place = tmp_path / "out/blimp-qemu.img"
+    place.parent.mkdir()
+    place.write_bytes(b"the old one")
+    given = make_ingredients(tmp_path / "in")
+    harm(given, tmp_path)
+    with pytest.raises(DeployError, match=says) as failure:
+        card.build(place, "qemu", given, checkout, EPOCH)
+    assert "\n" not in str(failure.value)
+    assert place.read_bytes() == b"the old one"
+    assert list(place.parent.iterdir()) == [place], "nothing half-made is left"
+
+
+def test_a_tool_that_fails_in_the_midst_leaves_nothing(checkout, tmp_path, monkeypatch):
+    place = tmp_path / "out/blimp-qemu.img"
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "bmaptool").write_text("#!/bin/sh\necho 'No space left on device' >&2\nexit 1\n")
+    (tools / "bmaptool").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
+    with pytest.raises(DeployError, match=r"^bmaptool: No space left on device$"):
+        card.build(place, "qemu", make_ingredients(tmp_path / "in"), checkout, EPOCH)
+    assert list(place.parent.iterdir()) == []
+
+
+def test_a_time_that_fat_cannot_tell_is_refused(checkout, tmp_path):
+    with pytest.raises(DeployError, match="--epoch 0: allowed: 315532800 to 4354819199"):
+        card.build(tmp_path / "x.img", "qemu", make_ingredients(tmp_path / "in"), checkout, 0)
