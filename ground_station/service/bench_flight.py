@@ -6,7 +6,6 @@ import contextlib
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ground_station.errors import GroundStationError
-from ground_station.stream import rtp
+from ground_station.stream import rtp, udp
 from ground_station.stream.counters import Counters
 from pi_firmware.wire import keys, sei
 from pi_firmware.wire.telemetry import open_session
@@ -27,7 +26,6 @@ RATE_HZ = 30.0
 _PAYLOAD_ID = "bench"
 _LIMIT_S = 600.0
 _COUNTERS = re.compile(r"frames: (\d+) captured, (\d+) gated, (\d+) sent")
-_BUFFER_BYTES = 4 << 20
 
 
 class FlightError(GroundStationError):
@@ -53,10 +51,7 @@ class Ground:
         self.arrivals: list[Arrival] = []
         self.messages = 0
         self._closing = threading.Event()
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        self._socket.bind(("127.0.0.1", 0))
-        self._socket.settimeout(0.1)
+        self._socket = udp.bind("127.0.0.1", 0, 0.1)
         self._thread = threading.Thread(target=self._receive, name="bench-video", daemon=True)
         self._session: Any = None
         self._telemetry = telemetry

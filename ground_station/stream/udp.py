@@ -7,7 +7,8 @@ import socket
 
 from pi_firmware.wire.errors import StreamError
 
-_BUFFER_BYTES = 4 << 20
+BUFFER_BYTES = 4 << 20
+"""What the receiver asks for: a second of video that a busy machine leaves waiting."""
 _SO_RCVBUFFORCE = 33  # Linux, not in Python's socket module
 
 
@@ -22,9 +23,9 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
     except OSError as error:
         raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
     try:
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         with contextlib.suppress(OSError):  # beyond the system's limit, where we may
-            receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
+            receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, BUFFER_BYTES)
         receiver.bind(address)
     except OSError as error:
         receiver.close()

@@ -28,6 +28,7 @@ from intake_stand import (
     stamped,
 )
 from mcap.reader import make_reader
+from mcap_doctor import complaints
 
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.recording.flight import trajectory_of
@@ -144,7 +145,7 @@ def test_a_recording_holds_all_that_was_said_on_the_grounds_clock(tmp_path: Path
 
 
 def test_others_open_it(tmp_path: Path) -> None:
-    """MCAP's own reader with CRCs checked, and Foxglove's message types."""
+    """`mcap doctor`, MCAP's own reader with CRCs checked, and Foxglove's message types."""
     made = recorder(tmp_path)
     made.start()
     for k in range(30):
@@ -152,6 +153,7 @@ def test_others_open_it(tmp_path: Path) -> None:
         made.estimate("blimp-1", estimate(k))
     made.close()
     (path,) = recorded(tmp_path)
+    assert complaints(path) == []
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -178,6 +180,7 @@ def test_each_payload_has_its_own_topics(tmp_path: Path) -> None:
             made.frame("blimp-1", frame(k), log_ns(k))
         made.estimate("blimp-1", estimate(k))
     made.close()
+    assert [complaints(path) for path in recorded(tmp_path)] == [[]]
     (path,) = recorded(tmp_path)
     reader = RecordingReader(path)
     assert sequences(path) == list(range(30))
@@ -195,6 +198,7 @@ def test_a_full_file_goes_on_in_the_next_and_no_stream_loses_a_frame(tmp_path: P
         made.frame("blimp-1", frame(k, 10_000), log_ns(k))
         made.frame("blimp-2", frame(k + 7, 2_000), log_ns(k))  # its IDRs come at other times
     made.close()
+    assert not any(complaints(path) for path in recorded(tmp_path))
     paths = recorded(tmp_path)
     assert len(paths) > 3 and made.dropped == 0
     both = (("", 0), ("/blimp-2", GOP))

@@ -22,6 +22,7 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from intake_stand import eventually, free_udp_port
 from mcap.reader import make_reader
+from mcap_doctor import complaints
 from payload_process import PayloadProcess
 from standing import STOP_S, Estimates, Process, Service, Viewer
 
@@ -126,7 +127,8 @@ def test_the_demo_from_its_start_to_a_trajectory_and_its_end(tmp_path: Path) -> 
 
 
 def is_whole(path: Path) -> None:
-    """MCAP's reader with CRCs checked, ours, and foxglove-sdk's."""
+    """For `mcap doctor`, MCAP's reader with CRCs checked, ours, and foxglove-sdk's."""
+    assert complaints(path) == []
     with path.open("rb") as file:
         mcap = make_reader(file, validate_crcs=True)
         summary = mcap.get_summary()

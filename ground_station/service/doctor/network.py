@@ -15,12 +15,11 @@ from ground_station.service.doctor import firewall, sockets
 from ground_station.service.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import HttpSettings, StationSettings
 from ground_station.service.web import access
+from ground_station.stream.udp import BUFFER_BYTES
 from pi_firmware.wire import scouting
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import check_endpoint
 
-_RECEIVE_BYTES = 4 << 20
-"""What the receiver asks for: a second of video that a busy machine leaves waiting."""
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _SCOUTING_GROUP, _SCOUTING_PORT = "224.0.0.224", 7446
 _COMMAND_S = 3.0
@@ -91,10 +90,10 @@ def _port(port: Port) -> Finding:
 def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:
     """A burst of video fits the socket while the receiver is not scheduled."""
     allowed = int(limit.read_text())
-    found = f"net.core.rmem_max is {allowed / 2**20:.1f} MiB, {_RECEIVE_BYTES >> 20} are asked for"
-    if allowed >= _RECEIVE_BYTES:
+    found = f"net.core.rmem_max is {allowed / 2**20:.1f} MiB, {BUFFER_BYTES >> 20} are asked for"
+    if allowed >= BUFFER_BYTES:
         return ok("receive buffer", found)
-    line = f"net.core.rmem_max={_RECEIVE_BYTES}"
+    line = f"net.core.rmem_max={BUFFER_BYTES}"
     mend = f"echo {line} | sudo tee /etc/sysctl.d/60-blimp.conf && sudo sysctl -w {line}"
     return warning("receive buffer", f"{found}: bursts are lost when the machine is busy", mend)
 
