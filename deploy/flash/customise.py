@@ -60,13 +60,22 @@ def check_room(boot: BootPartition, content: Content) -> None:
 def customise(target: Target, boot: BootPartition, content: Content) -> list[str]:
     """Writes what differs and compares all of it with what reads back; gives what was written.
 
-    Raises `DeployError` with one line; `blimp.toml` is then not there.
+    Raises `DeployError` with one line; `blimp.toml` is then not there, or not as it was asked for.
     """
-    files = content.files()
+    try:
+        return _customise(target, boot, content.files(), content.certificates is not None)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DeployError(f"{boot.shown}: write error: {reason}: set it up again") from None
+
+
+def _customise(
+    target: Target, boot: BootPartition, files: dict[str, bytes], all_certificates: bool
+) -> list[str]:
     present = set(boot.files(FOLDER))
     changed = [p for p, data in files.items() if p not in present or boot.read(p) != data]
     stale = [p for p in present if p.startswith(CERTIFICATES + "/") and p not in files]
-    stale = stale if content.certificates is not None else []
+    stale = stale if all_certificates else []
     if changed or stale:
         if TOML in present:
             boot.remove(TOML)
@@ -75,7 +84,7 @@ def customise(target: Target, boot: BootPartition, content: Content) -> list[str
             changed.append(TOML)
         for path in stale:
             boot.remove(path)
-        if content.certificates is not None and CERTIFICATES not in present:
+        if all_certificates and CERTIFICATES not in present:
             boot.make_folder(CERTIFICATES)
         for path in changed:
             if path == TOML:
