@@ -8,9 +8,10 @@ import subprocess
 import time
 from pathlib import Path
 
-from ground_station.service.doctor import network, sockets
+from ground_station.service.doctor import ROOT, network, sockets, versions
 from ground_station.service.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import StationSettings
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire.errors import TelemetryError
 
 UNIT = "blimp-station.service"
@@ -56,7 +57,7 @@ def judge_unit(state: dict[str, str]) -> Finding:
 
 
 def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
-    """Who is heard within 2 s, and whether they speak this program's messages.
+    """Who is heard within 2 s, whether they speak this program's messages, and which version.
 
     Where a port is held, nobody is asked: the service itself is listening then.
     """
@@ -64,8 +65,6 @@ def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
     ports = [port for port in network.ports_of(settings) if port.setting == "telemetry.listen"]
     if any(sockets.refusal(socket.SOCK_STREAM, port.host, port.number) for port in ports):
         return ok("payloads", "not listened for: the telemetry port is held")
-    from ground_station.stream.telemetry import TelemetryListener
-
     try:
         with TelemetryListener(
             telemetry.listen, connect=telemetry.connect, certificates=telemetry.certificates
@@ -80,4 +79,21 @@ def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
     if other:
         found = f"{', '.join(other)}: messages of another version than this station's"
         return problem("payloads", found, "update payload and ground station to the same release")
-    return ok("payloads", f"{', '.join(heard)}: the same version of messages as here")
+    return judge_payloads(heard, ROOT)
+
+
+def judge_payloads(heard: dict[str, PayloadState | None], root: Path) -> Finding:
+    """The versions of those that are heard, beside the firmware at `root`."""
+    found, mend = [], []
+    for name, state in heard.items():
+        said = f"{name} runs {versions.told(state)}"
+        version = state.health.version if state is not None and state.health is not None else ""
+        if reason := versions.trouble(state):
+            said += f": {reason}"
+            mend.append(f"mend that and update {name} again")
+        if differs := versions.difference(version, root) if version else "":
+            said += f"; {differs}"
+            mend.append(f"make update PAYLOAD={name}, or leave it: both speak the same messages")
+        found.append(said)
+    told = "; ".join(found)
+    return warning("payloads", told, "; ".join(mend)) if mend else ok("payloads", told)
