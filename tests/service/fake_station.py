@@ -107,6 +107,9 @@ class Payload:
     sequence: int = 0
     map: str = "atrium"
     flies: bool = True
+    version: str = "0.0.0+git0123456789ab"
+    release: str = "update"
+    release_reason: str = ""
 
 
 @dataclass
@@ -248,6 +251,9 @@ class FakeStation:
                 "disk_free_MB": 9_120.0,
                 "recording": one.recording,
                 "recording_MB": 12.0,
+                "version": one.version,
+                "release": one.release,
+                "release_reason": one.release_reason,
             },
             "autopilot": {"connected": True, "armed": False, "battery_percentage": 0.66},
             "recording": one.recording,

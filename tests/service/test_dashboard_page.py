@@ -272,6 +272,27 @@ def test_states_are_said_in_words_and_old_values_are_not_shown_as_current(
     shown.page.wait_for_selector("#battery:not([data-stale])")
 
 
+def test_the_payloads_firmware_is_told_and_marked_when_an_update_did_not_stay(
+    shown: Watched, station: FakeStation
+) -> None:
+    one, place = station.payloads["blimp-1"], "#board [data-f=version]"
+
+    def says(text: str, title: str, *, bad: bool) -> None:
+        shown.until(f"document.querySelector('{place}').title === {title!r}")
+        assert shown.text(place) == text
+        assert shown.page.locator(f"{place}[data-bad]").count() == bad
+
+    says(one.version, one.version, bad=False)
+    one.release, one.release_reason = "fell back", "0.0.1+gitnew: no frames <b>within</b> 120 s"
+    says(f"fell back to {one.version}", f"{one.version}: {one.release_reason}", bad=True)
+    one.version, one.release, one.release_reason = "0.9.0", "factory", ""
+    says("0.9.0", "0.9.0: the ground station is 0.0.0", bad=True)
+    one.version = ""  # an older payload
+    shown.until(f"document.querySelector('{place}').textContent === '–'")
+    assert shown.page.locator(f"{place}[data-bad]").count() == 0
+    one.version, one.release = Payload(one.id).version, "update"
+
+
 def test_a_recording_starts_and_stops(shown: Watched, station: FakeStation) -> None:
     shown.page.click("#act-record")
     shown.page.wait_for_selector("#act-record[data-on]")

@@ -95,6 +95,10 @@ export class Board {
     const free = health?.disk_free_MB == null ? "" : `${size(health.disk_free_MB)} free`;
     setText(f.card, health?.recording ? `recording ${size(health.recording_MB)}` : free || UNKNOWN);
     setText(f.autopilot, autopilot(note?.autopilot));
+    const trouble = firmware(health, this.store.station.version);
+    setText(f.version, health?.version ? (health.release === "fell back" ? `fell back to ${health.version}` : health.version) : UNKNOWN);
+    setAttribute(f.version, "data-bad", trouble ? "" : null);
+    setAttribute(f.version, "title", trouble ? `${health?.version}: ${trouble}` : health?.version || null);
   }
 }
 
@@ -102,6 +106,13 @@ export class Board {
 const ALARMS = { low: "low", critical: "critical" };
 /** Of ROS `sensor_msgs/BatteryState`. @type {Record<number, string>} */
 const STATUS = { 1: "charging", 2: "discharging", 3: "not charging", 4: "full" };
+
+/** What is wrong with the firmware's version. @param {Record<string, any>|null|undefined} health @param {string|undefined} own */
+function firmware(health, own) {
+  if (!health?.version) return "";
+  if (health.release === "fell back") return health.release_reason || "an update did not stay";
+  return own && health.version.split(/[ +]/)[0] !== own ? `the ground station is ${own}` : "";
+}
 
 /** @param {number|null|undefined} age_s */
 function old(age_s) {
