@@ -12,7 +12,6 @@ from deploy.run import run
 
 LABEL = "BLIMPBOOT"
 FOLDER = "blimp"
-BOARD_FILE = "blimp/board.json"
 SECTOR_BYTES = 512
 _FAT_TYPES = {0x0B, 0x0C, 0x0E}
 _FREE = re.compile(rb"^\s*([\d ]+) bytes free", re.MULTILINE)

@@ -12,14 +12,15 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from deploy.errors import DeployError
 from deploy.flash import bmap
 from deploy.flash.bmap import CHUNK_BYTES, Stretch
-from deploy.flash.boot import BOARD_FILE, BootPartition
+from deploy.flash.boot import BootPartition
 from deploy.flash.progress import Progress
 
+MANIFEST_SCHEMA = "blimp.image/1"
 _SUM = re.compile(r"([0-9a-fA-F]{64})(?: [ *](.+))?", re.ASCII)
 
 
@@ -54,10 +55,11 @@ def opened(path: Path, *, checksum: bool, board: str = "") -> Iterator[Image]:
             file = _checked(path, source, stack, checksum)
             size = file.seek(0, os.SEEK_END)
             boot = BootPartition.find(file.fileno(), path.name)
-            found, version = _identity(path, boot)
+            manifest = _manifest(path)
+            found, version = (str(manifest.get(key, "")) for key in ("board", "version"))
             if board and found != board:
                 raise DeployError(
-                    f"{path}: an image for {found or 'a board that it does not tell'};"
+                    f"{path}: an image for {found or 'a board that no .manifest.json tells'};"
                     f" this card is to be for {board}"
                 )
             yield Image(path, file, size, _stretches(path, file, size), boot, found, version)
@@ -102,7 +104,7 @@ def _checksums(path: Path) -> dict[str, str]:
     Of a packed image either the file's own or its content's is there.
     """
     found = {}
-    for subject in dict.fromkeys((path, path.with_suffix("") if path.suffix == ".xz" else path)):
+    for subject in dict.fromkeys((path, _content_name(path))):
         for place in (subject.with_name(subject.name + ".sha256"), subject.with_suffix(".sha256")):
             try:
                 lines = place.read_text(errors="replace").splitlines()
@@ -153,7 +155,7 @@ def _unpack(path: Path, source: BinaryIO, content: BinaryIO, progress: Progress)
 
 def _stretches(path: Path, file: BinaryIO, size: int) -> list[Stretch]:
     """What must be written: what the map beside the image says, or all of it."""
-    stem = path.with_suffix("") if path.suffix == ".xz" else path
+    stem = _content_name(path)
     for place in (stem.with_name(stem.name + ".bmap"), stem.with_suffix(".bmap")):
         if place.is_file():
             stretches = bmap.read(place, size)
@@ -166,11 +168,20 @@ def _stretches(path: Path, file: BinaryIO, size: int) -> list[Stretch]:
     return [Stretch(0, size)]
 
 
-def _identity(path: Path, boot: BootPartition) -> tuple[str, str]:
-    """The board and the version that the image names, "" where it does not."""
+def _manifest(path: Path) -> dict[str, Any]:
+    """The builder's description beside an image; empty where there is none."""
+    place = _content_name(path).with_name(_content_name(path).name + ".manifest.json")
     try:
-        document = json.loads(boot.read(BOARD_FILE)) if boot.has(BOARD_FILE) else {}
-        board, version = str(document.get("board", "")), str(document.get("image", ""))
-    except (ValueError, AttributeError, RecursionError):
-        raise DeployError(f"{path}: its {BOARD_FILE} is damaged") from None
-    return board, version
+        document = json.loads(place.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict) or document.get("schema") != MANIFEST_SCHEMA:
+        raise DeployError(f"{place}: not of schema {MANIFEST_SCHEMA}")
+    return document
+
+
+def _content_name(path: Path) -> Path:
+    """Where the unpacked image would lie."""
+    return path.with_suffix("") if path.suffix == ".xz" else path

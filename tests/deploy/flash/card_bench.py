@@ -96,7 +96,7 @@ def sum_of(image: Path) -> None:
 
 
 def make_image(path: Path, *, boot_mib: int = 8, root_mib: int = 8, label: str = "BLIMPBOOT",
-               folder: bool = True, board: bool = True) -> None:  # fmt: skip
+               folder: bool = True) -> None:  # fmt: skip
     """A card image as the builder's: FAT, ext4 with files, a gap, an empty ext4 for data."""
     work = path.parent / (path.name + ".work")
     work.mkdir()
@@ -121,9 +121,6 @@ def make_image(path: Path, *, boot_mib: int = 8, root_mib: int = 8, label: str =
         tool("mcopy", "-i", str(boot), "-", f"::/{name}", input=data)
     if folder:
         tool("mmd", "-i", str(boot), "::/blimp")
-    if folder and board:
-        text = b'{"board": "zero2w", "image": "0.1.0+gitabcdef"}\n'
-        tool("mcopy", "-i", str(boot), "-", "::/blimp/board.json", input=text)
     tree = work / "tree"
     tree.mkdir()
     # What is not all the same byte, so that a block in the wrong place is seen.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 from pathlib import Path
 
@@ -19,6 +20,8 @@ def shared_image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_image(image)
     tool("bmaptool", "create", "-o", f"{image}.bmap", str(image))
     sum_of(image)
+    manifest = {"schema": "blimp.image/1", "board": "zero2w", "version": "0.1.0+gitabcdef"}
+    Path(f"{image}.manifest.json").write_text(json.dumps(manifest))
     return image
 
 
@@ -40,7 +43,7 @@ def bench(tmp_path: Path, shared_image: Path, shared_keys: Path) -> Bench:
     """A bench of the test's own; the card holds another card's remains."""
     image = tmp_path / shared_image.name
     tool("cp", "--sparse=auto", str(shared_image), str(image))
-    for suffix in (".bmap", ".sha256"):
+    for suffix in (".bmap", ".sha256", ".manifest.json"):
         shutil.copy(f"{shared_image}{suffix}", f"{image}{suffix}")
     card = tmp_path / "card"
     card.write_bytes(hashlib.shake_256(b"old").digest(MEBI) * (image.stat().st_size // MEBI + 3))

@@ -46,6 +46,10 @@ def test_a_card_that_is_too_small(untouched: Bench) -> None:
 
 def test_an_image_that_is_not_ours_or_for_another_board(untouched: Bench) -> None:
     refused(untouched.command("--board", "zerow"), "an image for zero2w; this card is to be for")
+    manifest = Path(f"{untouched.image}.manifest.json")
+    manifest.write_text('{"schema": "blimp.image/9"}')
+    refused(untouched.command(), "not of schema blimp.image/1")
+    manifest.unlink()
     other = untouched.folder / "other.img"
 
     def words() -> list[str]:
@@ -56,8 +60,8 @@ def test_an_image_that_is_not_ours_or_for_another_board(untouched: Bench) -> Non
     refused(words(), "its boot partition is not BLIMPBOOT")
     make_image(other, folder=False)
     refused(words(), "has no folder 'blimp'")
-    make_image(other, board=False)
-    refused([*words(), "--board", "zerow"], "an image for a board that it does not tell")
+    make_image(other)
+    refused([*words(), "--board", "zerow"], "an image for a board that no .manifest.json tells")
     other.write_bytes(b"\0" * 5 * MEBI)
     refused(words(), "not a card image")
     other.write_bytes(b"")
