@@ -149,7 +149,10 @@ class Apt:
         """The package itself, or the one dependency of it whose name matches `pattern` whole."""
         if re.fullmatch(pattern, name):
             return name
-        text = self._run("apt-cache", "depends", "--important", name)
+        try:
+            text = self._run("apt-cache", "depends", "--important", name)
+        except DeployError as error:
+            raise DeployError(f"package {name}: {error}") from None
         found = sorted(set(re.findall(rf"Depends: ({pattern})$", text, re.MULTILINE)))
         if len(found) != 1:
             raise DeployError(f"package {name}: depends on {len(found)} packages like {pattern!r}")

@@ -1,0 +1,238 @@
+"""A root file system is built once, whole or not at all, and holds nothing of its builder's.
+
+mmdebstrap's own minutes are not spent here: a stand-in of a few lines takes its place, which writes
+down how it was called. What it would have built is checked by the slow build (`make image`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from deploy.errors import DeployError
+from deploy.image.packages import Package, build_rootfs, installed_packages, load_board
+from deploy.image.packages.board import Board
+from deploy.run import run
+from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
+
+_ROOT = Path(__file__).parents[3]
+_EPOCH = 1_767_225_600
+_STAND_IN = f"""#!{sys.executable}
+import json, os, pathlib, sys, time
+called = pathlib.Path(os.environ["CALLED"])
+inputs = {{pathlib.Path(word).name: pathlib.Path(word).read_text() for word in sys.argv[1:]
+          if word.endswith(".sources")}}
+calls = json.loads(called.read_text()) if called.exists() else []
+keys = ("SOURCE_DATE_EPOCH", "TMPDIR", "PYTHONHASHSEED", "PYTHONPATH")
+calls.append([sys.argv[1:], {{key: os.environ.get(key) for key in keys}}, inputs])
+(pathlib.Path(os.environ["TMPDIR"]) / "half").mkdir()
+print("I: installing essential packages...", flush=True)
+called.write_text(json.dumps(calls))
+time.sleep(float(os.environ.get("TAKES_S", "0")))
+if "FAILS" in os.environ:
+    print("E: dpkg: it broke", flush=True)
+    print("I: cleaning up", flush=True)
+    sys.exit(25)
+pathlib.Path(sys.argv[-2]).write_bytes(b"TAR")
+"""
+
+
+@pytest.fixture(scope="module")
+def native(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Board]:
+    """A board of this machine's own architecture, with one package in a signed archive."""
+    need_tools(*TOOLS, "dpkg")
+    architecture = run(["dpkg", "--print-architecture"]).decode().strip()
+    folder = tmp_path_factory.mktemp("archive")
+    with new_key(folder, "debian") as key:
+        archive = LocalArchive(folder / "debian", "Debian", architecture)
+        archive.add("tool", "1.0")
+        archive.publish(key)
+        board = load_board("qemu")
+        yield dataclasses.replace(
+            board,
+            architecture=architecture,
+            archives=(archive.archive("debian", key),),
+            packages=(dataclasses.replace(board.packages[0], names=("tool",)),),
+        )
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stands in for mmdebstrap and for being root; the file that tells how it was called."""
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "mmdebstrap").write_text(_STAND_IN)
+    (tools / "mmdebstrap").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("CALLED", str(tmp_path / "calls.json"))
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    return tmp_path / "calls.json"
+
+
+def _left(cache: Path) -> list[str]:
+    return sorted(p.name for p in cache.iterdir() if p.suffix not in (".lock", ".log"))
+
+
+def test_it_is_built_once_for_its_inputs(native: Board, calls: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    tar = build_rootfs(native, cache, _EPOCH)
+    assert tar.read_bytes() == b"TAR" and _left(cache) == [tar.name]
+    assert build_rootfs(native, cache, _EPOCH) == tar
+    assert len(json.loads(calls.read_text())) == 1
+    # Another list, another time: another tar. The first one stays.
+    without = dataclasses.replace(native, left_out=())
+    others = {build_rootfs(without, cache, _EPOCH), build_rootfs(native, cache, _EPOCH + 1)}
+    assert len(others | {tar}) == 3 and len(_left(cache)) == 3
+
+
+def test_mmdebstrap_is_told_archives_packages_and_what_to_leave_out(
+    native: Board, calls: Path, tmp_path: Path
+) -> None:
+    build_rootfs(native, tmp_path / "cache", _EPOCH)
+    ((words, environment, inputs),) = json.loads(calls.read_text())
+    assert environment["SOURCE_DATE_EPOCH"] == str(_EPOCH)
+    assert Path(environment["TMPDIR"]).parent == tmp_path / "cache"
+    assert "--include=tool" in words and f"--architectures={native.architecture}" in words
+    assert '--aptopt=APT::Install-Recommends "false"' in words
+    rules = [word.removeprefix("--dpkgopt=") for word in words if word.startswith("--dpkgopt=")]
+    document = "path-exclude=/usr/share/doc/*"
+    licence = "path-include=/usr/share/doc/*/copyright"
+    # dpkg goes by the last rule that fits.
+    assert rules.index(document) < rules.index(licence)
+    (sources,) = inputs.values()
+    assert f"Signed-By: {native.archives[0].keyring}" in sources and "Trusted" not in sources
+
+
+def test_a_build_that_fails_is_one_line_and_leaves_its_log_only(
+    native: Board, calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FAILS", "1")
+    with pytest.raises(DeployError, match=r"^root file system of qemu: dpkg: it broke$"):
+        build_rootfs(native, tmp_path / "cache", _EPOCH)
+    assert _left(tmp_path / "cache") == []
+    assert "E: dpkg: it broke" in (tmp_path / "cache/rootfs-qemu.log").read_text()
+    monkeypatch.delenv("FAILS")
+    build_rootfs(native, tmp_path / "cache", _EPOCH)
+    assert len(_left(tmp_path / "cache")) == 1
+
+
+def test_a_package_that_is_nowhere_is_said_before_the_minutes(
+    native: Board, calls: Path, tmp_path: Path
+) -> None:
+    group = dataclasses.replace(native.packages[0], names=("tool", "gone"))
+    with pytest.raises(DeployError, match="gone"):
+        build_rootfs(dataclasses.replace(native, packages=(group,)), tmp_path / "cache", _EPOCH)
+    assert not calls.exists()
+
+
+def test_without_root_it_is_one_line(
+    native: Board, calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    with pytest.raises(DeployError, match="is built as root: sudo"):
+        build_rootfs(native, tmp_path / "cache", _EPOCH)
+    assert not calls.exists() and _left(tmp_path / "cache") == []
+
+
+def test_ctrl_c_leaves_nothing_half_made(native: Board, calls: Path, tmp_path: Path) -> None:
+    """A second process waits for the first one's tar meanwhile, and then makes it."""
+    place = {name: getattr(native.archives[0], name) for name in ("url", "keyring")}
+    program = (
+        "import dataclasses, os, sys\n"
+        "from pathlib import Path\n"
+        "from deploy.image.packages import build_rootfs, load_board, with_archives\n"
+        "os.geteuid = lambda: 0\n"
+        "board = load_board('qemu')\n"
+        "group = dataclasses.replace(board.packages[0], names=('tool',))\n"
+        f"board = dataclasses.replace(board, architecture={native.architecture!r},\n"
+        "    packages=(group,), archives=board.archives[:1])\n"
+        f"board = with_archives(board, {{'debian': {place!r}}})\n"
+        "board = dataclasses.replace(board, archives=(dataclasses.replace(\n"
+        "    board.archives[0], suites=('trixie',), components=('main',)),))\n"
+        "try:\n"
+        f"    print(build_rootfs(board, Path({str(tmp_path / 'cache')!r}), {_EPOCH}))\n"
+        "except KeyboardInterrupt:\n"
+        "    sys.exit(130)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(_ROOT), "TAKES_S": "60"}
+    first = subprocess.Popen([sys.executable, "-c", program], env=environment, cwd=_ROOT)
+    _until(lambda: calls.exists() and bool(calls.read_text()))
+    second = subprocess.Popen(
+        [sys.executable, "-c", program],
+        env={**environment, "TAKES_S": "0"},
+        cwd=_ROOT,
+        stdout=subprocess.PIPE,
+    )
+    first.send_signal(signal.SIGINT)
+    assert first.wait(60) == 130
+    out, _ = second.communicate(timeout=60)
+    assert second.returncode == 0
+    assert _left(tmp_path / "cache") == [Path(out.decode().strip()).name]
+
+
+def test_nothing_of_one_machine_s_own_goes_onto_all_cards(tmp_path: Path) -> None:
+    own = (
+        "etc/ssh/ssh_host_ed25519_key",
+        "etc/hostname",
+        "etc/resolv.conf",
+        "etc/shadow-",
+        "etc/apt/sources.list.d/0000board.sources",
+        "var/lib/systemd/random-seed",
+        "var/lib/dbus/machine-id",
+        "var/log/apt/history.log",
+        "var/cache/ldconfig/aux-cache",
+        "var/lib/apt/lists/index",
+        "var/lib/dpkg/status-old",
+        "tmp/x",
+    )
+    kept = ("etc/ssh/moduli", "etc/shadow", "var/lib/dpkg/status", "usr/share/doc/a/copyright")
+    root = tmp_path / "a root"
+    for name in (*own, *kept, "etc/machine-id", "run/x", "var/tmp/y"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text("of the builder")
+    script = _ROOT / "deploy/image/packages/finish.sh"
+    subprocess.run(["sh", str(script), str(root)], check=True)
+    assert [name for name in own if (root / name).exists()] == []
+    assert all((root / name).is_file() for name in kept)
+    assert (root / "etc/machine-id").read_bytes() == b""
+    assert (root / "var/log/apt").is_dir()
+
+
+def test_the_manifest_lists_what_is_installed(tmp_path: Path) -> None:
+    status = (
+        b"Package: zeta\nStatus: install ok installed\nArchitecture: all\nVersion: 1:2-3\n"
+        b"Description: words\n with: more\n\n"
+        b"Package: gone\nStatus: deinstall ok config-files\nArchitecture: arm64\nVersion: 1\n\n"
+        b"Package: alpha\nStatus: install ok installed\nArchitecture: arm64\nVersion: 4~rc1\n"
+    )
+    with tarfile.open(tmp_path / "root.tar", "w") as tar:
+        member = tarfile.TarInfo("./var/lib/dpkg/status")
+        member.size = len(status)
+        tar.addfile(member, io.BytesIO(status))
+    assert installed_packages(tmp_path / "root.tar") == [
+        Package("alpha", "4~rc1", "arm64"),
+        Package("zeta", "1:2-3", "all"),
+    ]
+    cut = (tmp_path / "root.tar").read_bytes()[:700]
+    (tmp_path / "cut.tar").write_bytes(cut)
+    with pytest.raises(DeployError, match=r"cut\.tar: no root file system"):
+        installed_packages(tmp_path / "cut.tar")
+
+
+def _until(condition: object, limit_s: float = 60.0) -> None:
+    assert callable(condition)
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s, "waited in vain"
+        time.sleep(0.05)
