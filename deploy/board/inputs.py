@@ -54,6 +54,8 @@ def read(card: Card) -> Inputs | None:
     """
     toml = _bytes(card.boot / FILE, MOST_BYTES)
     if toml is None:
+        if (card.boot / f"{FILE}.txt").exists():  # an editor's doing, which the laptop hides
+            raise DeployError(f"there is {FILE}.txt and no {FILE}: take .txt off its name")
         return None
     folder = card.boot / CERTIFICATES
     certificates = {}

@@ -90,6 +90,12 @@ def test_without_a_file_nothing_is_in_force_and_a_lost_one_changes_nothing(perso
     assert person.boots() == provision.Outcome("in force", "blimp-1", wifi=True)
 
 
+def test_an_ending_that_an_editor_added_is_told(person: Person) -> None:
+    (person.card.boot / "blimp.toml.txt").write_text(render(BLIMP))
+    told = "there is blimp.toml.txt and no blimp.toml: take .txt off its name"
+    assert person.boots() == provision.Outcome("refused", reason=told)
+
+
 def test_another_network_is_one_edited_line(person: Person) -> None:
     person.gives(keys=certificates())
     person.boots()
