@@ -218,7 +218,8 @@ def _quotable(text: str) -> str:
 
 def clock(epoch: int) -> dict[str, str]:
     """The environment in which e2fsprogs takes this for the present."""
-    return {"E2FSPROGS_FAKE_TIME": str(epoch), "TZ": "UTC"}
+    # e2fsck has a name of its own for it.
+    return {"E2FSPROGS_FAKE_TIME": str(epoch), "E2FSCK_TIME": str(epoch), "TZ": "UTC"}
 
 
 def _inodes(tree: Tree) -> int:

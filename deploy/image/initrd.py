@@ -22,9 +22,9 @@ _APPLETS = ("sh", "cat", "chmod", "cut", "echo", "findfs", "insmod", "mkdir", "m
 
 # Without these there is no root: as modules or in the kernel itself.
 _NEEDED = ("ext4", "overlay")
-# Where the card hangs, if the kernel does not have it built in; crc32c is asked for by name.
-_WELCOME = ("crc32c_generic", "crc32c-cryptoapi", "libcrc32c", "bcm2835", "sdhci-iproc",
-            "mmc_block", "virtio_mmio", "virtio_pci", "virtio_blk")  # fmt: skip
+# Where the card hangs, and what can start the board again, if they are not built in.
+_WELCOME = ("bcm2835", "sdhci-iproc", "mmc_block", "virtio_mmio", "virtio_pci", "virtio_blk",
+            "bcm2835_wdt")  # fmt: skip
 
 
 def build(tree: Tree, release: str) -> bytes:
@@ -69,14 +69,24 @@ def load_order(tree: Tree, release: str) -> list[str]:
             after = words[words.index("pre:") + 1 :]
             stop = after.index("post:") if "post:" in after else len(after)
             soft[_name(words[1])] = after[:stop]
+    aliases = {
+        words[1]: words[2]
+        for words in (line.split() for line in _lines(tree, f"{base}/modules.alias"))
+        if len(words) == 3
+    }
     order: list[str] = []
 
     def take(path: str) -> None:
         if path in order:
             return
         for name in soft.get(_name(path), []):
-            if _name(name) in paths:
-                take(paths[_name(name)])
+            other = paths.get(_name(name)) or paths.get(_name(aliases.get(name, "")))
+            # ext4 asks for its checksum by what that does and not by the module's name.
+            stem = _name(name).removeprefix("crypto_")
+            if other is not None:
+                take(other)
+            elif not any(stem in known for known in builtin):
+                raise DeployError(f"/{base}: no {name}, which {_name(path)} asks for")
         # depmod lists the nearest first.
         for other in reversed(needs[path]):
             take(other)
