@@ -93,6 +93,8 @@ def read_release(document: Any, where: str) -> Release:
         if not isinstance(value, str) or not form.fullmatch(value):
             raise DeployError(f"{where}: '{name}' is {str(value)[:60]!r}")
         values[name] = value
+    if not places.is_name(values["version"]):
+        raise DeployError(f"{where}: 'version' is {values['version']!r}, which can name no folder")
     return Release(**values)
 
 

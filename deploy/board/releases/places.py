@@ -18,7 +18,7 @@ FACTORY = ""
 """The name of the release that came with the image."""
 
 _MOST_BYTES = 4 << 20
-_NAME = re.compile(r"[0-9][0-9A-Za-z.+_-]{0,62}", re.ASCII)
+_NAME = re.compile(r"[0-9][0-9a-z.+]{0,90}", re.ASCII)
 
 
 class Places:

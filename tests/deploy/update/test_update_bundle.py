@@ -151,7 +151,8 @@ def with_release(**changes: Any) -> bytes:
          "not in order"),
         (listed(files=[["pi_firmware/__main__.py", 1, "0" * 64]] * 20_001), "20001 files"),
         *((with_release(version=version), "'version' is") for version in (
-            "", "1", "a.b", "1.0-2", "1.0/../x", "01.0", "1.0+", "1.0+A", "1." + "9" * 99, 3, None,
+            "", "1", "a.b", "1.0+a..b", "1.0+a.part", "1.0-2", "1.0/../x", "01.0", "1.0+", "1.0+A",
+            "1." + "9" * 99, 3, None,
         )),
         (with_release(made="yesterday"), "'made' is"),
         (with_release(machine="a b"), "'machine' is"),

@@ -76,7 +76,8 @@ class Flight:
 
 
 @pytest.fixture
-def flight(card: Card, tmp_path: Path) -> Iterator[Flight]:
+def flight(card: Card, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Flight]:
+    monkeypatch.setattr(watch, "STEADY_S", 2.0)
     with ExitStack() as stack:
         yield Flight(stack, card, tmp_path)
 

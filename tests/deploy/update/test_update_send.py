@@ -262,9 +262,14 @@ def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
 
 
 def test_over_a_real_sshd(
-    stand: Stand, sshd: tuple[remote.Card, Path], tmp_path: Path, other_keys: Path
+    stand: Stand,
+    sshd: tuple[remote.Card, Path],
+    tmp_path: Path,
+    other_keys: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     card, identity = sshd
+    monkeypatch.setattr(remote, "_POLL_S", 0.2)
     assert card.ask("status")["in_force"]["version"] == OLDEST
     held = card.ask("holds")
     assert held == receive.holds(stand.card.at)
