@@ -1,0 +1,126 @@
+"""Recordings over HTTP: listed, sent whole or in part, as trajectories, and from one folder."""
+
+from __future__ import annotations
+
+import os
+import zlib
+
+import numpy as np
+import pytest
+import web_station as station
+
+from ground_station.service import notes
+from pi_firmware.wire.errors import BlimpError
+
+
+@pytest.fixture
+def shelf(tmp_path, served):
+    return tmp_path / "recordings"
+
+
+def write_recording(path, seconds=2.0):
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        mcap = Writer(file)
+        mcap.start()
+        channel = mcap.register_channel("x", "json", 0)
+        for at_ns in (0, int(seconds * 1e9)):
+            mcap.add_message(channel, at_ns, b"{}", at_ns)
+        mcap.finish()
+
+
+def test_recordings_are_listed_with_size_and_duration(served, shelf):
+    client, bus, _ = served
+    write_recording(shelf / "a.mcap")
+    write_recording(shelf / "b.mcap", 3.5)
+    (shelf / "cut.mcap").write_bytes((shelf / "a.mcap").read_bytes()[:-30])
+    (shelf / "not-one.txt").write_text("x")
+    (shelf / "folder.mcap").mkdir()
+    (shelf / "link.mcap").symlink_to("/etc/passwd")
+    bus.put(notes.RECORDING, notes.STATION, station.recording(active=True, file="b.mcap"))
+    listed = {item["file"]: item for item in client.get("/api/recordings").json()}
+    assert set(listed) == {"a.mcap", "b.mcap", "cut.mcap"}
+    assert listed["a.mcap"]["duration_s"] == 2.0
+    assert listed["b.mcap"]["active"] and listed["b.mcap"]["duration_s"] is None
+    assert listed["cut.mcap"]["duration_s"] is None and not listed["cut.mcap"]["active"]
+    assert listed["a.mcap"]["size_MB"] == round((shelf / "a.mcap").stat().st_size / 1e6, 3)
+
+
+def test_a_recording_is_downloaded_whole_or_in_part(served, shelf):
+    client = served[0]
+    data = np.random.default_rng(0).bytes(700_000)
+    (shelf / "a.mcap").write_bytes(data)
+    whole = client.get("/api/recordings/a.mcap")
+    assert zlib.crc32(whole.content) == zlib.crc32(data)
+    assert whole.headers["content-disposition"] == 'attachment; filename="a.mcap"'
+    for asked, part in (
+        ("bytes=0-0", data[:1]), ("bytes=699990-", data[-10:]), ("bytes=-10", data[-10:]),
+        ("bytes=10-19", data[10:20]), ("bytes=5-9999999", data[5:]),
+    ):  # fmt: skip
+        answer = client.get("/api/recordings/a.mcap", headers={"range": asked})
+        assert (answer.status_code, answer.content) == (206, part), asked
+        assert answer.headers["content-range"].endswith("/700000")
+    for asked in ("bytes=700000-", "bytes=-0", "bytes=99999999999-"):
+        answer = client.get("/api/recordings/a.mcap", headers={"range": asked})
+        assert answer.status_code == 416
+        assert answer.headers["content-range"] == "bytes */700000"
+    for asked in ("bytes=9-5", "bytes=0-1,3-4", "lines=1-2", "bytes=-", "x" * 500):
+        assert client.get("/api/recordings/a.mcap", headers={"range": asked}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nope.mcap", "..", "../secret.mcap", "..%2fsecret.mcap", "%2e%2e%2fsecret.mcap",
+        "..%252fsecret.mcap", "..%5csecret.mcap", "%2fetc%2fpasswd", "/etc/passwd",
+        "link.mcap", "folder.mcap", "pipe.mcap", ".hidden.mcap", "a.mcap%00", "a.mcap%0a",
+        "a.txt", "inner%2fa.mcap", "....//secret.mcap", "x" * 300 + ".mcap",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("rest", ["", "/trajectory.txt"])
+def test_no_path_leaves_the_folder(served, shelf, name, rest):
+    secret = shelf.parent / "secret.mcap"
+    write_recording(secret)
+    write_recording(shelf / "a.mcap")
+    write_recording(shelf / ".hidden.mcap")
+    (shelf / "a.txt").write_text("x")
+    (shelf / "folder.mcap").mkdir()
+    (shelf / "inner").mkdir()
+    write_recording(shelf / "inner" / "a.mcap")
+    (shelf / "link.mcap").symlink_to(secret)
+    os.mkfifo(shelf / "pipe.mcap")
+    assert served[0].get(f"/api/recordings/{name}{rest}").status_code in (404, 422)
+
+
+def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypatch):
+    client, _, _ = served
+    from ground_station.service import export
+
+    write_recording(shelf / "a.mcap")
+    monkeypatch.setattr(export, "tum_lines", lambda path: iter(["# tum\n", "1 2 3 4 5 6 7 8\n"]))
+    for _ in range(3):  # each ends and lets the next one in
+        answer = client.get("/api/recordings/a.mcap/trajectory.txt")
+        assert answer.text == "# tum\n1 2 3 4 5 6 7 8\n"
+        assert answer.headers["content-type"].startswith("text/plain")
+
+    def refuses(_):
+        raise BlimpError("a.mcap: no poses in it")
+
+    monkeypatch.setattr(export, "tum_lines", refuses)
+    for _ in range(2):
+        answer = client.get("/api/recordings/a.mcap/trajectory.txt")
+        assert (answer.status_code, answer.json()) == (409, {"detail": "a.mcap: no poses in it"})
+
+
+def test_what_grows_while_it_is_sent_ends_where_it_was(shelf, served):
+    from ground_station.service.web.recordings import _pieces
+
+    path = shelf / "a.mcap"
+    path.write_bytes(b"x" * 1000)
+    descriptor = os.open(path, os.O_RDONLY)
+    pieces = _pieces(descriptor, 0, 1000)
+    path.write_bytes(b"y" * 5000)
+    assert len(b"".join(pieces)) == 1000
+    with pytest.raises(OSError):
+        os.fstat(descriptor)
