@@ -93,7 +93,18 @@ def _take(board: Board, rootfs: Path, root: Path) -> None:
                 python = name == f"./usr/bin/python{board.python}" or name.startswith(
                     standard_library
                 )
-                if (library or python) and (member.isfile() or member.issym()):
-                    file.extract(member, root, filter="tar")
+                if library or python:
+                    _put(file, member, root / name)
     except (OSError, tarfile.TarError) as error:
         raise DeployError(f"{rootfs}: {error}") from None
+
+
+def _put(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    content = tar.extractfile(member) if member.isfile() else None
+    if content is not None or member.issym():
+        target.parent.mkdir(parents=True, exist_ok=True)
+    if content is not None:
+        target.write_bytes(content.read())
+        target.chmod(member.mode & 0o777)
+    elif member.issym():
+        target.symlink_to(member.linkname)
