@@ -66,6 +66,10 @@ def _of_options(args: argparse.Namespace) -> int:
     _refuse(args, ("solve", "required_g"), "of a build only")
     envelope, day = _envelope(args), conditions_from(args, Conditions())
     masses = {name: getattr(args, name) for name in MASSES if getattr(args, name) is not None}
+    if args.film_g_m2 is not None:
+        if envelope is None or "envelope_g" in masses:
+            raise HardwareError("film_g_m2 is given; allowed: with a shape, without envelope_g")
+        masses = {"envelope_g": envelope.film_m2 * args.film_g_m2, **masses}
     if args.free_lift_g is not None:
         _refuse(args, (*CONDITIONS, "film_g_m2", "envelope_g"), "not with a measured free lift")
         lift, note = args.free_lift_g, "measured free lift, the envelope's own weight in it"
@@ -86,10 +90,6 @@ def _of_options(args: argparse.Namespace) -> int:
             print("      and it is gross lift: envelope, fins, mechanism and payload come off it")
         if day.gas_left < 1:
             print(f"{lift:.1f} g after {day.days:g} days at {day.leak_percent_per_day:g} % a day")
-        if args.film_g_m2 is not None:
-            if envelope is None or "envelope_g" in masses:
-                raise HardwareError("film_g_m2 is given; allowed: with a shape, without envelope_g")
-            masses = {"envelope_g": envelope.film_m2 * args.film_g_m2, **masses}
     for name, mass in masses.items():
         print(f"{-mass:.1f} g {name.removesuffix('_g')}")
     if masses:
@@ -159,6 +159,8 @@ def endurance(args: argparse.Namespace) -> int:
 def budget(args: argparse.Namespace) -> int:
     """The whole reckoning of one build; 1 when its margin is not positive."""
     build = shipped_builds().named(args.build)
+    if args.out is not None:
+        output.make_folder(args.out)  # refused before anything is reckoned
     margin = reckon(build, args.samples, args.seed)
     endurance_table, flights = tables.endurance_table(build, Wear())
     text = "\n\n".join([

@@ -10,11 +10,19 @@ from typing import Any
 from hw.errors import HardwareError
 
 
+def make_folder(path: Path) -> None:
+    """Makes a folder with those above it; a disk's refusal is a `HardwareError`."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HardwareError(f"{path}: {error.strerror or error}") from None
+
+
 def write(path: Path, produce: Callable[[Path], object]) -> None:
     """Lets `produce` write beside `path` and renames; a disk's refusal is a `HardwareError`."""
     part = path.with_name(f".{path.name}.part{path.suffix}")
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         produce(part)
         part.replace(path)
     except OSError as error:

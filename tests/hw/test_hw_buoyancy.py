@@ -86,12 +86,12 @@ def test_a_measured_free_lift_takes_the_place_of_film_and_gas() -> None:
 
 
 def test_drawn_and_propagated_uncertainty_agree() -> None:
-    margin = reckon(default(), samples=6000, seed=3)
-    # 6000 draws know a standard deviation to 0.9 %, a mean to 1.3 % of it.
-    assert margin.sampled_sigma_g == pytest.approx(margin.sigma_g, rel=0.04)
-    assert margin.sampled_mean_g == pytest.approx(margin.margin_g, abs=0.06 * margin.sigma_g)
+    margin = reckon(default(), samples=2500, seed=3)
+    # 2500 draws know a standard deviation to 1.4 %, a mean to 2 % of it.
+    assert margin.sampled_sigma_g == pytest.approx(margin.sigma_g, rel=0.05)
+    assert margin.sampled_mean_g == pytest.approx(margin.margin_g, abs=0.08 * margin.sigma_g)
     width = (margin.high_g - margin.low_g) / (2 * 1.645)
-    assert width == pytest.approx(margin.sigma_g, rel=0.06)
+    assert width == pytest.approx(margin.sigma_g, rel=0.08)
     assert 0.99 < margin.positive_share <= 1
 
 
