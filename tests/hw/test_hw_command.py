@@ -28,15 +28,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_the_thesiss_numbers_as_a_user_types_them() -> None:
-    words = [
-        "buoyancy",
-        "--volume-m3",
-        "0.1905",
-        "--air-kg-m3",
-        "1.2260",
-        "--helium-kg-m3",
-        "0.1693",
-    ]
+    numbers = ("--volume-m3", "0.1905", "--air-kg-m3", "1.2260", "--helium-kg-m3", "0.1693")
     done = subprocess.run(
         [sys.executable, "-m", "hw", "buoyancy", *numbers],
         cwd=ROOT, capture_output=True, text=True, timeout=120,
