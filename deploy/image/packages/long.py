@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.run import need
+from deploy.run import find, need
 
 # mmdebstrap and apt say a step after `I:` and a fault after `E:`.
 _STEP = re.compile(r"^I: (?P<what>.+?)\.*$")
@@ -35,6 +35,9 @@ def run_long(
     """
     arguments = [str(word) for word in words]
     arguments[0] = need(arguments[0])
+    if dies_with_us := find("setpriv"):
+        # Were this program killed, nobody would end the tool and clear its folder.
+        arguments = [dies_with_us, "--pdeathsig", "TERM", "--", *arguments]
     environment = {**os.environ, "LC_ALL": "C.UTF-8", **(env or {})}
     start_s = time.monotonic()
     terminal = sys.stderr.isatty()

@@ -35,10 +35,13 @@ inputs = {{pathlib.Path(word).name: pathlib.Path(word).read_text() for word in s
           if word.endswith(".sources")}}
 calls = json.loads(called.read_text()) if called.exists() else []
 keys = ("SOURCE_DATE_EPOCH", "TMPDIR", "PYTHONHASHSEED", "PYTHONPATH")
-calls.append([sys.argv[1:], {{key: os.environ.get(key) for key in keys}}, inputs])
+environment = {{key: os.environ.get(key) for key in keys}} | {{"pid": os.getpid()}}
+calls.append([sys.argv[1:], environment, inputs])
 (pathlib.Path(os.environ["TMPDIR"]) / "half").mkdir()
 print("I: installing essential packages...", flush=True)
-called.write_text(json.dumps(calls))
+part = called.with_suffix(".part")
+part.write_text(json.dumps(calls))
+part.replace(called)
 time.sleep(float(os.environ.get("TAKES_S", "0")))
 if "FAILS" in os.environ:
     print("E: dpkg: it broke", flush=True)
@@ -145,8 +148,13 @@ def test_without_root_it_is_one_line(
     assert not calls.exists() and _left(tmp_path / "cache") == []
 
 
-def test_ctrl_c_leaves_nothing_half_made(native: Board, calls: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_stopped_or_killed_it_leaves_nothing_half_made(
+    native: Board, calls: Path, tmp_path: Path, how: signal.Signals
+) -> None:
     """A second process waits for the first one's tar meanwhile, and then makes it."""
+    if how == signal.SIGKILL:
+        need_tools("setpriv")
     place = {name: getattr(native.archives[0], name) for name in ("url", "keyring")}
     program = (
         "import dataclasses, os, sys\n"
@@ -167,15 +175,18 @@ def test_ctrl_c_leaves_nothing_half_made(native: Board, calls: Path, tmp_path: P
     )
     environment = {**os.environ, "PYTHONPATH": str(_ROOT), "TAKES_S": "60"}
     first = subprocess.Popen([sys.executable, "-c", program], env=environment, cwd=_ROOT)
-    _until(lambda: calls.exists() and bool(calls.read_text()))
+    _until(calls.exists)
     second = subprocess.Popen(
         [sys.executable, "-c", program],
         env={**environment, "TAKES_S": "0"},
         cwd=_ROOT,
         stdout=subprocess.PIPE,
     )
-    first.send_signal(signal.SIGINT)
-    assert first.wait(60) == 130
+    ((_, environment_of_first, _),) = json.loads(calls.read_text())
+    first.send_signal(how)
+    assert first.wait(60) == (130 if how == signal.SIGINT else -how)
+    # The tool doesn't outlive it.
+    _until(lambda: not Path(f"/proc/{environment_of_first['pid']}").exists())
     out, _ = second.communicate(timeout=60)
     assert second.returncode == 0
     assert _left(tmp_path / "cache") == [Path(out.decode().strip()).name]
