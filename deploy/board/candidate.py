@@ -36,7 +36,7 @@ from deploy.run import run
 
 SCHEMA = "blimp.provisioned/1"
 RECORD, RADIO, SSH, KEYS = "provisioned.json", "wpa_supplicant.conf", "ssh", "authorized_keys"
-CHECK_LIMIT_S = 120.0
+CHECK_LIMIT_S = 240.0
 
 Check = Callable[[Path], None]
 """Looks at a candidate's payload.toml and certificates/; raises `DeployError` with the reason."""
