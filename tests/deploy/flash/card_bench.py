@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
+import io
 import os
 import shutil
 import subprocess
 import sys
+import unittest.mock
 from pathlib import Path
+
+from deploy.flash import command
 
 REPOSITORY = Path(__file__).parents[3]
 MEBI = 1 << 20
 BOOT_OFFSET = MEBI
-GAP_MIB = 4
+GAP_MIB = 2
 TOOLS = ("sfdisk", "mkfs.vfat", "mke2fs", "mcopy", "bmaptool", "e2fsck", "fsck.vfat")
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 
@@ -72,13 +77,26 @@ def run(
     )  # fmt: skip
 
 
-def refused(words: list[str], said: str, *, input: str = "") -> None:
-    """Asserts a refusal: status 2, one line that says so, no traceback."""
-    done = run(words, input=input)
-    lines = done.stderr.strip().splitlines()
-    assert done.returncode == 2, (done.returncode, done.stderr)
-    assert lines[-1].startswith("deploy.flash: ") and said in lines[-1], done.stderr
-    assert "Traceback" not in done.stderr
+def refused(words: list[str], said: str, *, input: str = "", program: bool = False) -> None:
+    """Asserts a refusal: status 2, one line that says so, no traceback.
+
+    In this process, which is ten times faster; with `program` as a person runs it.
+    """
+    if program:
+        done = run(words, input=input)
+        status, told = done.returncode, done.stderr
+    else:
+        with (
+            contextlib.redirect_stderr(io.StringIO()) as stderr,
+            contextlib.redirect_stdout(io.StringIO()),
+            unittest.mock.patch("sys.stdin", io.StringIO(input)),
+        ):
+            status = command.main(words[3:])
+        told = stderr.getvalue()
+    lines = told.strip().splitlines()
+    assert status == 2, (status, told)
+    assert lines[-1].startswith("deploy.flash: ") and said in lines[-1], told
+    assert "Traceback" not in told
 
 
 def tool(*words: str, input: bytes = b"") -> bytes:

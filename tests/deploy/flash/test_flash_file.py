@@ -205,7 +205,11 @@ def test_no_wifi_is_said_and_no_password_is_on_a_command_line(bench: Bench) -> N
     assert parse(bench.toml()).wifi is None
     # No terminal to ask on, and no file.
     words = ["--wifi-ssid", "hall", "--country", "DE"]
-    refused(bench.command(*words, wifi=False), "--wifi-password-file, or run it on a terminal")
+    refused(
+        bench.command(*words, wifi=False),
+        "--wifi-password-file, or run it on a terminal",
+        program=True,
+    )
     assert "--wifi-password " not in run([*bench.command(), "--help"]).stdout
 
 

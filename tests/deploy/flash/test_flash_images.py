@@ -27,7 +27,7 @@ def test_a_wrong_or_missing_checksum(untouched: Bench) -> None:
     with open(untouched.image, "r+b") as file:
         file.seek(12 * MEBI)
         file.write(b"x")
-    refused(untouched.command(), "its checksum is wrong")
+    refused(untouched.command(), "its checksum is wrong", program=True)
     refused(untouched.command("--no-checksum"), "its checksum is wrong")
     sums.write_text("not a sum\n")
     refused(untouched.command(), "it tells no checksum")
@@ -40,7 +40,7 @@ def test_a_card_that_is_too_small(untouched: Bench) -> None:
     small = untouched.folder / "small"
     small.write_bytes(b"o" * (untouched.image.stat().st_size - 512))
     words = [str(small) if word == str(untouched.card) else word for word in untouched.command()]
-    refused(words, f"the image needs {untouched.image.stat().st_size}")
+    refused(words, f"the image needs {untouched.image.stat().st_size}", program=True)
     assert small.read_bytes().count(b"o") == small.stat().st_size
 
 
@@ -89,7 +89,7 @@ def test_a_second_flasher_waits_its_turn(untouched: Bench) -> None:
 
 def test_only_the_typed_name_goes_on(bench: Bench) -> None:
     before = bench.card.read_bytes()
-    refused(bench.command(ask=True), "not confirmed", input="yes\n")
+    refused(bench.command(ask=True), "not confirmed", input="yes\n", program=True)
     refused(bench.command(ask=True), "not confirmed", input="")
     assert bench.card.read_bytes() == before
     assert run(bench.command(ask=True), input="card\n").returncode == 0

@@ -116,7 +116,7 @@ def test_the_program_says_what_is_no_card(bench: Bench) -> None:
     def device(path: str) -> list[str]:
         return [path if word == str(bench.card) else word for word in bench.command()]
 
-    refused(device("/dev/null"), "neither a disk nor an image file")
+    refused(device("/dev/null"), "neither a disk nor an image file", program=True)
     refused(device(str(bench.folder)), "neither a disk nor an image file")
     refused(device(str(bench.folder / "none")), "truncate -s 8G")
     refused(device("/dev/no-such-card"), "No such file or directory")
@@ -156,7 +156,7 @@ def test_a_real_device_that_is_mounted_or_fixed_is_refused(
     if mounted.returncode:
         pytest.skip("mounting is not allowed here")
     try:
-        refused(words, f"in use: {Path(device).name} is mounted on {point}")
+        refused(words, f"in use: {Path(device).name} is mounted on {point}", program=True)
         # The last line of defence: the kernel itself.
         with pytest.raises(DeployError, match="in use by the system or another program"):
             Target.open(Path(device))
