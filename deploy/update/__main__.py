@@ -40,7 +40,10 @@ def _parser() -> argparse.ArgumentParser:
         "--keys", type=Path, metavar="DIR", help="the folder of `blimp keys` (default: its own)"
     )
     parser.add_argument(
-        "--identity", type=Path, metavar="FILE", help="the pilot's SSH key (default: SSH's own)"
+        "--identity",
+        type=Path,
+        metavar="FILE",
+        help="the pilot's SSH key (default: the ground station's)",
     )
     parser.add_argument(
         "--site", type=Path, metavar="DIR", help="unpacked wheels (default: those of the lock)"

@@ -27,6 +27,7 @@ _PROGRAM = (
 _ASK_S = 60.0
 _END_S = 900.0  # writing, reading back and compiling on a slow board
 _POLL_S = 3.0
+_MOST_TRIES = 3  # MaxAuthTries of the card's sshd
 _SLACK_S = 60.0  # a payload whose radio comes back late
 _OPTIONS = (
     "BatchMode=yes",
@@ -44,7 +45,8 @@ class Card:
         host: its address or name in the network.
         keys: the authority's folder. The host key that it made for the payload is the only one
             that is taken; for a payload without one there, the first that is seen is kept.
-        identity: the pilot's private SSH key; None: those of SSH's agent and configuration.
+        identity: the pilot's private SSH key; None: the ground stations' in that folder, which
+            `deploy.flash` lets in, or else those of SSH's agent and configuration.
         port: of its sshd.
         user: who may become root there without a password.
     """
@@ -75,8 +77,10 @@ class Card:
         self._words = [need("ssh"), "-T", "-l", user]
         for option in options:
             self._words += ["-o", option]
-        if identity is not None:
-            self._words += ["-i", str(identity), "-o", "IdentitiesOnly=yes"]
+        stations = sorted(keys.glob("ground/*/ssh_ed25519"))[:_MOST_TRIES]
+        for path in stations if identity is None else [identity]:
+            # Only these: an agent's many keys would use up what the card allows.
+            self._words += ["-i", str(path), "-o", "IdentitiesOnly=yes"]
 
     def ask(self, action: str) -> dict[str, Any]:
         """What the card answers to `status` or `holds`; raises `DeployError` with one line."""

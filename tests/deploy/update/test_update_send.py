@@ -2,7 +2,6 @@
 behind a real sshd on loopback."""
 
 import getpass
-import json
 import os
 import shutil
 import socket
@@ -86,8 +85,8 @@ class Stand:
 
 
 def authority(folder: Path) -> Path:
-    """An authority with the payload blimp-1, as its user makes it."""
-    for words in (["init"], ["payload", "blimp-1"]):
+    """An authority with a station and the payload blimp-1, as its user makes it."""
+    for words in (["init"], ["ground", "main"], ["payload", "blimp-1"]):
         command = [sys.executable, "-m", "ground_station.cli", "keys", "--folder", str(folder)]
         subprocess.run([*command, *words], cwd=CHECKOUT, check=True, timeout=120)
     return folder
@@ -216,8 +215,8 @@ def test_a_link_that_goes_and_comes_back_is_no_end() -> None:
 
 
 @pytest.fixture
-def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
-    """A real sshd on loopback, whose only command is the card's program."""
+def sshd(stand: Stand, tmp_path: Path) -> Iterator[int]:
+    """A real sshd on loopback, whose only command is the card's program; its port."""
     program = shutil.which("sshd", path=f"{os.environ['PATH']}:/usr/sbin")
     if program is None:
         pytest.skip("no sshd here (openssh-server)")
@@ -227,9 +226,6 @@ def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    identity = tmp_path / "pilot"
-    command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(identity)]
-    subprocess.run(command, check=True, timeout=30)
     variables = "\n".join(
         f"export {name}='{stand.environment[name]}'"
         for name in ("PATH", "CARD", "PYTHON", "PYTHONPATH")
@@ -241,7 +237,8 @@ def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
     config.write_text(
         f"Port {port}\nListenAddress 127.0.0.1\nPidFile none\nUsePAM no\nStrictModes no\n"
         f"HostKey {stand.keys}/payload/blimp-1/ssh_ed25519\n"
-        f"AuthorizedKeysFile {identity}.pub\nPasswordAuthentication no\nForceCommand {forced}\n"
+        f"AuthorizedKeysFile {stand.keys}/ground/main/ssh_ed25519.pub\n"
+        f"PasswordAuthentication no\nForceCommand {forced}\n"
     )
     log = (tmp_path / "sshd.log").open("w")
     server = subprocess.Popen([program, "-D", "-e", "-f", str(config)], stderr=log)
@@ -253,8 +250,7 @@ def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
             time.sleep(0.05)
         if server.poll() is not None:
             pytest.skip(f"sshd does not run here: {(tmp_path / 'sshd.log').read_text()[-200:]}")
-        user = getpass.getuser()
-        yield remote.Card("blimp-1", "127.0.0.1", stand.keys, identity, port, user), identity
+        yield port
     finally:
         server.terminate()
         server.wait(10)
@@ -263,12 +259,15 @@ def sshd(stand: Stand, tmp_path: Path) -> Iterator[tuple[remote.Card, Path]]:
 
 def test_over_a_real_sshd(
     stand: Stand,
-    sshd: tuple[remote.Card, Path],
+    sshd: int,
     tmp_path: Path,
     other_keys: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    card, identity = sshd
+    def reach(keys: Path, identity: Path | None = None) -> remote.Card:
+        return remote.Card("blimp-1", "127.0.0.1", keys, identity, sshd, getpass.getuser())
+
+    card = reach(stand.keys)
     monkeypatch.setattr(remote, "_POLL_S", 0.2)
     assert card.ask("status")["in_force"]["version"] == OLDEST
     held = card.ask("holds")
@@ -281,19 +280,21 @@ def test_over_a_real_sshd(
     assert remote.is_healthy(card.follow(answer["id"], lambda line: None))
     assert (stand.card.at.folder(NEW) / "site/big").read_bytes() == big["site/big"]
     # A refusal comes back as the card's own words, though the rest of the bundle is not read.
-    stranger = bundles.make(contents("0.9.0", big), identity)
+    stranger = bundles.make(contents("0.9.0", big), other_keys / "releases/1")
     with pytest.raises(DeployError, match="blimp-1 refuses: the bundle's signature is of no"):
         card.give(stranger, {}, sizes.append)
     # Another host key than the payload's own is refused.
     other = Path(shutil.copytree(other_keys, tmp_path / "other"))
-    port = next(word for word in card._words if word.startswith("Port=")).removeprefix("Port=")
-    wrong = remote.Card("blimp-1", "127.0.0.1", other, identity, int(port), getpass.getuser())
+    own = stand.keys / "ground/main/ssh_ed25519"
+    wrong = reach(other, own)
     with pytest.raises(DeployError, match=r"another host key than this payload's$"):
         wrong.ask("status")
     # One that this authority knows no key of is taken at first sight, and kept.
     (other / "payload/blimp-1/ssh_ed25519.pub").unlink()
-    first = remote.Card("blimp-1", "127.0.0.1", other, identity, int(port), getpass.getuser())
+    first = reach(other, own)
     assert first.ask("status")["trial"] == ""
     assert (other / "known_hosts").stat().st_mode & 0o777 == 0o600
     assert (other / "known_hosts").read_text().startswith("blimp-1 ssh-ed25519 ")
-    assert json.dumps(first.ask("status"))
+    # Whose key the card does not know stays outside.
+    with pytest.raises(DeployError, match="Permission denied"):
+        reach(other).ask("status")
