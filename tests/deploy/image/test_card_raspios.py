@@ -1,0 +1,201 @@
+"""The Zero W's card out of a base image that this test makes in the real one's layout."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import uuid
+from pathlib import Path
+
+import pytest
+from card_parts import (
+    EPOCH,
+    ImageReader,
+    make_checkout,
+    missing_tools,
+    root_members,
+    write_tar,
+)
+
+from deploy.errors import DeployError
+from deploy.image import card, ext4, fat, partitions, raspios, sparse
+from deploy.image.packages import load_board
+from deploy.image.partitions import FAT32_LBA, LINUX, Partition
+from deploy.image.tree import Tree
+
+pytestmark = pytest.mark.skipif(
+    (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
+)
+
+KERNEL = "6.12.1+rpt-rpi-v6"
+UUID = uuid.UUID("12345678-1234-1234-1234-123456789abc")
+BOARD = load_board("zerow")
+
+
+def make_base(path: Path, **changes) -> Path:
+    """An image as Raspberry Pi's: a FAT with kernels and firmware, a root that can be written."""
+    architecture = changes.get("architecture", "armhf")
+    members = root_members(architecture, changes.get("kernel", KERNEL))
+    status = members["var/lib/dpkg/status"].decode()
+    for name in BOARD.package_names:
+        if name != changes.get("without"):
+            status += f"\nPackage: {name}\nStatus: install ok installed\n"
+            status += f"Architecture: {architecture}\nVersion: 1\n"
+    members["var/lib/dpkg/status"] = status.encode()
+    codename = changes.get("codename", "trixie")
+    members["usr/lib/os-release"] = f'ID=raspbian\nVERSION_CODENAME="{codename}"\n'.encode()
+    members["usr/lib/systemd/system/NetworkManager.service"] = (
+        b"[Service]\nExecStart=/usr/bin/ip\n[Install]\nWantedBy=multi-user.target\n"
+    )
+    members["etc/systemd/system/multi-user.target.wants/NetworkManager.service"] = (
+        "/usr/lib/systemd/system/NetworkManager.service"
+    )
+    members["etc/hostname"] = b"raspberrypi\n"
+    members["usr/share/of-the-base"] = b"stays"
+    work = path.with_name(path.name + ".work")
+    work.mkdir()
+    tree = Tree.from_tar(write_tar(work / "tar", members))
+    ext4.make(work / "root", 48 << 20, tree, ext4.Ext4("rootfs", UUID, journal=True), EPOCH - 1000)
+    boot = Tree()
+    size = fat.bytes_needed(boot)
+    for name in ("kernel.img", "kernel7.img", "bootcode.bin", "start.elf", "fixup.dat",
+                 "bcm2708-rpi-zero-w.dtb", "overlays/disable-bt.dtbo", "initramfs",
+                 "issue.txt"):  # fmt: skip
+        boot.write(name, name)
+    boot.write("config.txt", "[all]\ndtparam=audio=on\n")
+    boot.write("cmdline.txt", "console=serial0,115200 init=/usr/lib/raspberrypi-sys-mods/firstboot")
+    fat.make(work / "boot", size, boot, "BOOTFS", 1, EPOCH)
+    parts = [
+        Partition("boot", FAT32_LBA, work / "boot", fat.used_ranges(work / "boot")),
+        Partition("root", LINUX, work / "root", ext4.used_ranges(work / "root")),
+    ]
+    partitions.assemble(path, parts[: changes.get("parts", 2)], 1)
+    shutil.rmtree(work)
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    return make_checkout(tmp_path_factory.mktemp("checkout"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_boot_partition():
+    """What is tested here does not depend on its size, and hashing a real one's takes long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(card.BOOT_BYTES, "zerow", 40 << 20)
+        yield
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return make_base(tmp_path_factory.mktemp("base") / "raspios.img")
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory, base, checkout):
+    place = tmp_path_factory.mktemp("image") / "blimp-zerow.img"
+    raspios.build(place, BOARD, base, None, checkout, EPOCH)
+    return place
+
+
+@pytest.fixture(scope="module")
+def reader(image, tmp_path_factory):
+    return ImageReader(image, tmp_path_factory.mktemp("parts"))
+
+
+def test_the_card_has_the_layout_of_the_others(reader):
+    assert [part["type"] for part in reader.table["partitions"]] == ["c", "83", "83"]
+    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+    for part in (reader.root, reader.data):
+        subprocess.run([shutil.which("e2fsck", path=path), "-fn", part], check=True)
+    subprocess.run([shutil.which("fsck.vfat", path=path), "-n", reader.boot], check=True)
+    facts = reader.facts(reader.root)
+    assert facts["Filesystem volume name"] == "blimp-root"
+    assert f"root=UUID={facts['Filesystem UUID']}" in reader.boot_text("cmdline.txt")
+
+
+def test_the_boot_partition_keeps_the_bases_first_stages_and_starts_ours(reader):
+    names = reader.boot_names()
+    assert {"kernel.img", "bootcode.bin", "start.elf", "overlays/disable-bt.dtbo"} <= names
+    assert not names & {"initramfs", "issue.txt"}
+    config = reader.boot_text("config.txt").splitlines()
+    assert "kernel=kernel.img" in config and "initramfs initrd.img followkernel" in config
+    assert "arm_64bit=1" not in config and "dtoverlay=disable-bt" in config
+    assert "init=" not in reader.boot_text("cmdline.txt").replace("initrd", "")
+
+
+def test_the_root_keeps_the_bases_files_and_takes_ours(reader, checkout):
+    assert reader.read("usr/share/of-the-base") == "stays"
+    assert reader.stat("usr/bin/ip")["mode"] == "04755", "an entry that was not touched"
+    assert reader.stat("usr/share/über uns/a b.txt")["gid"] == "44"
+    assert reader.read("etc/hostname") == "blimp\n", "replaced"
+    assert json.loads(reader.read("usr/share/blimp/board.json"))["board"] == "zerow"
+    ours = reader.stat("usr/lib/blimp/release/pi_firmware/__main__.py")
+    assert (ours["uid"], ours["gid"], ours["mode"]) == ("0", "0", "0644")
+    assert ours["mtime"].startswith(f"{EPOCH:#x}")
+    wants = "etc/systemd/system/multi-user.target.wants"
+    assert reader.exists(f"{wants}/blimp-payload.service")
+    assert not reader.exists(f"{wants}/NetworkManager.service")
+    assert not reader.exists("etc/ssh/ssh_host_ed25519_key")
+
+
+def test_nobody_has_a_password_and_the_bases_user_is_gone(reader):
+    passwd, shadow = reader.rows("etc/passwd"), reader.rows("etc/shadow")
+    assert set(passwd) == set(shadow) and "somebody" not in passwd
+    assert all(row[1] == "*" for row in shadow.values())
+    assert reader.stat("etc/shadow")["mode"] == "0640"
+
+
+def test_the_base_is_named_in_the_manifest_and_was_not_changed(image, base):
+    document = json.loads(card.beside(image, ".manifest.json").read_text())
+    assert document["base"] == {"name": "raspios.img", "sha256": sparse.sha256(base)}
+    assert "gstreamer1.0-libcamera" in {row["name"] for row in document["packages"]}
+
+
+def test_the_same_base_gives_the_same_bytes_also_out_of_xz(image, base, checkout, tmp_path):
+    packed = tmp_path / "raspios.img.xz"
+    with open(packed, "wb") as file:
+        subprocess.run(["xz", "-1", "-c", base], stdout=file, check=True)
+    again = tmp_path / "blimp-zerow.img"
+    raspios.build(again, BOARD, packed, None, checkout, EPOCH)
+    unpacked = json.loads(card.beside(again, ".manifest.json").read_text())
+    assert unpacked["base"]["name"] == "raspios.img.xz"
+    raspios.build(again, BOARD, base, None, checkout, EPOCH)
+    assert sparse.sha256(again) == sparse.sha256(image)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"codename": "bookworm"}, "of 'bookworm'; expected 'trixie'"),
+        ({"architecture": "arm64"}, "for arm64; expected armhf"),
+        ({"parts": 1}, "partitions of type c; expected c and 83"),
+        ({"kernel": "6.12.1+rpt-rpi-v7"}, "one kernel .* expected, there: 6.12.1.rpt-rpi-v7"),
+        ({"without": "busybox-static"}, "install there first: busybox-static$"),
+    ],
+)
+def test_another_base_is_refused_by_what_it_is(changes, says, checkout, tmp_path):
+    base = make_base(tmp_path / "other.img", **changes)
+    place = tmp_path / "out/blimp-zerow.img"
+    with pytest.raises(DeployError, match=says) as failure:
+        raspios.build(place, BOARD, base, None, checkout, EPOCH)
+    assert "\n" not in str(failure.value) and str(base) in str(failure.value)
+    assert list(place.parent.iterdir()) == []
+
+
+def test_a_base_that_is_cut_or_none_is_refused(base, checkout, tmp_path):
+    cut = tmp_path / "cut.img"
+    cut.write_bytes(base.read_bytes()[: 80 << 20])
+    text = tmp_path / "text.img"
+    text.write_text("no image")
+    for place, says in (
+        (cut, "cut at 83886080 of"),
+        (text, "no partition table of a Raspberry Pi OS image"),
+        (tmp_path / "none.img", "no such image"),
+    ):
+        with pytest.raises(DeployError, match=says):
+            raspios.build(tmp_path / "out.img", BOARD, place, None, checkout, EPOCH)
+        assert not (tmp_path / "out.img").exists()
