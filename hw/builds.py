@@ -11,7 +11,7 @@ from typing import Any
 from hw import envelopes, gases
 from hw.envelopes import Envelope
 from hw.errors import HardwareError
-from hw.parts import SOURCES, Part, shipped_parts
+from hw.parts import SOURCES, Part, entries_of, shipped_parts
 from hw.quantities import checked
 from pi_firmware.wire import config
 
@@ -223,7 +223,7 @@ def load_builds(path: str | Path = BUILDS_FILE) -> Catalogue:
     if unknown:
         raise HardwareError(f"{path}: unknown key {unknown[0]!r}")
     hulls: dict[str, Hull] = {}
-    for entry in _tables(document, "hull", path):
+    for entry in entries_of(document, "hull", path):
         where = f"{path}: hull {entry.get('id')!r}"
         entry = dict(entry)
         stations = _stations(entry.pop("stations", {}), where)
@@ -231,17 +231,17 @@ def load_builds(path: str | Path = BUILDS_FILE) -> Catalogue:
         hulls[entry_hull.id] = _with_stations(entry_hull, stations)
     days = {
         name: config.from_mapping(entry, Conditions, where=f"{path}: conditions {name!r}")
-        for name, entry in document.get("conditions", {}).items()
+        for name, entry in _table(document, "conditions", str(path)).items()
     }
     builds: dict[str, Build] = {}
-    for entry in _tables(document, "build", path):
+    for entry in entries_of(document, "build", path):
         where = f"{path}: build {entry.get('name')!r}"
         build = _build(entry, hulls, days, parts, where)
         if build.name in builds:
             raise HardwareError(f"{where} stands there twice")
         builds[build.name] = build
     for key in ("default", "simulated"):
-        if document.get(key) not in builds:
+        if str(document.get(key)) not in builds:
             raise HardwareError(f"{path}: '{key}' is {document.get(key)!r}, which is no build here")
     return Catalogue(builds, document["default"], document["simulated"])
 
@@ -252,11 +252,18 @@ def shipped_builds() -> Catalogue:
     return load_builds()
 
 
-def _tables(document: dict[str, Any], key: str, path: str | Path) -> list[dict[str, Any]]:
-    entries = document.get(key, [])
-    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-        raise HardwareError(f"{path}: '{key}' must be tables, [[{key}]]")
-    return entries
+def _table(document: dict[str, Any], key: str, where: str) -> dict[str, Any]:
+    table = document.get(key, {})
+    if not isinstance(table, dict):
+        raise HardwareError(f"{where}: '{key}' must be a table, not {table!r}")
+    return table
+
+
+def _number(entry: dict[str, Any], key: str, where: str) -> float:
+    value = entry.get(key, 0.0)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise HardwareError(f"{where}: '{key}' must be a number, not {value!r}")
+    return float(value)
 
 
 def _stations(entry: Any, where: str) -> dict[str, tuple[float, float]]:
@@ -287,32 +294,36 @@ def _build(
     unknown = sorted(set(entry) - set(_BUILD_KEYS))
     if unknown:
         raise HardwareError(f"{where}: unknown key {unknown[0]!r} (known here: {known})")
-    hull = hulls.get(entry.get("hull", ""))
+    hull = hulls.get(str(entry.get("hull")))
     if hull is None:
         raise HardwareError(f"{where}: hull {entry.get('hull')!r}; there are: {', '.join(hulls)}")
     placed = []
-    for station, ids in entry.get("parts", {}).items():
+    for station, ids in _table(entry, "parts", where).items():
+        if not isinstance(ids, list):
+            raise HardwareError(f"{where}: parts.{station} must be a list of ids, not {ids!r}")
         if station not in hull.stations:
             raise HardwareError(
                 f"{where}: station {station!r}; the hull has: {', '.join(hull.stations)}"
             )
         for part_id in ids:
-            if part_id not in parts:
+            if not isinstance(part_id, str) or part_id not in parts:
                 raise HardwareError(f"{where}: part {part_id!r} is not in parts.toml")
             placed.append((parts[part_id], station))
-    conditions = days.get(entry.get("conditions", ""))
+    conditions = days.get(str(entry.get("conditions")))
     if conditions is None:
         day = entry.get("conditions")
         raise HardwareError(f"{where}: conditions {day!r}; there are: {', '.join(days)}")
     station = str(entry.get("ballast_station", ""))
-    ballast = entry.get("ballast_g", 0.0)
+    ballast = _number(entry, "ballast_g", where)
     bare = Build(str(entry.get("name", "")), str(entry.get("about", "")), hull, tuple(placed),
                  conditions)  # fmt: skip
     if "ballast_to_mass_g" in entry:
-        ballast = float(entry["ballast_to_mass_g"]) - math.fsum(i.mass_g for i in bare.items)
+        ballast = _number(entry, "ballast_to_mass_g", where) - math.fsum(
+            i.mass_g for i in bare.items
+        )
     if ballast and station not in hull.stations:
         raise HardwareError(f"{where}: ballast_station {station!r} is not one of the hull's")
-    return with_ballast(bare, checked("ballast_g", float(ballast)), station)
+    return with_ballast(bare, checked("ballast_g", ballast), station)
 
 
 def with_ballast(build: Build, ballast_g: float, station: str = "") -> Build:

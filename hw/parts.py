@@ -99,11 +99,8 @@ def load_parts(path: str | Path = PARTS_FILE) -> dict[str, Part]:
     unknown = sorted(set(document) - {"part"})
     if unknown:
         raise HardwareError(f"{path}: unknown key {unknown[0]!r} (known here: part)")
-    entries = document.get("part", [])
-    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-        raise HardwareError(f"{path}: 'part' must be tables, [[part]]")
     parts: dict[str, Part] = {}
-    for number, entry in enumerate(entries, 1):
+    for number, entry in enumerate(entries_of(document, "part", path), 1):
         where = f"{path}: part {entry.get('id', number)!r}"
         for name in _REQUIRED:
             if name not in entry:
@@ -115,6 +112,14 @@ def load_parts(path: str | Path = PARTS_FILE) -> dict[str, Part]:
             raise HardwareError(f"{where} stands there twice")
         parts[part.id] = part
     return parts
+
+
+def entries_of(document: dict[str, Any], key: str, path: str | Path) -> list[dict[str, Any]]:
+    """The tables [[key]] of a file that was read; raises `HardwareError` for anything else."""
+    entries = document.get(key, [])
+    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+        raise HardwareError(f"{path}: '{key}' must be tables, [[{key}]]")
+    return entries
 
 
 @lru_cache(maxsize=1)

@@ -122,7 +122,7 @@ def _endurance(build: Build, wear: Wear) -> Any:
     axis.axvline(cell.capacity_mAh, color=_GREY, linestyle="--", label=f"{cell.name}")
     ticks = [5, 10, 20, 30, 60, 120, 240, 480]
     axis.set_yscale("log")
-    axis.set_ylim(ticks[0], 1.5 * ticks[-1])
+    axis.set_ylim(ticks[0], 2 * ticks[-1])
     axis.set_yticks(ticks, [f"{t}" for t in ticks])
     axis.minorticks_off()
     axis.set(

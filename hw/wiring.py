@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hw.builds import Build
 from hw.errors import HardwareError
+from hw.parts import entries_of
 from pi_firmware.wire import config
 
 WIRING_FILE = Path(__file__).with_name("wiring.toml")
@@ -84,7 +85,7 @@ def load_wiring(gauge: str, autopilot: bool, path: str | Path = WIRING_FILE) -> 
     document = config.read(path)
     every = [
         config.from_mapping(entry, Device, where=f"{path}: device {entry.get('id')!r}")
-        for entry in document.get("device", [])
+        for entry in entries_of(document, "device", path)
     ]
     devices = tuple(device for device in every if device.when in here)
     known = {device.id for device in every}
@@ -94,7 +95,7 @@ def load_wiring(gauge: str, autopilot: bool, path: str | Path = WIRING_FILE) -> 
         for text in device.pins:
             pins[f"{device.id}.{text.split(',')[0].strip()}"] = _pin(device, text, rows, path)
     wires = []
-    for entry in document.get("wire", []):
+    for entry in entries_of(document, "wire", path):
         wire = config.from_mapping(entry, Wire, where=f"{path}: wire {entry.get('ends')!r}")
         if len(wire.ends) != 2 or not {e.partition(".")[0] for e in wire.ends} <= known:
             raise HardwareError(f"{path}: wire {wire.ends!r} ends at a device that is not there")
