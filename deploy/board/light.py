@@ -23,7 +23,8 @@ from deploy.board.releases.service import UNIT, Seen, Service
 from deploy.board.status import Status
 from deploy.errors import DeployError
 
-LOOK_S = 5.0
+LOOK_S, CALM_S = 5.0, 20.0
+"""It looks so often until a state has settled, and seldom from then on: each look runs systemctl."""
 PATIENCE_S = 90.0
 """The first frame and the first address may take so long on the slowest board."""
 SETTLED_S = 15.0
@@ -82,7 +83,8 @@ class Teller:
         self._card, self._disk = card, disk
         self._state: tuple[Fault | None, bool] | None = None
         self._since_s = now_s
-        self._told = self._failed = False
+        self.told = False  # what there is to tell of this state has been told
+        self._failed = False
         self._writes = 0
 
     def tell(
@@ -90,12 +92,12 @@ class Teller:
     ) -> None:
         """`text` makes the file; it is called when there is something to tell and no sooner."""
         if (fault, streams) != self._state:
-            self._state, self._since_s, self._told = (fault, streams), now_s, False
-        if self._told or now_s - self._since_s < SETTLED_S or self._writes >= MOST_WRITES:
+            self._state, self._since_s, self.told = (fault, streams), now_s, False
+        if self.told or now_s - self._since_s < SETTLED_S or self._writes >= MOST_WRITES:
             return
         if fault is None and not streams:
             return  # it is starting
-        self._told = True
+        self.told = True
         try:
             self._writes += status.write(self._card, self._disk, text())
         except (DeployError, OSError) as error:
@@ -193,9 +195,10 @@ def main() -> int:
         teller.tell(fault, streams, partial(text_of, card, fault, view), begun_s)
         if fault is None:
             (lamp.heartbeat if streams else lamp.steady)()
-        while fault is not None and time.monotonic() - begun_s < LOOK_S:
+        until_s = begun_s + (CALM_S if teller.told else LOOK_S)
+        while fault is not None and time.monotonic() < until_s:
             lamp.blink(fault.blinks)
-        time.sleep(max(0.0, LOOK_S - (time.monotonic() - begun_s)))
+        time.sleep(max(0.0, until_s - time.monotonic()))
 
 
 if __name__ == "__main__":
