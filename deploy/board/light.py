@@ -24,7 +24,7 @@ from deploy.board.status import Status
 from deploy.errors import DeployError
 
 LOOK_S, CALM_S = 5.0, 20.0
-"""It looks so often until a state has settled, and seldom from then on: each look runs systemctl."""
+"""So often it looks until a state has settled, and from then on: each look runs systemctl."""
 PATIENCE_S = 90.0
 """The first frame and the first address may take so long on the slowest board."""
 SETTLED_S = 15.0
