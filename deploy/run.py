@@ -21,6 +21,7 @@ _PACKAGES = {
     "dumpe2fs": "e2fsprogs",
     "e2fsck": "e2fsprogs",
     "fakeroot": "fakeroot",
+    "fsck.vfat": "dosfstools",
     "git": "git",
     "gpg": "gnupg",
     "lsblk": "util-linux",

@@ -125,10 +125,11 @@ def build(
         size = align(ext4.bytes_needed(tree))
         ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
         say("boot and data partition, image, block map and checksums")
-        finish(work / image.name, board, front, place, new, epoch)
+        digest = finish(work / image.name, board, front, place, new, epoch)
         manifest.write(
             work / image.name,
             beside(work / image.name, ".manifest.json"),
+            digest=digest,
             board=board,
             checkout=checkout,
             epoch=epoch,
@@ -141,11 +142,11 @@ def build(
 
 def finish(
     image: Path, board: str, front: Tree, root_place: Path, new: Identifiers, epoch: int
-) -> None:
+) -> str:
     """Puts an image together from a boot partition's files and a root partition's file system.
 
     Adds the data partition, empty: the card makes its folders and grows it. Writes block map and
-    checksum, too.
+    checksum, too. Returns the image's SHA-256.
     """
     boot_place, data_place = image.with_name("boot"), image.with_name("data")
     size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
@@ -161,7 +162,9 @@ def finish(
     whole = power_of_two(total) if board == "qemu" else None
     partitions.assemble(image, layout, new.number("disk"), whole)
     run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
-    beside(image, ".sha256").write_text(f"{sha256(image)}  {image.name}\n")
+    digest = sha256(image)
+    beside(image, ".sha256").write_text(f"{digest}  {image.name}\n")
+    return digest
 
 
 def check_epoch(epoch: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,15 @@ from deploy.image.tree import Tree
 from deploy.run import run
 
 SCHEMA = "blimp.image/1"
+_NUMBER = re.compile(r"\d\.\d")
 
 # The tools whose work is in the bytes, and how each says its version.
 _TOOLS = {
     "debugfs": ["debugfs", "-V"],
     "mcopy": ["mcopy", "--version"],
     "mke2fs": ["mke2fs", "-V"],
-    "mkfs.vfat": ["mkfs.vfat", "--help"],
+    # mkfs.vfat says its version only at work; its sister of the same package always.
+    "mkfs.vfat": ["fsck.vfat", "-n", "/dev/null"],
     "sfdisk": ["sfdisk", "--version"],
 }
 
@@ -31,6 +34,7 @@ def write(
     image: Path,
     to: Path,
     *,
+    digest: str,
     board: str,
     checkout: Path,
     epoch: int,
@@ -45,6 +49,7 @@ def write(
     Args:
         image: finished.
         to: the manifest's file.
+        digest: the image's SHA-256 in hex.
         board, checkout, epoch: what it was made for, of and at.
         packages: name, version, architecture of what is installed.
         site: the unpacked wheels.
@@ -63,7 +68,7 @@ def write(
         "revision": git.revision(checkout),
         "epoch": epoch,
         "made": utc(epoch),
-        "image": {"size": image.stat().st_size, "sha256": sha256(image)},
+        "image": {"size": image.stat().st_size, "sha256": digest},
         "partitions": partitions,
         "units": list(units),
         "packages": [
@@ -71,6 +76,7 @@ def write(
             for name, version, architecture in packages
         ],
         "wheels": wheels(site),
+        "wheels_sha256": _all_files(site),
         "tools": {name: _version(words) for name, words in _TOOLS.items()},
     }
     if base is not None:
@@ -95,23 +101,25 @@ def packages_of(tree: Tree) -> list[tuple[str, str, str]]:
 
 
 def wheels(site: Path | None) -> list[dict[str, str]]:
-    """Name, version and a hash over all files of each unpacked wheel."""
-    if site is None:
-        return []
+    """Name, version and the hash of its list of files (RECORD) of each unpacked wheel."""
     result = []
-    for info in sorted(site.glob("*.dist-info")):
+    for info in sorted(site.glob("*.dist-info")) if site is not None else ():
         name, _, version = info.name.removesuffix(".dist-info").rpartition("-")
         record = info / "RECORD"
-        data = record.read_bytes() if record.is_file() else b""
-        result.append(
-            {"name": name, "version": version, "record_sha256": hashlib.sha256(data).hexdigest()}
-        )
+        digest = sha256(record) if record.is_file() else ""
+        result.append({"name": name, "version": version, "record_sha256": digest})
+    return result
+
+
+def _all_files(site: Path | None) -> str:
+    """One hash over all files of the wheels, as of what `sha256sum` prints for them."""
     whole = hashlib.sha256()
-    for path in folder_files(site):
-        whole.update(f"{sha256(site / path)}  {path}\n".encode())
-    return [*result, {"name": "(all files)", "version": "", "sha256": whole.hexdigest()}]
+    if site is not None:
+        for path in folder_files(site):
+            whole.update(f"{sha256(site / path)}  {path}\n".encode())
+    return whole.hexdigest()
 
 
 def _version(words: list[str]) -> str:
     said = run(words, merge=True, ok=(0, 1)).decode(errors="replace")
-    return next((line.strip() for line in said.splitlines() if line.strip()), "")
+    return next((line.strip() for line in said.splitlines() if _NUMBER.search(line)), "")

@@ -84,10 +84,12 @@ def build(
         files = _boot_files(base, boot_place, work / "base-files")
         front = boot.contents(board.name, _KERNEL, board.machine, files, first, where)
         say("boot and data partition, image, block map and checksums")
-        card.finish(work / image.name, board.name, front, root_place, new, epoch)
+        whole = work / image.name
+        digest = card.finish(whole, board.name, front, root_place, new, epoch)
         manifest.write(
             work / image.name,
             beside(work / image.name, ".manifest.json"),
+            digest=digest,
             board=board.name,
             checkout=checkout,
             epoch=epoch,
