@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from hw import inverse, output, tables
-from hw.builds import Conditions, shipped_builds, with_ballast
+from hw.builds import Conditions, with_ballast
 from hw.buoyancy import THESIS_GROSS_G, gross_lift_g, gross_of, margin_g, reckon
+from hw.catalogue import shipped_builds
 from hw.command import CONDITIONS, MASSES, WEAR
 from hw.endurance import Wear
 from hw.envelopes import Envelope, of_shape, of_volume

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from hw.balance import balance_of
-from hw.builds import shipped_builds
+from hw.catalogue import shipped_builds
 from hw.errors import HardwareError
 
 

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 from hw import output, tables
-from hw.builds import shipped_builds
 from hw.buoyancy import reckon
+from hw.catalogue import shipped_builds
 from hw.endurance import Wear
 from hw.errors import HardwareError
 from hw.parts import shipped_parts
@@ -50,8 +50,12 @@ def drawings() -> dict[Path, str]:
 
 
 def write() -> list[Path]:
-    """Writes tables into the page, and the drawings beside it."""
-    output.write_text(PAGE, filled(PAGE.read_text(encoding="utf-8")))
+    """Writes tables into the page, and the drawings beside it; raises `HardwareError`."""
+    try:
+        page = PAGE.read_text(encoding="utf-8")
+    except OSError as error:
+        raise HardwareError(f"{PAGE}: {error.strerror or error}") from None
+    output.write_text(PAGE, filled(page))
     for path, text in drawings().items():
         output.write_text(path, text)
     return [PAGE, *drawings()]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hw.balance import balance_of, climb_of
-from hw.builds import Build, Catalogue
-from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, margin_g, reckon
+from hw.builds import Build
+from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, gross_of, margin_g, sigmas
+from hw.catalogue import Catalogue
 from hw.endurance import MODES, Endurance, Wear, fly
 from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_envelope
 from hw.parts import Part
@@ -90,11 +92,11 @@ def builds_table(catalogue: Catalogue) -> Table:
     """All builds: mass, margin, minutes when streaming, pitch."""
     rows = []
     for build in catalogue.builds.values():
-        margin, flown = reckon(build, samples=100), fly(build)
+        flown, sigma = fly(build), math.hypot(*sigmas(build).values())
         pitch = balance_of(build).pitch_deg
         rows.append((
-            f"`{build.name}`", f"{margin.gross_g:.0f}", f"{margin.mass_g:.0f}",
-            f"{margin.margin_g:+.0f} ± {margin.sigma_g:.0f}", f"{flown.minutes:.0f}",
+            f"`{build.name}`", f"{gross_of(build):.0f}", f"{build.mass_g:.0f}",
+            f"{margin_g(build):+.0f} ± {sigma:.0f}", f"{flown.minutes:.0f}",
             f"{flown.end_A:.2f} of {flown.rating_A:g}",
             "turns over" if pitch is None else f"{_zero(pitch):+.1f}",
         ))  # fmt: skip

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw.builds import Build, Conditions, Hull, shipped_builds
+from hw.builds import Build, Conditions, Hull
 from hw.buoyancy import gross_lift_g, gross_of, lift_in, margin_g, reckon, sampled_margins_g
+from hw.catalogue import shipped_builds
 from hw.errors import HardwareError
 
 THESIS_M3 = 0.1905

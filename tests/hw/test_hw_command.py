@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hw import answering
-from hw.builds import BUILDS_FILE, load_builds
+from hw.catalogue import BUILDS_FILE, load_builds
 from hw.command import main
 
 ROOT = Path(__file__).parents[2]

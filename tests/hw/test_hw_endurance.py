@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from hw.builds import Build, shipped_builds
+from hw.builds import Build
+from hw.catalogue import shipped_builds
 from hw.endurance import MODES, Wear, drain, fly, load_of
 from hw.errors import HardwareError
 from hw.inverse import cell_of, with_cell

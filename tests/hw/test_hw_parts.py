@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hw.builds import BUILDS_FILE, load_builds
+from hw.catalogue import BUILDS_FILE, load_builds
 from hw.parts import MIN_UNWEIGHED_SPREAD, PARTS_FILE, load_parts
 from pi_firmware.wire.errors import BlimpError
 

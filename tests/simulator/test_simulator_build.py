@@ -13,7 +13,7 @@ from ground_station.simulator.motion import Mount
 from ground_station.simulator.plans import Reference, plan_named
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, prepare_flight
-from hw.builds import shipped_builds
+from hw.catalogue import shipped_builds
 from hw.errors import HardwareError
 from hw.flight import flight_model
 
