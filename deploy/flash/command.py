@@ -14,6 +14,7 @@ from deploy.flash import customise, image, keys, refusals, wishes, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
 from deploy.flash.disks import Disk, Machine
+from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
 from deploy.flash.wishes import WifiWish
 from deploy.provisioning import Provisioning, Wifi
@@ -66,14 +67,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with _interruptible():
             _run(options)
-    except write.Interrupted as error:
-        print(f"deploy.flash: {error}", file=sys.stderr)
-        return _INTERRUPTED
     except DeployError as error:
         print(f"deploy.flash: {error}", file=sys.stderr)
+        return _INTERRUPTED if isinstance(error, Interrupted) else 2
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"deploy.flash: {where}{error.strerror or error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("deploy.flash: interrupted; no image was written", file=sys.stderr)
+        print("deploy.flash: interrupted; nothing was written", file=sys.stderr)
         return _INTERRUPTED
     return 0
 
@@ -86,7 +88,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.customise_only:
         with Target.open(device) as target:
             boot = _boot_of(target)
-            content = _content(options, customise.stored(boot))
+            content = _content(options, _stored(options, boot))
             customise.check_room(boot, content)
             _confirm(options, disk, target, "change its settings")
             written = customise.customise(target, boot, content)
@@ -121,18 +123,41 @@ def _needed(options: argparse.Namespace) -> None:
     for name in ("image", "payload"):
         if getattr(options, name) is None:
             raise DeployError(f"--{name} is missing (--customise-only writes no image)")
+    _network_named(options)
+
+
+def _network_named(options: argparse.Namespace) -> None:
     if options.wifi_ssid is None and options.wifi is None and not options.no_wifi:
         raise DeployError("expected --wifi-ssid, --wifi, or --no-wifi for a payload on a cable")
 
 
+def _stored(options: argparse.Namespace, boot: BootPartition) -> Provisioning | None:
+    """What the card says; all must be named where it says nothing, or nothing that is right."""
+    existing = None
+    try:
+        existing = customise.stored(boot)
+    except DeployError as error:
+        if options.payload is None:
+            raise DeployError(f"{error} (name all anew: --payload and Wi-Fi)") from None
+        print(f"the card's {error}; it is written anew")
+    if existing is None:
+        if options.payload is None:
+            raise DeployError("--payload is missing: the card does not have a name yet")
+        _network_named(options)
+    return existing
+
+
 def _content(options: argparse.Namespace, existing: Provisioning | None) -> Content:
     """All that was asked for, checked; the password is asked for last."""
-    payload = options.payload or (existing.payload_id if existing else None)
-    if payload is None:
-        raise DeployError("--payload is missing: the card does not have a name yet")
+    payload = options.payload or (existing.payload_id if existing else "")
     Provisioning(payload)  # its name, before it is a folder's
     folder = options.keys or wishes.default_keys()
     held = keys.load(folder, payload) if options.payload else None
+    if held is not None and keys.SIGNERS not in held.files:
+        print(
+            f"note: the card will take no updates: {folder} names no key of releases for it;"
+            " make one, and set it up again: blimp keys release"
+        )
     ssh = _ssh_keys(options, folder, held, existing)
     settings = None
     if options.payload_toml is not None:
@@ -140,10 +165,10 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
         certificates = folder / "payload" / payload if held else None
         customise.check_payload_toml(options.payload_toml, settings, payload, certificates)
     before = {"no_wifi": options.no_wifi, "ground": options.ground, "ssh": ssh}
-    wishes.merge(existing, payload, None, country=options.country, **before)
-    provisioning = wishes.merge(
-        existing, payload, _wifi(options), country=options.country, **before
-    )
+    wishes.merge(existing, payload, None, **before)  # before a password is typed for nothing
+    wifi = _wifi(options)
+    country = options.country if wifi is None else None
+    provisioning = wishes.merge(existing, payload, wifi, country=country, **before)
     return Content(provisioning, held.files if held else None, settings)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.flash.boot import FOLDER, BootPartition
+from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse, render
 
@@ -24,6 +25,7 @@ TOML, PAYLOAD_TOML, CERTIFICATES = (
 # A file takes whole clusters, and a folder entry; none of ours is larger.
 _CLUSTER_BYTES = 32 * 1024
 _CHECK_S = 60.0
+_NOT_SET = "the card may lack its settings; set them again"
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Content:
 
 
 def stored(boot: BootPartition) -> Provisioning | None:
-    """What the card's `blimp.toml` says; None when there is none."""
+    """What the card's `blimp.toml` says; None when there is none. Raises `DeployError`."""
     return parse(boot.read(TOML)) if boot.has(TOML) else None
 
 
@@ -66,7 +68,9 @@ def customise(target: Target, boot: BootPartition, content: Content) -> list[str
         return _customise(target, boot, content.files(), content.certificates is not None)
     except OSError as error:
         reason = error.strerror or error
-        raise DeployError(f"{boot.shown}: write error: {reason}: set it up again") from None
+        raise DeployError(f"{boot.shown}: write error: {reason}: {_NOT_SET}") from None
+    except KeyboardInterrupt:
+        raise Interrupted(f"{boot.shown}: interrupted: {_NOT_SET}") from None
 
 
 def _customise(

@@ -50,7 +50,7 @@ def opened(path: Path, *, checksum: bool, board: str = "") -> Iterator[Image]:
         DeployError: it is missing, cut, damaged, not ours or for another board.
     """
     with contextlib.ExitStack() as stack:
-        try:
+        try:  # of the image only: what goes wrong while it is used is told there
             source = stack.enter_context(open(path, "rb"))
             file = _checked(path, source, stack, checksum)
             size = file.seek(0, os.SEEK_END)
@@ -62,9 +62,10 @@ def opened(path: Path, *, checksum: bool, board: str = "") -> Iterator[Image]:
                     f"{path}: an image for {found or 'a board that no .manifest.json tells'};"
                     f" this card is to be for {board}"
                 )
-            yield Image(path, file, size, _stretches(path, file, size), boot, found, version)
+            image = Image(path, file, size, _stretches(path, file, size), boot, found, version)
         except OSError as error:
             raise DeployError(f"{path}: {error.strerror or error}") from None
+        yield image
 
 
 def _checked(path: Path, source: BinaryIO, stack: contextlib.ExitStack, required: bool) -> BinaryIO:

@@ -11,7 +11,8 @@ from deploy.errors import DeployError
 from deploy.flash.wishes import read_file
 
 NEEDED = ("ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key")
-OPTIONAL = ("ssh_ed25519", "ssh_ed25519.pub")
+SIGNERS = "allowed_signers"  # whose releases the payload takes
+OPTIONAL = ("ssh_ed25519", "ssh_ed25519.pub", SIGNERS)
 _ACCESS_SCHEMA = "blimp.access/1"
 
 

@@ -41,6 +41,8 @@ def read_wifi(wish: WifiWish, ask: Callable[[str], str] | None = None) -> Wifi |
     """
     if [wish.ssid is not None, wish.file is not None, wish.none].count(True) > 1:
         raise DeployError("expected one of --wifi-ssid, --wifi and --no-wifi")
+    if wish.ssid is None and (wish.security is not None or wish.hidden):
+        raise DeployError("--wifi-security and --wifi-hidden go with --wifi-ssid")
     if wish.file is not None:
         named = parse_wifi(read_file(wish.file), wish.file.name, wish.country)
         if wish.password_file is None:
@@ -66,7 +68,7 @@ def read_wifi(wish: WifiWish, ask: Callable[[str], str] | None = None) -> Wifi |
 
 def merge(
     existing: Provisioning | None,
-    payload: str | None,
+    payload: str,
     wifi: Wifi | None,
     *,
     no_wifi: bool = False,
@@ -79,8 +81,6 @@ def merge(
     An empty password keeps the card's own, where it is for the same network. None keeps, too.
     """
     if existing is None:
-        if payload is None:
-            raise DeployError("--payload is missing: the payload's name, as blimp-1")
         existing = Provisioning(payload)
     old = existing.wifi
     if wifi is not None and wifi.security != OPEN and not wifi.password:
@@ -89,8 +89,10 @@ def merge(
         wifi = dataclasses.replace(wifi, password=old.password)
     if wifi is None and not no_wifi and old is not None:
         wifi = dataclasses.replace(old, country=country or old.country)
+    if wifi is None and country is not None:
+        raise DeployError(f"--country {country}: there is no Wi-Fi to set it for")
     return Provisioning(
-        payload_id=payload or existing.payload_id,
+        payload_id=payload,
         wifi=wifi,
         ground_station=GroundStation(ground) if ground is not None else existing.ground_station,
         authorized_keys=existing.authorized_keys if ssh is None else ssh,

@@ -20,6 +20,7 @@ from deploy.errors import DeployError
 from deploy.flash.bmap import CHUNK_BYTES, Stretch, chunks
 from deploy.flash.boot import SECTOR_BYTES
 from deploy.flash.image import Image
+from deploy.flash.interrupted import Interrupted
 from deploy.flash.progress import Progress
 from deploy.flash.target import Target
 
@@ -27,6 +28,7 @@ from deploy.flash.target import Target
 HEAD_BYTES = 1 << 20
 # Waited for so often, so that the bar tells what is on the card and Ctrl-C does not wait long.
 _FLUSH_BYTES = 32 << 20
+UNKNOWN = "what the card holds now is not known; flash it again"
 NOT_BOOTABLE = "the card has no partition table now and does not boot; flash it again"
 
 
@@ -37,15 +39,18 @@ def write(image: Image, target: Target, customise: Callable[[], None]) -> None:
     """
     head = Stretch(0, min(HEAD_BYTES, image.boot.offset))
     body = [part for part in _without(head, image.stretches) if part.start < part.stop]
-    with _never_half(target, head):
+    stage = _Stage()
+    with _never_half(target, stage):
         target.write(0, bytes(head.stop))
         _flush(target, 0)
+        stage.table_gone = True
         _write(image, target, body)
         _compare(image, target, body)
         customise()
         first = Stretch(0, SECTOR_BYTES)
         rest = Stretch(SECTOR_BYTES, head.stop)
         for last in (rest, first):
+            stage.table_gone = last is rest
             for start, data in chunks(image.file, last):
                 target.write(start, data)
             _flush(target, last.start)
@@ -57,24 +62,26 @@ def _without(head: Stretch, stretches: Iterable[Stretch]) -> Iterator[Stretch]:
         yield Stretch(max(stretch.start, head.stop), stretch.stop)
 
 
+class _Stage:
+    """Whether zeros are known to stand in sector 0, whatever the card answers from now on."""
+
+    table_gone = False
+
+
 @contextlib.contextmanager
-def _never_half(target: Target, head: Stretch) -> Iterator[None]:
+def _never_half(target: Target, stage: _Stage) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        zeroed = _zero_again(target)
-        state = NOT_BOOTABLE if zeroed else "the card may hold half of it; don't use it"
-        if isinstance(error, KeyboardInterrupt):
+        known = stage.table_gone or _zero_again(target)
+        state = NOT_BOOTABLE if known else UNKNOWN
+        if isinstance(error, KeyboardInterrupt | Interrupted):
             raise Interrupted(f"{target.path}: interrupted: {state}") from None
         if isinstance(error, OSError):
             raise DeployError(f"{target.path}: {error.strerror or error}: {state}") from None
         if isinstance(error, DeployError):
             raise DeployError(f"{error}: {state}") from None
         raise
-
-
-class Interrupted(DeployError):
-    """Stopped by a person, with what that means for the card."""
 
 
 def _zero_again(target: Target) -> bool:

@@ -16,7 +16,10 @@ from deploy.provisioning.wpa import psk
 BOOT_MIB, ROOT_MIB = 8, 8
 BOOT_END = BOOT_OFFSET + BOOT_MIB * MEBI
 GAP = slice(BOOT_END + ROOT_MIB * MEBI, BOOT_END + (ROOT_MIB + GAP_MIB) * MEBI)
-KEYS = ("ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key", "ssh_ed25519")
+KEYS = (
+    "ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key", "ssh_ed25519",
+    "ssh_ed25519.pub", "allowed_signers",
+)  # fmt: skip
 
 
 def test_the_card_holds_the_image_and_what_was_asked_for(bench: Bench, tmp_path: Path) -> None:
@@ -101,7 +104,10 @@ def test_settings_change_an_image_file_too_and_only_what_was_named(bench: Bench)
     """An image straight from the builder, customised without a device and without a flash."""
     shutil.copy(bench.image, bench.card)
     refused(bench.customise(), "--payload is missing")
-    assert run(bench.customise("--payload", "blimp-2", "--ground", "gs.local")).returncode == 0
+    refused(bench.customise("--payload", "blimp-2"), "--no-wifi")
+    refused(bench.customise("--payload", "blimp-2", "--no-wifi", "--country", "DE"), "no Wi-Fi")
+    words = bench.customise("--payload", "blimp-2", "--no-wifi", "--ground", "gs.local")
+    assert run(words).returncode == 0
     told = parse(bench.toml())
     assert (told.payload_id, told.wifi, told.ground_station.host) == ("blimp-2", None, "gs.local")
     wifi = ["--wifi-ssid", "hall", "--wifi-password-file", str(bench.password()), "--country", "DE"]
@@ -115,7 +121,7 @@ def test_settings_change_an_image_file_too_and_only_what_was_named(bench: Bench)
 
 def test_another_payloads_keys_leave_none_of_the_first(bench: Bench) -> None:
     shutil.copy(bench.image, bench.card)
-    assert run(bench.customise("--payload", "blimp-1")).returncode == 0
+    assert run(bench.customise("--payload", "blimp-1", "--no-wifi")).returncode == 0
     words = ["mcopy", "-i", f"{bench.card}@@{BOOT_OFFSET}", "-", "::/blimp/certificates/left"]
     tool(*words, input=b"another tool's")
     assert run(bench.customise("--payload", "blimp-2")).returncode == 0
@@ -123,6 +129,17 @@ def test_another_payloads_keys_leave_none_of_the_first(bench: Bench) -> None:
     for name in KEYS:
         made = (bench.keys / "payload/blimp-2" / name).read_bytes()
         assert bench.read(f"blimp/certificates/{name}") == made
+
+
+def test_settings_that_are_damaged_are_written_anew_when_all_is_named(bench: Bench) -> None:
+    """As after a power cut while the card or a laptop wrote them."""
+    shutil.copy(bench.image, bench.card)
+    target = ["mcopy", "-i", f"{bench.card}@@{BOOT_OFFSET}", "-", "::/blimp/blimp.toml"]
+    tool(*target, input=bytes(512))
+    refused(bench.customise("--no-wifi"), "it holds a NUL byte")
+    refused(bench.customise("--payload", "blimp-1"), "--no-wifi")
+    assert run(bench.customise("--payload", "blimp-1", "--no-wifi")).returncode == 0
+    assert parse(bench.toml()).payload_id == "blimp-1"
 
 
 def test_an_empty_password_keeps_the_cards_own_of_the_same_network(bench: Bench) -> None:

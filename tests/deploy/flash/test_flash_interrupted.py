@@ -21,6 +21,7 @@ from deploy.errors import DeployError
 from deploy.flash import customise, image, keys, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
+from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse
 
@@ -92,6 +93,25 @@ def test_an_error_of_the_card_is_told_and_leaves_no_table(
     assert _is_zero(_sector(bench))
 
 
+@pytest.mark.parametrize("place", [0, BOOT_OFFSET + 5000, 12 << 20])
+def test_a_card_that_is_pulled_out_has_no_table(bench: Bench, place: int) -> None:
+    """From then on nothing answers, so that what is there must be known before."""
+    gone = []
+
+    def fault(what: str, offset: int, data: bytes) -> bytes:
+        if what == "write" and offset + len(data) > place >= offset and any(data):
+            gone.append(place)
+        if gone:
+            raise OSError(errno.EIO, "Input/output error")
+        return data
+
+    with pytest.raises(DeployError) as caught:
+        _flash(bench, fault)
+    # Sector 0 itself, the last one, is written or not: that nobody knows.
+    assert str(caught.value).endswith(write.NOT_BOOTABLE if place else write.UNKNOWN)
+    assert _is_zero(_sector(bench))
+
+
 def test_an_error_told_late_leaves_no_table(bench: Bench) -> None:
     """As a system that keeps writes in memory tells it: with a flush, after them."""
     flushes = iter(range(100))
@@ -143,7 +163,7 @@ def test_ctrl_c_leaves_no_table(bench: Bench, place: int) -> None:
             raise KeyboardInterrupt
         return data
 
-    with pytest.raises(write.Interrupted, match="interrupted: the card has no partition table"):
+    with pytest.raises(Interrupted, match="interrupted: the card has no partition table"):
         _flash(bench, fault)
     assert _is_zero(_sector(bench))
 
