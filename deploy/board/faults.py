@@ -21,7 +21,7 @@ NO_PROVISIONING = Fault(
 )
 REFUSED = Fault(
     3,
-    "what this folder says is refused; what was in force before still is, if there was any",
+    "something in this folder is refused; what was in force before still is",
     "Mend what the reason names, here on the boot partition, and start the payload again.",
 )
 NO_VIDEO = Fault(
