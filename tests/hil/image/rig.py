@@ -143,7 +143,7 @@ class Rig:
         self.ground.__exit__()
 
     def _flash(self, image: Path) -> None:
-        for words in (("init",), ("ground", "main"), ("payload", PAYLOAD)):
+        for words in (("init",), ("release",), ("ground", "main"), ("payload", PAYLOAD)):
             program("ground_station.cli", "keys", "--folder", self.keys, *words)
         settings = self.folder / "settings.toml"
         settings.write_text(SETTINGS)

@@ -6,14 +6,13 @@ BLIMP_IMAGE. Figures go to out/hil-image.json. Seeds: BLIMP_SEED (default 1) dra
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,8 @@ from rig import CHECKOUT, PAYLOAD, Figures, Rig, Up, program
 
 from deploy.emulator import card, gauge
 from deploy.run import need, run
+from ground_station.stream.telemetry import PayloadState
+from pi_firmware.wire.messages import Health
 
 OUT = CHECKOUT / "out"
 SEED = int(os.environ.get("BLIMP_SEED", "1"))
@@ -74,7 +75,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, image: Path, figures: Figures)
 
 def assert_from_vivid(up: Up) -> None:
     """vivid's picture is eight colour bars, white to black: their brightness falls to the right."""
-    luma = up.frame.gray
+    luma = up.frame.image
     assert luma.shape == (180, 320)
     bars = np.median(luma[90:170], axis=0).reshape(8, 40)[:, 8:32].mean(axis=1)
     assert (np.diff(bars) < -4).all(), bars.round().tolist()
@@ -110,8 +111,8 @@ def test_it_streams_at_its_rate_and_stays_small(rig: Rig, figures: Figures) -> N
     begun = time.monotonic()
     taken = rig.frames(40)
     rate_hz = len(taken) / (time.monotonic() - begun)
-    sequences = [frame.info.sequence for frame in taken]
-    figures.add("frames", {"rate_hz": round(rate_hz, 2), "of": taken[0].gray.shape[::-1]})
+    sequences = [frame.sequence for frame in taken]
+    figures.add("frames", {"rate_hz": round(rate_hz, 2), "of": taken[0].image.shape[::-1]})
     assert sequences == sorted(set(sequences))
     rig.run_until(rig.machine.age_s + STEADY_S)
     state = rig.ground.state()
@@ -168,8 +169,8 @@ def test_it_comes_back_from_a_power_cut(rig: Rig, figures: Figures, cycle: int) 
     rig.run_until(at_s)
     said = rig.machine.tail(2)
     health = rig.cut()
-    told = {"kind": kind, "cut_at_s": round(at_s, 2), "journal_replayed": health.replayed}
-    figures.append("cuts", {**told, "problems": list(health.problems), "last_words": said})
+    facts = {"kind": kind, "cut_at_s": round(at_s, 2), "journal_replayed": health.replayed}
+    figures.append("cuts", {**facts, "problems": list(health.problems), "last_words": said})
     assert health.problems == ()
     rig.power(volts=draw.randrange(46_080, 53_760) * VCELL_BIT_V)
     up = rig.until_up()
@@ -250,23 +251,31 @@ def site() -> Path:
     return fetch_wheels(load_board("qemu"), OUT / "cache/image")
 
 
-def version(rig: Rig) -> str:
-    said = json.loads(rig.ssh("cat /run/blimp/running.json"))
-    return str(said["version"])
+def told(rig: Rig, words: str, condition: Callable[[Health], bool]) -> Health:
+    """The payload's health in telemetry, once it meets a condition."""
+
+    def met(state: PayloadState) -> bool:
+        return state.health is not None and condition(state.health)
+
+    state = rig.ground.telemetry.wait(PAYLOAD, met, 180)
+    assert state is not None and state.health is not None, words + rig.machine.tail()
+    return state.health
 
 
 def test_an_update_comes_into_force(rig: Rig, figures: Figures, checkout: Path) -> None:
     rig.machine.cut()
     rig.power()
     rig.until_up()
-    before = version(rig)
+    before = told(rig, "no health", lambda health: health.version != "")
     note = (checkout / "pi_firmware/__init__.py").read_text() + "\n# another release\n"
     commit(checkout, "pi_firmware/__init__.py", note)
     begun = time.monotonic()
     status, said = update(rig, checkout)
     figures.add("update", {"s": round(time.monotonic() - begun, 1), "said": said.splitlines()})
     assert status == 0, said + rig.machine.tail()
-    assert version(rig) != before
+    after = told(rig, "no new version", lambda health: health.version != before.version)
+    assert before.release == "factory" and after.release == "update"
+    rig.ground.drain()
     rig.frames(5)
 
 
@@ -274,12 +283,13 @@ def test_an_update_that_never_gets_healthy_falls_back(
     rig: Rig, figures: Figures, checkout: Path
 ) -> None:
     ensure_up(rig)
-    before = version(rig)
+    before = told(rig, "no health", lambda health: health.version != "")
     commit(checkout, "pi_firmware/__main__.py", NEVER_HEALTHY)
     begun = time.monotonic()
     status, said = update(rig, checkout)
     figures.add("fallback", {"s": round(time.monotonic() - begun, 1), "said": said.splitlines()})
     assert status == 1 and "no frames within" in said, said + rig.machine.tail()
-    assert version(rig) == before
+    after = told(rig, "no reason", lambda health: health.release == "fell back")
+    assert after.version == before.version and "no frames within" in after.release_reason
     rig.ground.drain()
     rig.frames(5)
