@@ -83,7 +83,8 @@ def _update(given: argparse.Namespace) -> int:
     try:
         factory = manifest.Release(**state["factory"])
         running, board = str(state["in_force"]["version"]), str(state["board"])
-    except (KeyError, TypeError):
+        limit_s = float(state["limit_s"])
+    except (KeyError, TypeError, ValueError):
         raise DeployError(f"{host}: tells its releases otherwise than this checkout") from None
     _say(f"{given.payload} ({board or 'an unknown board'}) runs {running}")
     site = given.site or fetch_wheels(load_board(board), _CACHE)
@@ -97,8 +98,8 @@ def _update(given: argparse.Namespace) -> int:
     if not answer.get("id"):
         _say(f"{version} is in force already")
         return 0
-    _say(f"{version} is on the card and on trial: frames must come within two minutes")
-    last = card.follow(str(answer["id"]), _say)
+    _say(f"{version} is on the card and on trial: frames must come within {limit_s:g} s")
+    last = card.follow(str(answer["id"]), limit_s, _say)
     if is_healthy(last):
         _say(f"{version} is in force")
         return 0

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from deploy.board.releases.choose import HEALTHY
-from deploy.board.releases.watch import LIMIT_S
 from deploy.errors import DeployError
 from deploy.run import need
 from deploy.update import bundle as bundles
@@ -138,15 +137,19 @@ class Card:
     def follow(
         self,
         trial: str,
+        limit_s: float,
         say: Callable[[str], None],
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> dict[str, Any]:
-        """Waits for the outcome of a trial; raises `DeployError` when it is not heard in time.
+        """Waits for the outcome of a trial, which the card gives within `limit_s`.
+
+        Raises `DeployError` when it is not heard in time.
 
         A link that goes and comes back, as it may while the firmware is started anew, is no end.
         """
-        until_s, fault = clock() + LIMIT_S + _SLACK_S, ""
+        limit_s += _SLACK_S
+        until_s, fault = clock() + limit_s, ""
         while clock() < until_s:
             try:
                 found = self.ask("status")
@@ -161,7 +164,7 @@ class Card:
                     return dict(last)
             sleep(_POLL_S)
         raise DeployError(
-            f"{self.name}: not heard what became of it within {LIMIT_S + _SLACK_S:g} s"
+            f"{self.name}: not heard what became of it within {limit_s:g} s"
             f"{f' ({fault})' if fault else ''}; the card decides by itself, ask again"
         )
 

@@ -70,7 +70,7 @@ class Card:
         (root / "proc/uptime").symlink_to("/proc/uptime")
         self.boot("boot-1")
         lay(self.at.factory, contents(NOW))
-        lay(self.at.board.parent, {"board.json": b'{"board": "qemu"}'})
+        lay(self.at.board.parent, {"board.json": b'{"board": "zero2w"}'})
         public = key.with_suffix(".pub").read_text()
         self.at.signers.write_text(f'blimp-release namespaces="blimp-release" {public}')
 

@@ -134,6 +134,18 @@ def test_one_that_gives_no_frames_goes_back_within_two_minutes(card: Card) -> No
     assert card.choice() == Choice("", "fell back", reason)
 
 
+def test_an_emulated_board_gets_the_time_that_it_takes(card: Card) -> None:
+    assert watch.status(card.at)["limit_s"] == LIMIT_S
+    card.at.board.write_text('{"board": "qemu"}')
+    clock = trial_of(card)
+    card.service.now = STARTING
+    begun_s = clock.now_s
+    watched(card, clock)
+    limit_s = watch.status(card.at)["limit_s"]
+    assert limit_s <= clock.now_s - begun_s < limit_s + 3 and limit_s == 220
+    assert last(card) == (FELL_BACK, f"{NEW}: no frames within 220 s (activating)")
+
+
 def test_one_that_ends_goes_back_at_once(card: Card) -> None:
     clock = trial_of(card)
     card.service.now = STARTING
