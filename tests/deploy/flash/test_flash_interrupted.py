@@ -202,7 +202,7 @@ def test_settings_that_stop_halfway_leave_none(
             customise.customise(target, boot, content)
     assert "blimp/blimp.toml" not in bench.listed()
     monkeypatch.undo()
-    assert run(bench.customise("--payload", "blimp-2")).returncode == 0
+    assert run(bench.customise("--payload", "blimp-2", "--no-wifi")).returncode == 0
     assert parse(bench.toml()).payload_id == "blimp-2"
 
 
