@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +14,9 @@ from hw.errors import HardwareError
 from hw.inverse import cell_of, with_cell
 from hw.parts import load_parts
 from pi_firmware.battery.cell import Cell
+from pi_firmware.wire import config
 
+ROOT = Path(__file__).parents[2]
 PARTS = load_parts()
 CELL, BOOST = PARTS["lipo-1300"], PARTS["boost-tps61090"]
 FRESH = Wear(health_percent=100, cutoff_V=3.0, reserve_percent=0)
@@ -56,6 +59,12 @@ def test_harder_work_an_older_or_a_colder_cell_and_a_higher_cut_off_end_it_earli
     ):
         assert fly(build, wear=worse).minutes < base, worse
     assert fly(build, wear=Wear(health_percent=100)).minutes > base
+
+
+def test_the_limits_are_those_of_the_payloads_shipped_file() -> None:
+    battery = config.read(ROOT / "pi_firmware" / "payload.toml")["battery"]
+    assert Wear().cutoff_V == battery["critical_V"]
+    assert Wear().reserve_percent == 100 * battery["critical_percentage"]
 
 
 def test_the_shunt_in_series_costs_minutes() -> None:
