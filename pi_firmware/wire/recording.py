@@ -90,7 +90,12 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from None
         # H.264 does not compress further; JSON and poses are small beside it.
-        self._writer = Writer(self._file, chunk_size=chunk_bytes, compression=CompressionType.NONE)
+        self._writer = Writer(
+            self._file,
+            chunk_size=chunk_bytes,
+            compression=CompressionType.NONE,
+            use_summary_offsets=False,  # the library tells of groups it has not, which doctors refuse
+        )
         with self._disk():
             self._writer.start(profile=profile, library="blimp")
         self._channels: dict[str, int] = {}

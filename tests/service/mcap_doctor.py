@@ -154,7 +154,7 @@ class _Doctor:
                 self._statistics(one)
             elif opcode == Opcode.SUMMARY_OFFSET:
                 first, *_, end = groups.get(one.group_opcode, [0, 0])
-                # The mcap library also tells of groups that it has not, of no length.
+                # The shipped sample also tells of groups that it has not, of no length.
                 self._expect(
                     one.group_length == 0
                     or (one.group_start, one.group_length) == (first, end - first),

@@ -60,7 +60,6 @@ def plus_one(data: bytearray, place: int) -> None:
         (Opcode.STATISTICS, 8, "schema_count"),
         (Opcode.STATISTICS, 22, "chunk_count"),
         (Opcode.STATISTICS, 34, "message_end_time"),
-        (Opcode.SUMMARY_OFFSET, 1, "lies elsewhere"),
         (Opcode.FOOTER, 0, "the summary begins elsewhere"),
         (Opcode.FOOTER, 16, "the checksum of the summary"),
     ],
