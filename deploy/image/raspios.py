@@ -25,8 +25,9 @@ from deploy.run import run
 _OS_RELEASE = "usr/lib/os-release"
 _STATUS = "var/lib/dpkg/status"
 _KERNEL, _KERNEL_SUFFIX = "kernel.img", "-rpi-v6"
-# What of the root is looked at: accounts, units, the kernel's tables and what goes into the initrd.
-_WANTED = ("etc/", "usr/lib/systemd/system", "usr/lib/sysusers.d/", "usr/lib/modules/")
+# What of the root is looked at: accounts, units, the kernel's modules and what else the initrd has.
+_WANTED = ("etc/", "usr/lib/systemd/system", "usr/lib/sysusers.d/")
+_MODULES = "usr/lib/modules/"
 _WANTED_FILES = (_OS_RELEASE, _STATUS, "usr/bin/busybox")
 # Its first boot's and its own first root.
 _NOT_TAKEN = ("config.txt", "cmdline.txt", "issue.txt", "initramfs*", "firstrun.sh", "userconf*",
@@ -127,6 +128,8 @@ def _take_apart(base: Path, work: Path, boot_place: Path, root_place: Path) -> N
 
 
 def _is_wanted(path: str) -> bool:
+    if path.startswith(_MODULES):
+        return path.split("/")[3].endswith(_KERNEL_SUFFIX)  # not the other boards' kernels
     return path.startswith(_WANTED) or path in _WANTED_FILES
 
 

@@ -10,9 +10,10 @@ import tarfile
 from pathlib import Path
 
 import pytest
+from card_parts import EPOCH, commit, git
 
 from deploy.errors import DeployError
-from deploy.image import cpio, sparse
+from deploy.image import checkout, cpio, release, sparse
 from deploy.image.partitions import align, power_of_two
 from deploy.image.sparse import Range
 from deploy.image.tree import Tree
@@ -161,6 +162,29 @@ def test_the_cpio_archive_is_what_cpio_reads(tmp_path):
     assert (folder / "bin/tool").read_bytes() == b"abcde"
     assert (folder / "bin/tool").stat().st_mode & 0o777 == 0o755
     assert (folder / "dev").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_release_tells_its_commit_and_what_was_changed_since(tmp_path):
+    folder = tmp_path / "checkout"
+    (folder / "pi_firmware").mkdir(parents=True)
+    (folder / "tests").mkdir()
+    (folder / "pyproject.toml").write_text('[project]\nversion = "1.2.3"\n')
+    (folder / "pi_firmware/__main__.py").write_text("")
+    (folder / "tests/test_x.py").write_text("")
+    git(folder, "init", "-q")
+    git(folder, "add", "-A")
+    commit(folder)
+    head = git(folder, "rev-parse", "HEAD").strip()
+    assert checkout.version(folder) == f"1.2.3+git{head[:12]}"
+    assert checkout.epoch(folder) == EPOCH
+    (folder / "pi_firmware/untracked.py").write_text("")
+    (folder / "tests/test_x.py").write_text("changed")
+    assert checkout.revision(folder) == head, "neither is on a card"
+    (folder / "pi_firmware/__main__.py").write_text("changed")
+    assert checkout.version(folder) == f"1.2.3+git{head[:12]}.dirty"
+    tree = release.build(folder, None, "aarch64", "3.13", EPOCH)
+    assert [name for name, _ in tree.below("pi_firmware")] == ["pi_firmware/__main__.py"]
+    assert b'"made": "2025-10-09T08:53:20Z"' in tree.read("release.json")
 
 
 def test_ranges_are_widened_to_blocks_and_joined():
