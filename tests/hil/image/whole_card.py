@@ -117,6 +117,12 @@ def test_it_streams_at_its_rate_and_stays_small(rig: Rig, figures: Figures) -> N
     rig.run_until(rig.machine.age_s + STEADY_S)
     state = rig.ground.state()
     assert state is not None and state.health is not None
+    now_s, stamp_s, up_s = map(
+        float,
+        rig.ssh("date +%s; stat -c %Y /usr/lib/clock-epoch; cut -d' ' -f1 /proc/uptime").split(),
+    )
+    # It has no clock: it begins at the image's own time and not in 1970.
+    assert stamp_s <= now_s <= stamp_s + up_s + 60
     pid = rig.ssh("systemctl show -p MainPID --value blimp-payload").strip()
     rollup = rig.ssh(f"sudo cat /proc/{pid}/smaps_rollup")
     kb = {line.split()[0]: int(line.split()[1]) for line in rollup.splitlines()[1:]}
