@@ -22,6 +22,7 @@ _LIMITS_S = {"qemu": 220.0}
 STEADY_S = 10.0
 _LOOK_S = 1.0
 _RESTART_S = 30.0
+_AT_IT = ("activating", "deactivating")
 
 
 def decide(
@@ -74,15 +75,20 @@ def watch(
         before = trial["previous"] or "the image's"
         say(f"{trial['release']} is on trial, after {before}")
         # A board that comes back from a power cut starts the firmware itself.
-        restarted_s = -_RESTART_S if first else at.uptime_s()
+        if first:
+            service.restart()
+        restarted_s = at.uptime_s()
         while True:
             running = places.read(at.running) or {}
-            waited_s = at.uptime_s() - restarted_s
-            if running.get("trial") != trial["id"] and waited_s >= _RESTART_S:
+            seen, waited_s = service.seen(), at.uptime_s() - restarted_s
+            # Nobody started it: the watcher before this one was killed just then. A slow board
+            # that is at it is left alone.
+            missed = running.get("trial") != trial["id"] and not seen.said.startswith(_AT_IT)
+            if missed and waited_s >= _RESTART_S:
                 service.restart()
                 restarted_s = at.uptime_s()
             elapsed_s = at.uptime_s() - trial["started_s"]
-            outcome, reason = decide(trial, running, service.seen(), elapsed_s, limit_s)
+            outcome, reason = decide(trial, running, seen, elapsed_s, limit_s)
             if outcome:
                 break
             sleep(_LOOK_S)

@@ -178,6 +178,19 @@ def test_a_firmware_that_nobody_starts_is_started_again(card: Card) -> None:
     assert 4 <= card.service.restarts <= 6 and last(card)[0] == FELL_BACK
 
 
+def test_a_slow_board_that_is_starting_it_is_left_alone(card: Card) -> None:
+    clock = trial_of(card)
+    card.service.on_restart = lambda: setattr(card.service, "now", STARTING)
+
+    def up() -> None:
+        card.start()
+        card.service.now = WELL
+
+    clock.at[180.0] = up
+    watched(card, clock)
+    assert card.service.restarts == 1 and last(card) == (HEALTHY, "")
+
+
 def test_a_board_that_loses_power_in_its_trial_gets_the_whole_time_again(card: Card) -> None:
     clock = trial_of(card)
     card.service.now = STARTING
