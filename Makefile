@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench soak soak-service install-service uninstall-service lock sample \
+.PHONY: help setup demo serve test check bench budget soak soak-service install-service uninstall-service lock sample \
   virtual-camera
 
 help:  ## Show this list
@@ -35,6 +35,9 @@ bench: setup  ## Measure what each step of localizer and payload costs, in ratio
 	@mkdir -p out
 	@$(BLIMP) bench localize --json out/bench.json
 	@$(BLIMP) bench payload --json out/bench-payload.json
+
+budget: setup  ## Reckon the default build: table and plots in out/budget; status 1 without margin
+	@.venv/bin/python -m hw budget --out out/budget
 
 soak: setup  ## Fly the firmware 30 minutes over a lossy link: memory, clock, every frame's account
 	@mkdir -p out

@@ -78,7 +78,7 @@ hash_of() { sha256sum | cut -c1-16; }
 
 # What a release is made of, relative to the checkout.
 contents() {
-  find pi_firmware ground_station maps/atrium pyproject.toml requirements.lock README.md LICENSE \
+  find pi_firmware ground_station hw maps/atrium pyproject.toml requirements.lock README.md LICENSE \
     -name __pycache__ -prune -o -type f ! -name '*.pyc' -print | LC_ALL=C sort
 }
 
@@ -136,7 +136,7 @@ build_release() {
   chmod 755 "$release.part/bin/blimp"
   ln -s "${environment#"$root"}" "$release.part/environment"
   "$environment/bin/python" -m compileall -q -s "$release.part" -p "${release#"$root"}" \
-    "$release.part/ground_station" "$release.part/pi_firmware"
+    "$release.part/ground_station" "$release.part/pi_firmware" "$release.part/hw"
   sync
   mv -T "$release.part" "$release"
   changed=1
