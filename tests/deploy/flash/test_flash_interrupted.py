@@ -279,7 +279,6 @@ def test_killed_at_random_moments_it_is_untouched_tableless_or_whole(bench: Benc
     whole = bench.card.read_bytes()
     table = whole[:BOOT_OFFSET]
     draw = random.Random(7)
-    ends = {"untouched": 0, "no table": 0, "whole": 0}
     for _ in range(6):
         bench.card.write_bytes(before)
         program = subprocess.Popen(
@@ -291,16 +290,10 @@ def test_killed_at_random_moments_it_is_untouched_tableless_or_whole(bench: Benc
             program.kill()
             program.wait()
         card = bench.card.read_bytes()
-        if card == before:
-            ends["untouched"] += 1
-        elif _is_zero(card[:SECTOR]):
-            ends["no table"] += 1
-        else:
-            ends["whole"] += 1
+        if card != before and not _is_zero(card[:SECTOR]):
             assert card[:BOOT_OFFSET] == table
             assert card[9 << 20 :] == whole[9 << 20 :]
             assert parse(bench.toml()).payload_id == "blimp-1"
-    assert sum(ends.values()) == 6
 
 
 def test_a_password_is_typed_without_an_echo(bench: Bench) -> None:
