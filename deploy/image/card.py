@@ -7,7 +7,9 @@ what lies under the final name is whole, with the files that describe it.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
+import os
 import shutil
 import tempfile
 import uuid
@@ -99,6 +101,13 @@ def build(
         DeployError: an ingredient is missing or broken, something does not fit, a tool fails.
     """
     check_epoch(epoch)
+    with building(image) as work:
+        _build(work / image.name, board, given, checkout, epoch, say)
+
+
+def _build(
+    image: Path, board: str, given: Ingredients, checkout: Path, epoch: int, say: Say
+) -> None:
     say("reading the packages' root")
     tree = Tree.from_tar(given.rootfs)
     modules = f"usr/lib/modules/{given.kernel_release}"
@@ -119,25 +128,24 @@ def build(
         raise DeployError(f"{given.boot}: no kernel '{given.kernel}' in it")
     where = f"UUID={new.uuid('root')}"
     front = boot.contents(board, given.kernel, given.machine, files, first, where)
-    with building(image) as work:
-        say("root partition")
-        place = work / "root"
-        size = align(ext4.bytes_needed(tree))
-        ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
-        say("boot and data partition, image, block map and checksums")
-        digest = finish(work / image.name, board, front, place, new, epoch)
-        manifest.write(
-            work / image.name,
-            beside(work / image.name, ".manifest.json"),
-            digest=digest,
-            board=board,
-            checkout=checkout,
-            epoch=epoch,
-            packages=manifest.packages_of(tree),
-            site=given.site,
-            names=NAMES,
-            units=units,
-        )
+    say("root partition")
+    place = image.with_name("root")
+    size = align(ext4.bytes_needed(tree))
+    ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
+    say("boot and data partition, image, block map and checksums")
+    digest = finish(image, board, front, place, new, epoch)
+    manifest.write(
+        image,
+        beside(image, ".manifest.json"),
+        digest=digest,
+        board=board,
+        checkout=checkout,
+        epoch=epoch,
+        packages=manifest.packages_of(tree),
+        site=given.site,
+        names=NAMES,
+        units=units,
+    )
 
 
 def finish(
@@ -175,13 +183,25 @@ def check_epoch(epoch: int) -> None:
 
 @contextlib.contextmanager
 def building(image: Path) -> Iterator[Path]:
-    """A folder for the work on an image; at the end, what describes it and it go into place."""
+    """A folder for the work on an image; at the end, what describes it and it go into place.
+
+    One build at a time in a folder: what an earlier one that was killed left there is removed.
+    """
     try:
         image.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{image.name}.part-", dir=image.parent))
+        folder = os.open(image.parent, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise DeployError(f"{image}: {error.strerror or error}") from None
+    prefix = f".{image.name}.part-"
+    work = None
     try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DeployError(f"{image.parent}: another image is being built there") from None
+        for left in image.parent.glob(f"{prefix}*"):
+            shutil.rmtree(left, ignore_errors=True)
+        work = Path(tempfile.mkdtemp(prefix=prefix, dir=image.parent))
         yield work
         # The old image goes before its description does: no image beside another's.
         image.unlink(missing_ok=True)
@@ -190,7 +210,9 @@ def building(image: Path) -> Iterator[Path]:
     except OSError as error:
         raise DeployError(f"{error.filename or image}: {error.strerror or error}") from None
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        if work is not None:
+            shutil.rmtree(work, ignore_errors=True)
+        os.close(folder)
 
 
 def beside(image: Path, suffix: str) -> Path:

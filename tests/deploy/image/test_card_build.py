@@ -368,6 +368,23 @@ def test_a_tool_that_fails_in_the_midst_leaves_nothing(checkout, tmp_path, monke
     assert list(place.parent.iterdir()) == []
 
 
+def test_one_build_at_a_time_and_what_a_killed_one_left_goes(tmp_path):
+    image = tmp_path / "out/blimp-qemu.img"
+    left = tmp_path / "out/.blimp-qemu.img.part-killed"
+    left.mkdir(parents=True)
+    (left / "root").write_bytes(b"half")
+    with card.building(image) as work:
+        assert not left.exists() and work.is_dir()
+        with pytest.raises(DeployError, match="another image is being built"), card.building(image):
+            pass
+        assert work.is_dir()
+        for suffix in ("", *card.DESCRIPTIONS):
+            card.beside(work / image.name, suffix).write_bytes(b"whole")
+    assert {path.name for path in image.parent.iterdir()} == {
+        card.beside(image, suffix).name for suffix in ("", *card.DESCRIPTIONS)
+    }
+
+
 def test_a_time_that_fat_cannot_tell_is_refused(checkout, tmp_path):
     with pytest.raises(DeployError, match="--epoch 0: allowed: 315532800 to 4354819199"):
         card.build(tmp_path / "x.img", "qemu", make_ingredients(tmp_path / "in"), checkout, 0)
