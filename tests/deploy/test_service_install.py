@@ -51,9 +51,9 @@ def link(path: Path) -> str:
 
 def copied(into: Path) -> Path:
     """A checkout of one's own, that nobody changes meanwhile."""
-    for name in ("deploy", "pi_firmware", "ground_station", "maps"):
+    for name in ("deploy", "pi_firmware", "ground_station", "hw", "maps"):
         hidden = shutil.ignore_patterns("__pycache__", "*.part")
-        shutil.copytree(ROOT / name, into / name, ignore=hidden)
+        shutil.copytree(ROOT / name, into / name, symlinks=True, ignore=hidden)
     for name in ("pyproject.toml", "requirements.lock", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, into / name)
     return into

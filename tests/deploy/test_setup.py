@@ -31,7 +31,7 @@ def test_every_direct_dependency_is_locked() -> None:
 
 def test_setup_refuses_an_old_python_in_one_line(tmp_path: Path) -> None:
     checkout = tmp_path / "checkout"
-    shutil.copytree(ROOT / "deploy", checkout / "deploy")
+    shutil.copytree(ROOT / "deploy", checkout / "deploy", symlinks=True)
     for name in ("requirements.lock", "pyproject.toml"):
         (checkout / name).write_text((ROOT / name).read_text())
     # A stand-in for dpkg, so that the test is about Python alone and installs nothing.
