@@ -77,9 +77,9 @@ def missing(root: Path) -> list[str]:
     """What programs, plugins and modules under `root` want and don't find, as `FILE: LIBRARY`."""
     folders = [folder for folder in root.glob("usr/lib/*-linux-gnu*") if folder.is_dir()]
     libraries: dict[str, Path] = {}
-    inner = [path for folder in folders for path in folder.iterdir() if path.is_dir()]
-    for place in (*folders, *inner):
-        for path in place.glob("*.so*"):
+    # Some lie in a folder of their program's own, which it names (RUNPATH): sudo's, systemd's.
+    for top in ("usr/lib", "usr/libexec"):
+        for path in (root / top).rglob("*.so*"):
             if _resolved(root, path) is not None:
                 libraries.setdefault(path.name, path)
     waiting = [(path, path) for path in _first(root, folders)]

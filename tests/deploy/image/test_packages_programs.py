@@ -67,6 +67,16 @@ def test_a_library_left_out_that_a_program_needs_is_told(root: Path) -> None:
     assert done.returncode == 1 and "E: misses a library: /usr/bin/ls: libc.so.6" in done.stderr
 
 
+def test_libraries_in_a_folder_of_the_program_s_own_are_found(root: Path) -> None:
+    own = root / "usr/libexec/ls"
+    own.mkdir(parents=True)
+    for library in _libraries(_PROGRAM):
+        link = _named(root, library.name)
+        shutil.move(link.parent / f"{link.name}.real", own / link.name)
+        link.unlink()
+    assert missing(root) == []
+
+
 def test_what_is_no_program_or_is_cut(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("#!/bin/sh\n")
     assert needed(tmp_path / "text") is None
