@@ -80,7 +80,7 @@ def root(tmp_path: Path, installed: Path) -> Path:
 @pytest.fixture
 def source(tmp_path: Path, checkout: Path) -> Path:
     """A checkout that the test can change."""
-    return shutil.copytree(checkout, tmp_path / "checkout")
+    return shutil.copytree(checkout, tmp_path / "checkout", symlinks=True)
 
 
 def test_everything_is_in_its_place(installed: Path) -> None:
