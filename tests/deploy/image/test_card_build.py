@@ -22,7 +22,8 @@ from card_parts import (
 )
 
 from deploy.errors import DeployError
-from deploy.image import card, sparse
+from deploy.image import card, command, sparse
+from deploy.image.packages import Kernel
 
 pytestmark = pytest.mark.skipif(
     (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
@@ -383,6 +384,26 @@ def test_one_build_at_a_time_and_what_a_killed_one_left_goes(tmp_path):
     assert {path.name for path in image.parent.iterdir()} == {
         card.beside(image, suffix).name for suffix in ("", *card.DESCRIPTIONS)
     }
+
+
+def test_the_command_makes_of_packages_kernel_and_wheels_the_same_image(
+    image, checkout, tmp_path, monkeypatch, capsys
+):
+    given = make_ingredients(tmp_path / "in")
+    compiled = []
+    kernel = Kernel(RELEASE, (), given.boot, given.modules)
+    monkeypatch.setattr(command, "_CHECKOUT", checkout)
+    monkeypatch.setattr(command, "fetch_wheels", lambda board, cache: given.site)
+    monkeypatch.setattr(command, "unpack_kernel", lambda board, cache: kernel)
+    monkeypatch.setattr(command, "build_rootfs", lambda board, cache, epoch: given.rootfs)
+    monkeypatch.setattr(command, "byte_compile", lambda *given: compiled.append(given[3]))
+    monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
+    assert command.main(["--board", "qemu"]) == 0
+    place = checkout / "out/image/blimp-qemu.img"
+    said = capsys.readouterr()
+    assert said.out == f"{place}\n" and "root partition" in said.err
+    assert compiled == ["/usr/lib/blimp"]
+    assert sparse.sha256(place) == sparse.sha256(image), "the epoch is the last commit's time"
 
 
 def test_a_time_that_fat_cannot_tell_is_refused(checkout, tmp_path):

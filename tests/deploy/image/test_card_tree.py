@@ -13,7 +13,7 @@ import pytest
 from card_parts import EPOCH, commit, git
 
 from deploy.errors import DeployError
-from deploy.image import checkout, cpio, release, sparse
+from deploy.image import boot, checkout, cpio, release, sparse
 from deploy.image.partitions import align, power_of_two
 from deploy.image.sparse import Range
 from deploy.image.tree import Tree
@@ -198,6 +198,23 @@ def test_zeros_that_matter_are_written(tmp_path):
     target.write_bytes(b"\xff" * 16384)
     sparse.copy_into(source, [Range(4096, 8192)], target, 4096)
     assert target.read_bytes() == b"\xff" * 8192 + bytes(4096) + b"\xff" * 4096
+
+
+@pytest.mark.parametrize(
+    ("board", "machine", "kernel"),
+    [("zero2w", "aarch64", "kernel8.img"), ("zerow", "armv6l", "kernel.img")],
+)
+def test_a_real_boards_first_stages_get_its_kernel_and_leave_the_uart_alone(board, machine, kernel):
+    files = Tree()
+    files.write(kernel, "x")
+    tree = boot.contents(board, kernel, machine, files, b"initrd", "UUID=1")
+    config = tree.read("config.txt").decode().splitlines()
+    assert f"kernel={kernel}" in config and "dtoverlay=disable-bt" in config
+    assert ("arm_64bit=1" in config) == (machine == "aarch64")
+    assert not any(line.startswith("device_tree=") for line in config)
+    line = tree.read("cmdline.txt").decode()
+    assert line.count("\n") == 1 and "vivid" not in line and "console=tty1" in line.split()
+    assert all(len(row) <= 98 for row in config), "the first stages read no longer line"
 
 
 def test_sizes_are_multiples_of_4_mib_and_powers_of_two():
