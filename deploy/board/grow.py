@@ -1,23 +1,24 @@
-"""Gives the data partition the rest of the card: `python3 -m deploy.board.grow PARTITION`.
+"""Gives the data partition the rest of the card: `python3 -m deploy.board.grow`, at each boot.
 
 The image's last partition is small; a card is as large as it is. One sector, the partition table
 (MBR), is written, so that power may go at any time: it is the old table or the new one. The file
 system follows when it is mounted (systemd's growfs, online and journalled).
+
+It runs before udev: that takes a written partition table for a new disk, announces all partitions
+anew, and systemd then unmounts what it had just mounted.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import struct
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from deploy.errors import DeployError
-from deploy.run import run
 
+LABEL = b"blimp-data"
 SECTOR = 512
 ALIGN_SECTORS = 4 * 1024 * 1024 // SECTOR  # a card's erase blocks are this large or a part of it
 _TABLE, _ENTRY, _ENTRIES = 446, struct.Struct("<B3sB3sII"), 4
@@ -111,31 +112,46 @@ def grow(disk: Path, number: int) -> bool:
     return True
 
 
-def disk_of(partition: Path, sysfs: Path = Path("/sys")) -> tuple[Path, int]:
-    """The disk's device file and the number of a partition on it, by the kernel's own list."""
-    name = partition.resolve().name
-    entry = (sysfs / "class/block" / name).resolve()
+def find(label: bytes = LABEL, root: Path = Path("/")) -> tuple[Path, int]:
+    """The disk's device file and the number of the ext4 partition of that label.
+
+    Raises `DeployError` when there is none, more than one, or its sectors have not 512 bytes.
+    """
+    found = []
+    for entry in sorted((root / "sys/class/block").glob("*/partition")):
+        folder = entry.parent.resolve()
+        if _label(root / "dev" / folder.name) == label:
+            found.append((folder, int(entry.read_text())))
+    if len(found) != 1:
+        raise DeployError(f"{len(found)} partitions are called {label.decode()}; expected one")
+    folder, number = found[0]
+    size = (folder.parent / "queue/logical_block_size").read_text().strip()
+    if size != str(SECTOR):
+        raise DeployError(f"{folder.name}: sectors of {size} bytes; expected {SECTOR}")
+    return root / "dev" / folder.parent.name, number
+
+
+def _label(partition: Path) -> bytes:
+    """An ext4's label (Linux, fs/ext4/ext4.h: s_magic and s_volume_name); empty for none."""
     try:
-        number = int((entry / "partition").read_text())
-        size = int((entry.parent / "queue/logical_block_size").read_text())
-    except (OSError, ValueError):
-        raise DeployError(f"{partition}: the kernel knows no such partition") from None
-    if size != SECTOR:
-        raise DeployError(f"{partition}: sectors of {size} bytes; expected {SECTOR}")
-    return Path("/dev") / entry.parent.name, number
+        with open(partition, "rb", buffering=0) as file:
+            block = os.pread(file.fileno(), 1024, 1024)
+    except OSError:
+        return b""
+    return block[0x78:0x88].rstrip(b"\0") if block[0x38:0x3A] == b"\x53\xef" else b""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(root: Path = Path("/")) -> int:
     """Status 0 also where there was nothing to do, 2 when the table is none that we touch."""
-    parser = argparse.ArgumentParser(prog="grow", description=__doc__.splitlines()[0])
-    parser.add_argument("partition", type=Path, help="as /dev/disk/by-label/blimp-data")
     try:
-        disk, number = disk_of(parser.parse_args(arguments).partition)
+        disk, number = find(root=root)
         if grow(disk, number):
+            from deploy.run import run  # at the first boot only: each import costs a slow board
+
             # The kernel keeps the old size otherwise, as the root on the same card is in use.
             run(["partx", "--update", "--nr", str(number), disk], timeout_s=20)
             print(f"grow: partition {number} of {disk} has the rest of the card")
-    except DeployError as error:
+    except (DeployError, OSError, ValueError) as error:
         print(f"grow: {error}", file=sys.stderr)
         return 2
     return 0

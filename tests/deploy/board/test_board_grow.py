@@ -118,23 +118,51 @@ def test_a_strange_table_is_refused_and_left_alone(tmp_path: Path, told: str) ->
     assert path.read_bytes() == before
 
 
-def test_the_disk_is_found_by_the_kernels_own_list(tmp_path: Path) -> None:
-    disk = tmp_path / "devices/mmcblk0"
-    (disk / "mmcblk0p3").mkdir(parents=True)
-    (disk / "queue").mkdir()
-    (disk / "queue/logical_block_size").write_text("512\n")
-    (disk / "mmcblk0p3/partition").write_text("3\n")
-    (tmp_path / "class/block").mkdir(parents=True)
-    (tmp_path / "class/block/mmcblk0p3").symlink_to(disk / "mmcblk0p3")
-    device = tmp_path / "mmcblk0p3"
-    device.touch()
-    (tmp_path / "by-label").symlink_to(device)
-    assert grow.disk_of(tmp_path / "by-label", tmp_path) == (Path("/dev/mmcblk0"), 3)
-    (disk / "queue/logical_block_size").write_text("4096\n")
-    with pytest.raises(DeployError, match="sectors of 4096 bytes; expected 512"):
-        grow.disk_of(device, tmp_path)
+def kernel(root: Path, name: str, number: int, label: bytes, sectors: str = "512") -> Path:
+    """A partition as sysfs and /dev have it, with the beginning of an ext4."""
+    disk, folder = name.rpartition("p")[0], root / "sys/class/block" / name
+    place = root / "sys/devices" / disk / name
+    place.mkdir(parents=True)
+    (place / "partition").write_text(f"{number}\n")
+    (place.parent / "queue").mkdir(exist_ok=True)
+    (place.parent / "queue/logical_block_size").write_text(f"{sectors}\n")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.symlink_to(place)
+    (root / "dev").mkdir(exist_ok=True)
+    device = root / "dev" / name
+    block = bytearray(2048)
+    block[1024 + 0x38 : 1024 + 0x3A] = b"\x53\xef"
+    block[1024 + 0x78 : 1024 + 0x78 + len(label)] = label
+    device.write_bytes(block)
+    return device
 
 
-def test_no_such_partition_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert grow.main(["/dev/null"]) == 2
-    assert capsys.readouterr().err == "grow: /dev/null: the kernel knows no such partition\n"
+def test_the_partition_is_found_by_its_label_without_udev(tmp_path: Path) -> None:
+    kernel(tmp_path, "mmcblk0p2", 2, b"blimp-root")
+    kernel(tmp_path, "mmcblk0p3", 3, b"blimp-data")
+    assert grow.find(root=tmp_path) == (tmp_path / "dev/mmcblk0", 3)
+    kernel(tmp_path, "mmcblk1p3", 3, b"blimp-data")
+    with pytest.raises(DeployError, match="2 partitions are called blimp-data; expected one"):
+        grow.find(root=tmp_path)
+
+
+@pytest.mark.skipif(find("mke2fs") is None, reason="mke2fs is not installed")
+def test_the_label_is_where_mke2fs_puts_it(tmp_path: Path) -> None:
+    device = kernel(tmp_path, "mmcblk0p3", 3, b"")
+    with device.open("r+b") as file:
+        file.truncate(4 * MB)
+    tool = find("mke2fs")
+    assert tool
+    subprocess.run([tool, "-q", "-F", "-t", "ext4", "-L", "blimp-data", device], check=True)
+    assert grow.find(root=tmp_path)[1] == 3
+
+
+def test_what_cannot_be_grown_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert grow.main(tmp_path) == 2
+    told = "grow: 0 partitions are called blimp-data; expected one\n"
+    assert capsys.readouterr().err == told
+    kernel(tmp_path, "mmcblk0p3", 3, b"blimp-data", "4096")
+    assert grow.main(tmp_path) == 2
+    assert capsys.readouterr().err == "grow: mmcblk0p3: sectors of 4096 bytes; expected 512\n"
