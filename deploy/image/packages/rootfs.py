@@ -18,6 +18,7 @@ from deploy.image.packages.long import run_long
 _HERE = Path(__file__).parent
 # Raised when this module makes another tar of the same inputs.
 _RECIPE = 1
+_HOST_KEYS = "ssh_host_rsa_key ssh_host_ecdsa_key ssh_host_ed25519_key"
 _STATUS = "./var/lib/dpkg/status"
 
 
@@ -120,6 +121,9 @@ def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:
         *(f"--dpkgopt={rule}" for rule in rules),
         f"--include={','.join(board.package_names)}",
         f'--setup-hook=mkdir -p "$1/etc/apt/preferences.d"; {copy_pins}',
+        # openssh-server makes no host keys where some are, which takes emulated RSA minutes;
+        # `finish.sh` takes them away as it would real ones.
+        f'--essential-hook=mkdir -p "$1/etc/ssh"; cd "$1/etc/ssh"; touch {_HOST_KEYS}',
         f'--customize-hook={python}.libraries "$1"',
         f'--customize-hook={python}.bytecode "$1"',
         f"--customize-hook={finish}",
