@@ -286,7 +286,8 @@ def test_name_servers_are_those_of_the_networks_and_nothing_else(person: Person)
     )
     before = card.resolver.stat()
     light.resolve(card)
-    assert card.resolver.stat() == before
+    assert card.resolver.stat().st_ino == before.st_ino
+    assert card.resolver.stat().st_mtime_ns == before.st_mtime_ns
 
 
 def test_a_status_on_no_partition_is_refused(tmp_path: Path) -> None:
