@@ -39,9 +39,9 @@ def said(unit: str) -> list[str]:
 
 def of_firmware(lines: list[str]) -> str:
     """The firmware's last complaint; empty when it had none."""
-    found = [line for line in lines if line.startswith(("pi_firmware: ", "start: "))]
-    complaints = [line for line in found if line.startswith("pi_firmware: ")]
-    last = (complaints or found or lines or [""])[-1]
+    others = [line for line in lines if not line.startswith("start: ")]
+    complaints = [line for line in others if line.startswith("pi_firmware: ")]
+    last = (complaints or others or [""])[-1]
     return one_line(last.removeprefix("pi_firmware: "))
 
 

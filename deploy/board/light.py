@@ -26,7 +26,9 @@ from deploy.errors import DeployError
 LOOK_S, CALM_S = 5.0, 20.0
 """So often it looks until a state has settled, and from then on: each look runs systemctl."""
 PATIENCE_S = 90.0
-"""The first frame and the first address may take so long on the slowest board."""
+"""A frame and an address may take so long to come."""
+START_S = 240.0
+"""The firmware's first start, which also lists GStreamer's plugins: systemd waits as long."""
 SETTLED_S = 15.0
 """A state is written down when it has lasted so long; a flight's hiccup is not."""
 MOST_WRITES = 5
@@ -69,7 +71,8 @@ class Judge:
             return faults.NO_PROVISIONING, False
         if state != provision.IN_FORCE:
             return faults.REFUSED, view.firmware.active
-        if now_s - self._video_s >= PATIENCE_S:
+        first = view.firmware.said == "activating" and not view.firmware.restarts
+        if now_s - self._video_s >= (START_S if first else PATIENCE_S):
             return faults.NO_VIDEO, False
         if now_s - self._network_s >= PATIENCE_S:
             return faults.NO_NETWORK, view.firmware.active

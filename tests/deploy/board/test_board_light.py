@@ -111,6 +111,15 @@ def test_a_firmware_that_comes_and_goes_is_given_time_again() -> None:
     assert judge.fault(down, 85.0 + PATIENCE_S)[0] is faults.NO_VIDEO
 
 
+def test_the_first_start_of_the_firmware_may_take_longer() -> None:
+    judge = Judge(0.0)
+    first = View(GOOD, firmware=Seen(said="activating"), links=UP)
+    again = View(GOOD, firmware=Seen(said="activating", restarts=1), links=UP)
+    assert judge.fault(first, PATIENCE_S)[0] is None
+    assert judge.fault(again, PATIENCE_S)[0] is faults.NO_VIDEO
+    assert judge.fault(first, light.START_S)[0] is faults.NO_VIDEO
+
+
 def test_every_fault_has_its_own_number_of_blinks() -> None:
     assert [fault.blinks for fault in faults.ALL] == [2, 3, 4, 5, 6]
     assert all(fault.mend.endswith(".") for fault in faults.ALL)
@@ -211,7 +220,7 @@ REASONS: list[tuple[Fault, View, list[str], str]] = [
         ["start: release 1", "pi_firmware: no camera", "Traceback", "start: release 1"],
         "no camera",
     ),
-    (faults.NO_VIDEO, View(GOOD, firmware=Seen(said="activating")), [], "activating"),
+    (faults.NO_VIDEO, View(GOOD, firmware=Seen(said="failed")), ["start: release 1"], "failed"),
     (faults.NO_NETWORK, View(GOOD), [], "this board has no radio, or its driver did not start"),
     (
         faults.NO_NETWORK,
