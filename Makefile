@@ -2,8 +2,8 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service install-service uninstall-service lock sample \
-  virtual-camera
+.PHONY: help setup demo serve test check bench budget soak soak-service install-service uninstall-service image flash update \
+  lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -16,6 +16,29 @@ demo: setup  ## Map the sample atrium, stream the sample flight, localize it liv
 
 serve: setup  ## Run the ground station: the sample flight, or MAP=maps/NAME; http://127.0.0.1:8080/
 	@$(BLIMP) serve $(if $(MAP),--map $(MAP),--demo)
+
+# How the payload's network is called comes from a person: make expands nothing in it.
+unexport DEVICE IMAGE WIFI COUNTRY
+flash: export FLASH_DEVICE := $(value DEVICE)
+flash: export FLASH_IMAGE := $(value IMAGE)
+flash: export FLASH_PAYLOAD := $(value PAYLOAD)
+flash: export FLASH_WIFI := $(value WIFI)
+flash: export FLASH_COUNTRY := $(value COUNTRY)
+
+image: setup  ## Build a card (root or sudo): BOARD=zero2w|qemu, BOARD=zerow BASE=raspios.img.xz
+	@sh deploy/packages.sh deploy/image/apt-packages.txt
+	@$$([ "$$(id -u)" = 0 ] || echo sudo) .venv/bin/python -m deploy.image \
+	  --board "$(or $(BOARD),zero2w)" $(if $(BASE),--base "$(BASE)") $(OPTIONS)
+
+flash: setup  ## Write a card: DEVICE=/dev/sdX IMAGE=FILE PAYLOAD=blimp-1 WIFI=SSID|FILE.toml COUNTRY=DE
+	@case "$$FLASH_WIFI" in *.toml) wifi=--wifi ;; *) wifi=--wifi-ssid ;; esac; \
+	sudo=; [ -b "$$FLASH_DEVICE" ] && [ ! -w "$$FLASH_DEVICE" ] && sudo=sudo; \
+	$$sudo .venv/bin/python -m deploy.flash --device "$$FLASH_DEVICE" --image "$$FLASH_IMAGE" \
+	  --payload "$$FLASH_PAYLOAD" $${FLASH_WIFI:+"$$wifi=$$FLASH_WIFI"} \
+	  $${FLASH_COUNTRY:+--country "$$FLASH_COUNTRY"} $(OPTIONS)
+
+update: setup  ## Send this checkout's firmware to a payload: PAYLOAD=blimp-1 [HOST=ADDRESS]
+	@.venv/bin/python -m deploy.update --payload "$(PAYLOAD)" $(if $(HOST),--host "$(HOST)") $(OPTIONS)
 
 install-service: setup  ## Install the ground station as a hardened system service (root or sudo)
 	@sh deploy/ground_station/service.sh install

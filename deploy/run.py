@@ -60,7 +60,7 @@ def find(tool: str) -> str | None:
     folders = [*os.environ.get("PATH", os.defpath).split(os.pathsep), *_SYSTEM_FOLDERS]
     for folder in folders:
         path = Path(folder or ".") / tool
-        if path.is_file() and os.access(path, os.X_OK):
+        if os.access(path, os.X_OK) and path.is_file():  # what may not be looked into holds none
             return str(path)
     return None
 

@@ -159,13 +159,14 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
             " make one, and set it up again: blimp keys release"
         )
     ssh = _ssh_keys(options, folder, held, existing)
-    settings = None
-    if options.payload_toml is not None:
-        settings = wishes.read_file(options.payload_toml)
-        certificates = folder / "payload" / payload if held else None
-        customise.check_payload_toml(options.payload_toml, settings, payload, certificates)
     before = {"no_wifi": options.no_wifi, "ground": options.ground, "ssh": ssh}
-    wishes.merge(existing, payload, None, **before)  # before a password is typed for nothing
+    planned = wishes.merge(existing, payload, None, **before)
+    settings = None
+    if options.payload_toml is not None:  # before a password is typed for nothing
+        settings = wishes.read_file(options.payload_toml)
+        certificates = folder / "payload" / payload
+        there = certificates if held or certificates.is_dir() else None
+        customise.check_payload_toml(options.payload_toml, settings, planned, there)
     wifi = _wifi(options)
     country = options.country if wifi is None else None
     provisioning = wishes.merge(existing, payload, wifi, country=country, **before)

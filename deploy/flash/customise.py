@@ -13,6 +13,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from deploy.board import settings
 from deploy.errors import DeployError
 from deploy.flash.boot import FOLDER, BootPartition
 from deploy.flash.interrupted import Interrupted
@@ -104,19 +105,23 @@ def _customise(
     return changed
 
 
-def check_payload_toml(file: Path, data: bytes, payload: str, certificates: Path | None) -> None:
+def check_payload_toml(
+    file: Path, data: bytes, provisioning: Provisioning, certificates: Path | None
+) -> None:
     """Lets the firmware check its settings; raises `DeployError` with what it says.
 
-    As a program of its own with the payload's name and keys, as on the card: what it can do there
-    and not here (open a camera, a gauge) it does not try.
+    As a program of its own, with what the card will put over them: the payload's name and, where
+    its keys are here, ground station and keys. What it can do there and not here (open a camera, a
+    gauge) it does not try; the board's own settings are not looked at.
     """
+    document = settings.read(data, str(file))
+    if certificates is not None:
+        document = settings.merged({}, document, provisioning, str(certificates.absolute()))
     with tempfile.TemporaryDirectory(prefix="blimp-flash-") as folder:
         copy = Path(folder) / "payload.toml"
-        copy.write_bytes(data)
+        copy.write_text(settings.dump(document), encoding="utf-8")
         words = [sys.executable, "-m", "pi_firmware", "--config", str(copy), "--check"]
-        words += ["--set", f"payload_id={payload}"]
-        if certificates is not None:
-            words += ["--set", f"telemetry.certificates={certificates.absolute()}"]
+        words += ["--set", f"payload_id={provisioning.payload_id}"]
         root = Path(__file__).parents[2]
         try:
             done = subprocess.run(

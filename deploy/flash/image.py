@@ -18,7 +18,7 @@ from deploy.errors import DeployError
 from deploy.flash import bmap
 from deploy.flash.bmap import CHUNK_BYTES, Stretch
 from deploy.flash.boot import BootPartition
-from deploy.flash.progress import Progress
+from deploy.progress import Progress
 
 MANIFEST_SCHEMA = "blimp.image/1"
 _SUM = re.compile(r"([0-9a-fA-F]{64})(?: [ *](.+))?", re.ASCII)

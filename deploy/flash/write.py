@@ -21,8 +21,8 @@ from deploy.flash.bmap import CHUNK_BYTES, Stretch, chunks
 from deploy.flash.boot import SECTOR_BYTES
 from deploy.flash.image import Image
 from deploy.flash.interrupted import Interrupted
-from deploy.flash.progress import Progress
 from deploy.flash.target import Target
+from deploy.progress import Progress
 
 # Table and gap before the first partition; an older table of the other kind (GPT) lies there, too.
 HEAD_BYTES = 1 << 20

@@ -13,27 +13,8 @@ if [ "${BLIMP_SETUP_LOCKED:-}" != 1 ] && command -v flock >/dev/null; then
   exec env BLIMP_SETUP_LOCKED=1 flock out/.setup.lock sh "$here/setup.sh"
 fi
 
-wanted=$(sed -e 's/#.*//' -e '/^[[:space:]]*$/d' "$here/apt-packages.txt" | tr '\n' ' ')
 stamp=$(cat "$here/apt-packages.txt" requirements.lock pyproject.toml | sha256sum | cut -d' ' -f1)
-missing=
-for package in $wanted; do
-  [ "$(dpkg-query -W -f='${db:Status-Status}' "$package" 2>/dev/null || true)" = installed ] \
-    || missing="$missing $package"
-done
-if [ -n "$missing" ]; then
-  command -v apt-get >/dev/null || die "needs these packages, and there is no apt-get here:$missing"
-  say "installing system packages:$missing"
-  if [ "$(id -u)" = 0 ]; then as_root=
-  elif command -v sudo >/dev/null; then as_root=sudo
-  else die "run once as root: apt-get install$missing"; fi
-  # The output is kept for when something fails; DPkg::Lock waits for another installation.
-  if ! { $as_root apt-get -o DPkg::Lock::Timeout=300 update \
-      && $as_root env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 \
-           install -y --no-install-recommends $missing; } >out/apt.log 2>&1 </dev/null; then
-    tail -n 5 out/apt.log >&2
-    die "apt-get failed; the whole output is in out/apt.log"
-  fi
-fi
+sh deploy/packages.sh "$here/apt-packages.txt"
 
 if [ "$(cat .venv/.stamp 2>/dev/null || true)" = "$stamp" ]; then exit 0; fi
 

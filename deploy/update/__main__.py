@@ -10,8 +10,8 @@ from pathlib import Path
 
 from deploy.board.releases import manifest
 from deploy.errors import DeployError
-from deploy.flash.progress import Progress
 from deploy.image.packages import fetch_wheels, load_board
+from deploy.progress import Progress
 from deploy.update import bundle as bundles
 from deploy.update.card import Card, is_healthy
 

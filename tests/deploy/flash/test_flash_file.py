@@ -214,6 +214,12 @@ def test_settings_of_the_firmware_are_checked_by_the_firmware(bench: Bench) -> N
     settings.write_text("[camera]\nrate_hz = 15\n[telemetry]\nconnect = ['tls/10.0.0.1:7447']\n")
     assert run(bench.command("--payload-toml", str(settings))).returncode == 0
     assert bench.read("blimp/payload.toml") == settings.read_bytes()
+    # The ground station that the card is told of needs none of its own in there.
+    settings.write_text("[gate]\nenabled = false\n")
+    more = ["--payload-toml", str(settings)]
+    for ground in ("auto", "10.0.2.2"):
+        assert run(bench.command(*more, "--ground", ground)).returncode == 0, ground
+    assert run(bench.customise(*more)).returncode == 0
 
 
 def test_no_wifi_is_said_and_no_password_is_on_a_command_line(bench: Bench) -> None:
