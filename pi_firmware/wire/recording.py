@@ -94,7 +94,7 @@ class RecordingWriter:
             self._file,
             chunk_size=chunk_bytes,
             compression=CompressionType.NONE,
-            use_summary_offsets=False,  # the library tells of groups it has not, which doctors refuse
+            use_summary_offsets=False,  # it tells of groups that it has not
         )
         with self._disk():
             self._writer.start(profile=profile, library="blimp")
