@@ -114,8 +114,9 @@ def test_a_trusted_archive_under_another_name_is_refused(shelf: Shelf) -> None:
 
 
 def test_an_archive_without_address_or_keys_is_one_line(shelf: Shelf, tmp_path: Path) -> None:
+    nowhere = with_archives(load_board("zero2w"), {"raspberrypi": {"url": ""}})
     with pytest.raises(DeployError, match="--archive raspberrypi=URL"):
-        apt.sources(load_board("zero2w").archives[2:])
+        apt.sources(nowhere.archives[2:])
     lost = with_archives(shelf.board, {"pi": {"keyring": str(tmp_path / "lost.gpg")}})
     with pytest.raises(DeployError, match=r"archive pi: keyring .*lost\.gpg is not there"):
         apt.sources(lost.archives)
