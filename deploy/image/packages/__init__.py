@@ -7,18 +7,16 @@ is keyed by its inputs, and appears there whole or not at all. What is cached ne
 from deploy.image.packages.board import Archive, Board, load_board, with_archives
 from deploy.image.packages.kernel import Kernel, unpack_kernel
 from deploy.image.packages.python import byte_compile
-from deploy.image.packages.rootfs import Package, build_rootfs, installed_packages
+from deploy.image.packages.rootfs import build_rootfs
 from deploy.image.packages.wheels import fetch_wheels
 
 __all__ = [
     "Archive",
     "Board",
     "Kernel",
-    "Package",
     "build_rootfs",
     "byte_compile",
     "fetch_wheels",
-    "installed_packages",
     "load_board",
     "unpack_kernel",
     "with_archives",

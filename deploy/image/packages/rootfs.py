@@ -6,8 +6,6 @@ import os
 import shlex
 import shutil
 import sys
-import tarfile
-from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
@@ -19,16 +17,6 @@ _HERE = Path(__file__).parent
 # Raised when this module makes another tar of the same inputs.
 _RECIPE = 1
 _HOST_KEYS = "ssh_host_rsa_key ssh_host_ecdsa_key ssh_host_ed25519_key"
-_STATUS = "./var/lib/dpkg/status"
-
-
-@dataclass(frozen=True)
-class Package:
-    """A package that is installed in a root file system."""
-
-    name: str
-    version: str
-    architecture: str
 
 
 def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
@@ -74,25 +62,6 @@ def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
         }
         run_long(words, log, f"root file system of {board.name}", environment)
     return target
-
-
-def installed_packages(tar: Path) -> list[Package]:
-    """What is installed in the root file system in a tar, sorted by name: the card's manifest.
-
-    Raises `DeployError` for a tar that is cut or has no dpkg in it.
-    """
-    try:
-        with tarfile.open(tar) as file:
-            member = file.extractfile(_STATUS)
-            text = member.read().decode() if member is not None else ""
-    except (OSError, KeyError, tarfile.TarError, UnicodeDecodeError) as error:
-        raise DeployError(f"{tar}: no root file system: {error}") from None
-    found = []
-    for stanza in text.split("\n\n"):
-        fields = dict(line.split(": ", 1) for line in stanza.splitlines() if ": " in line[1:])
-        if fields.get("Status", "").endswith(" installed"):
-            found.append(Package(fields["Package"], fields["Version"], fields["Architecture"]))
-    return sorted(found, key=lambda package: package.name)
 
 
 def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:

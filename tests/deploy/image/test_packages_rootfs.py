@@ -7,13 +7,11 @@ down how it was called. What it would have built is checked by the slow build (`
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import signal
 import subprocess
 import sys
-import tarfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.image.packages import Package, build_rootfs, installed_packages, load_board
+from deploy.image.packages import build_rootfs, load_board
 from deploy.image.packages.board import Board
 from deploy.run import run
 from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
@@ -218,27 +216,6 @@ def test_nothing_of_one_machine_s_own_goes_onto_all_cards(tmp_path: Path) -> Non
     assert all((root / name).is_file() for name in kept)
     assert (root / "etc/machine-id").read_bytes() == b""
     assert (root / "var/log/apt").is_dir()
-
-
-def test_the_manifest_lists_what_is_installed(tmp_path: Path) -> None:
-    status = (
-        b"Package: zeta\nStatus: install ok installed\nArchitecture: all\nVersion: 1:2-3\n"
-        b"Description: words\n with: more\n\n"
-        b"Package: gone\nStatus: deinstall ok config-files\nArchitecture: arm64\nVersion: 1\n\n"
-        b"Package: alpha\nStatus: install ok installed\nArchitecture: arm64\nVersion: 4~rc1\n"
-    )
-    with tarfile.open(tmp_path / "root.tar", "w") as tar:
-        member = tarfile.TarInfo("./var/lib/dpkg/status")
-        member.size = len(status)
-        tar.addfile(member, io.BytesIO(status))
-    assert installed_packages(tmp_path / "root.tar") == [
-        Package("alpha", "4~rc1", "arm64"),
-        Package("zeta", "1:2-3", "all"),
-    ]
-    cut = (tmp_path / "root.tar").read_bytes()[:700]
-    (tmp_path / "cut.tar").write_bytes(cut)
-    with pytest.raises(DeployError, match=r"cut\.tar: no root file system"):
-        installed_packages(tmp_path / "cut.tar")
 
 
 def _until(condition: object, limit_s: float = 60.0) -> None:
