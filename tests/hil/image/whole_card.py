@@ -41,6 +41,21 @@ for process in /proc/[0-9]*; do
   esac
 done
 """
+IMPORTS = """\
+PYTHONPATH=/usr/lib/blimp/release:/usr/lib/blimp/release/site python3 -c '
+import time
+begun = time.monotonic()
+import pi_firmware.__main__, pi_firmware.payload, zenoh
+print(time.monotonic() - begun)'"""
+LOOP = """python3 -c '
+import time
+begun = time.monotonic()
+total = 0
+for i in range(1_000_000):
+    total += i * i
+print(time.monotonic() - begun)'"""
+START_LIMIT_S = float(os.environ.get("BLIMP_START_LIMIT_S", "60"))
+"""What this emulation takes and more; what a board takes is to be measured on one."""
 NEVER_HEALTHY = """
 import time
 print("this release never sends a frame", flush=True)
@@ -137,6 +152,25 @@ def test_it_streams_at_its_rate_and_stays_small(rig: Rig, figures: Figures) -> N
     memory_mb = {name: round(int(kb[name]) / 1024, 1) for name in ("VmRSS", "VmHWM")}
     figures.add("memory_MB", {**memory_mb, "after_s": round(state.health.uptime_s)})
     assert memory_mb["VmRSS"] <= 120
+
+
+def test_how_long_the_firmware_takes_to_start(rig: Rig, figures: Figures) -> None:
+    """From systemd's exec to the first frame that left the encoder (READY=1), beside imports."""
+    ensure_up(rig)
+    starts_s = []
+    for _ in range(3):
+        rig.ssh("sudo systemctl restart blimp-payload", limit_s=240)
+        names = ("ExecMainStartTimestampMonotonic", "ActiveEnterTimestampMonotonic")
+        show = " ".join(f"-p {name}" for name in names)
+        lines = rig.ssh(f"sudo systemctl show {show} blimp-payload").split()
+        us = dict(line.split("=") for line in lines)
+        starts_s.append((int(us[names[1]]) - int(us[names[0]])) / 1e6)
+    imports_s = [float(rig.ssh(IMPORTS)) for _ in range(3)]
+    loop_s = [float(rig.ssh(LOOP)) for _ in range(3)]
+    figures.add("start_s", [round(s, 2) for s in starts_s])
+    figures.add("imports_s", [round(s, 2) for s in imports_s])
+    figures.add("loop_of_a_million_s", [round(s, 2) for s in loop_s])
+    assert min(starts_s) < START_LIMIT_S
 
 
 def test_no_unit_has_failed(rig: Rig) -> None:
