@@ -164,6 +164,11 @@ def host_name(payload_id: str) -> str:
     return payload_id.replace("_", "-").strip("-") or USER
 
 
+def hosts_text(name: str) -> str:
+    """hosts(5) of a board of this name; the file lies in memory, as all of /etc does."""
+    return "".join(f"{address}\tlocalhost {name}\n" for address in ("127.0.0.1", "::1"))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Status 0 whatever came of it: the outcome is told by the light and STATUS.txt."""
     parser = argparse.ArgumentParser(prog="provision", description=__doc__.splitlines()[0])
@@ -180,7 +185,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         outcome = Outcome(NONE, reason=_told(error))
     if outcome.payload_id and real:
         with contextlib.suppress(OSError):
-            socket.sethostname(host_name(outcome.payload_id))
+            name = host_name(outcome.payload_id)
+            # First the file: sudo asks for the address of its own host's name and waits for it.
+            (card.root / "etc/hosts").write_text(hosts_text(name))
+            socket.sethostname(name)
     card.outcome.parent.mkdir(parents=True, exist_ok=True)
     part = card.outcome.with_name(card.outcome.name + ".part")
     part.write_text(json.dumps(asdict(outcome)))

@@ -346,3 +346,10 @@ def test_the_program_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixt
 )
 def test_a_payloads_name_in_the_network(payload_id: str, name: str) -> None:
     assert provision.host_name(payload_id) == name
+
+
+def test_the_boards_own_name_has_an_address() -> None:
+    """Else sudo, which asks for it, waits for a name server each time."""
+    lines = [line.split() for line in provision.hosts_text("blimp-1").splitlines()]
+    assert [line[0] for line in lines] == ["127.0.0.1", "::1"]
+    assert all(line[1:] == ["localhost", "blimp-1"] for line in lines)
