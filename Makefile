@@ -3,7 +3,7 @@
 BLIMP := .venv/bin/blimp
 
 .PHONY: help setup demo serve test check bench budget soak soak-service install-service uninstall-service image flash update \
-  lock sample virtual-camera
+  hil-image lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -39,6 +39,10 @@ flash: setup  ## Write a card: DEVICE=/dev/sdX IMAGE=FILE PAYLOAD=blimp-1 WIFI=S
 
 update: setup  ## Send this checkout's firmware to a payload: PAYLOAD=blimp-1 [HOST=ADDRESS]
 	@.venv/bin/python -m deploy.update --payload "$(PAYLOAD)" $(if $(HOST),--host "$(HOST)") $(OPTIONS)
+
+hil-image: setup  ## Boot the qemu card in an emulated Pi: stream, cut its power, update it (root)
+	@sh deploy/packages.sh deploy/image/apt-packages.txt
+	@.venv/bin/python -m pytest -q -s tests/hil/image/whole_card.py
 
 install-service: setup  ## Install the ground station as a hardened system service (root or sudo)
 	@sh deploy/ground_station/service.sh install
