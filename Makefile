@@ -2,8 +2,8 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service install-service uninstall-service image flash update \
-  hil-image lock sample virtual-camera
+.PHONY: help setup demo serve test check bench budget soak soak-service install-service \
+  uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
