@@ -27,6 +27,8 @@ HOST = "10.0.2.2"
 QEMU = Path(__file__).resolve().parents[2] / "out/emulator/qemu-system-aarch64"
 _WORDS = "initcall_blacklist=bcm2835_power_driver_init systemd.watchdog_device=/dev/none panic=-1"
 _CONSOLE = "ttyAMA0,115200"
+# Named, QEMU puts no hub between, whose enumeration sometimes fails ("dwc2: Not connected").
+_USB_PORT = 1
 _POLL_S = 0.1
 _TAIL_LINES = 25
 _CUT_LIMIT_S = 30.0
@@ -100,7 +102,7 @@ class Machine:
             words += ["-initrd", self.boot.initrd]
         words += ["-append", " ".join(part for part in line if part)]
         words += ["-drive", f"file={self.card},if=sd,format=raw"]
-        words += ["-netdev", f"user,id=net{net}", "-device", "usb-net,netdev=net"]
+        words += ["-netdev", f"user,id=net{net}", "-device", f"usb-net,netdev=net,port={_USB_PORT}"]
         if self._gauge is not None:
             words += ["-drive", f"file={self._gauge},if=none,format=raw,id=gauge"]
             words += ["-device", ",".join([
