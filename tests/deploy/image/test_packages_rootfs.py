@@ -155,7 +155,9 @@ def test_stopped_or_killed_it_leaves_nothing_half_made(
         need_tools("setpriv")
     place = {name: getattr(native.archives[0], name) for name in ("url", "keyring")}
     program = (
-        "import dataclasses, os, sys\n"
+        "import dataclasses, os, signal, sys\n"
+        # A suite that runs in the background inherits an ignored SIGINT; a person's shell does not.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from pathlib import Path\n"
         "from deploy.image.packages import build_rootfs, load_board, with_archives\n"
         "os.geteuid = lambda: 0\n"
