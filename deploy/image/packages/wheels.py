@@ -104,6 +104,7 @@ def unpack(wheel_file: Path, site: Path, wheel: Wheel) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(archive.read(member))
                 target.chmod(_LIBRARY_MODE if path.suffix == ".so" else _FILE_MODE)
+    # zipfile says NotImplementedError of a compression that it does not know.
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise DeployError(f"{wheel_file.name}: no wheel, or cut: {error}") from None
 
