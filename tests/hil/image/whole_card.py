@@ -1,4 +1,4 @@
-"""The whole card in an emulated Raspberry Pi: `make hil-image`, about half an hour.
+"""The whole card in an emulated Raspberry Pi: `make hil-image`.
 
 Not among the tests that `make test` collects, by its name. The image is built first, or named by
 BLIMP_IMAGE. Figures go to out/hil-image.json. Seeds: BLIMP_SEED (default 1) draws the moments.
