@@ -1,0 +1,1 @@
+"""Replay tests as data: what a case is, what a run leaves behind, how it is judged and compared."""
