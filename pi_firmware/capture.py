@@ -183,6 +183,12 @@ class Capture:
         if media is not None:
             media.link_report(lost, round_trip_s)
 
+    def answered(self, sequence: int) -> None:
+        """The ground is done with this frame and all before it."""
+        source = self._source
+        if source is not None and source.window is not None:
+            source.window.answered(sequence)
+
     def ask_for(self, camera: CameraSettings) -> Future[None]:
         """Has the camera started anew with other settings; with the old ones when it refuses.
 

@@ -213,6 +213,8 @@ class Media:
         if verdict.decision is Decision.GATED:
             self.counters.gated += 1
         else:
+            if self._source.window is not None:
+                self._source.window.passed(info.sequence)
             self._in_encoder[running_ns] = info, self.last_captured_s
             self._keep_idr_interval(running_ns)
         self._decided(info, verdict)
@@ -242,8 +244,8 @@ class Media:
                 self._last_idr_ns = running_ns
                 self._encoder.saw_idr()
             for earlier in [ns for ns in list(self._in_encoder) if ns < running_ns]:
-                del self._in_encoder[earlier]  # the encoder keeps order: it dropped this one
-                self.counters.discarded += 1
+                dropped, _ = self._in_encoder.pop(earlier)  # the encoder keeps the order
+                self._discard(dropped.sequence)
             info, _ = self._in_encoder.pop(running_ns)
             stamped = annexb.insert_before_slice(access_unit, sei.encode(info))
             self.encoded += 1
@@ -251,8 +253,13 @@ class Media:
             if self._leave(Unit(info, stamped, clock_ns, idr)):
                 self.counters.sent += 1
             else:
-                self.counters.discarded += 1
+                self._discard(info.sequence)
             return self._gst.FlowReturn.OK
         except Exception as error:  # a callback cannot raise: the main thread does it
             self.error = self.error or error
             return self._gst.FlowReturn.ERROR
+
+    def _discard(self, sequence: int) -> None:
+        self.counters.discarded += 1
+        if self._source.window is not None:
+            self._source.window.gone(sequence)

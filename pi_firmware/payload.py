@@ -109,7 +109,7 @@ class Payload:
             self._supervision.start(self._capture, self._ground, self._recorder, self._telemetry)
             self._battery.start(on_critical=self._on_critical)
             self._autopilot.start()
-            self._telemetry.on_pose(self._autopilot.on_pose)
+            self._telemetry.on_pose(self._on_pose)
             self._telemetry.on_link(self._ground.heard)
             self._telemetry.on_command(self._commands.ask)
             self._fly(stop)
@@ -195,6 +195,10 @@ class Payload:
     def _tell_autopilot(self, message: messages.Autopilot) -> None:
         self._supervision.table.beat(AUTOPILOT)
         self._telemetry.autopilot(message)
+
+    def _on_pose(self, message: messages.Pose) -> None:
+        self._capture.answered(message.sequence)
+        self._autopilot.on_pose(message)
 
     def _on_critical(self) -> None:
         """On the battery's thread: the recording ends at once, whatever the flight's end takes."""

@@ -57,6 +57,10 @@ class FirmwareProcess:
         """Whether the process is alive."""
         return self._process is not None and self._process.poll() is None
 
+    def pid(self) -> int | None:
+        """The process's id; None before its start."""
+        return None if self._process is None else self._process.pid
+
     def check(self) -> None:
         """Raises `FirmwareError` with the firmware's own last line when it ended with an error."""
         status = None if self._process is None else self._process.poll()

@@ -126,18 +126,24 @@ def run(
     on_start: Callable[[int], None] = lambda time_ns: None,
     keep_picture: Callable[[ReceivedFrame], bool] = lambda frame: False,
     on_frame: Callable[[LiveFrame], None] = lambda frame: None,
+    repeat: bool = False,
 ) -> LiveResult:
     """Localizes what comes until the payload ends its stream, and tells the payload the poses.
 
     `check` raises when the payload has failed, `running` tells whether it may still send,
     `on_start` gets the first frame's capture time before that frame is localized. Frames
-    for which `keep_picture` holds keep their image. Raises `StreamError` when no frame came within
+    for which `keep_picture` holds keep their image. `repeat` is for a payload that waits for poses:
+    while nothing comes it is told the newest again. Raises `StreamError` when no frame came within
     `start_timeout_s`.
     """
     result = LiveResult()
     feed = PoseFeed(telemetry.session)
     with Feedback(telemetry, {payload_id: receiver}.get):
         for frame in _frames(receiver, telemetry, payload_id, check, running, start_timeout_s):
+            if frame is None:
+                if repeat:
+                    feed.again(payload_id)
+                continue
             if not result.frames:
                 on_start(frame.time_ns)
             estimate = localizer.process(
@@ -172,8 +178,11 @@ def _frames(
     check: Callable[[], None],
     running: Callable[[], bool],
     start_timeout_s: float,
-) -> Iterator[ReceivedFrame]:
-    """The frames as they come, until the payload has ended its stream and all of it is here."""
+) -> Iterator[ReceivedFrame | None]:
+    """The frames as they come, until the payload has ended its stream and all of it is here.
+
+    None whenever none has come for a while.
+    """
     started_s = last_s = time.monotonic()
     came = False
     while True:
@@ -182,6 +191,7 @@ def _frames(
             yield frame
             came, last_s = True, time.monotonic()
             continue
+        yield None
         check()
         now_s = time.monotonic()
         ended = _ended(telemetry.state(payload_id))

@@ -56,6 +56,7 @@ class PoseFeed:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._publishers: dict[str, Any] = {}
+        self._newest: dict[str, messages.Pose] = {}
 
     def publish(
         self, payload_id: str, estimate: PoseEstimate, *, capture_ns: int, sequence: int
@@ -70,6 +71,7 @@ class PoseFeed:
         """Sends a pose as it is to be told. One that cannot go is dropped."""
         import zenoh
 
+        self._newest[payload_id] = message
         if payload_id not in self._publishers:
             # At once, or not at all: the next frame has a newer one.
             self._publishers[payload_id] = self._session.zenoh.declare_publisher(
@@ -79,3 +81,8 @@ class PoseFeed:
             )
         with contextlib.suppress(zenoh.ZError):
             self._publishers[payload_id].put(messages.encode(message))
+
+    def again(self, payload_id: str) -> None:
+        """Sends the newest once more, for a payload that waits for it and may not have had it."""
+        if payload_id in self._newest:
+            self.send(payload_id, self._newest[payload_id])

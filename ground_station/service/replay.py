@@ -1,4 +1,4 @@
-"""A recorded flight through the real firmware, the real link and the localizer, in real time."""
+"""A recorded flight through the real firmware, the real link and the localizer."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from ground_station.mapping import store
 from ground_station.progress import Progress
 from ground_station.recording.flight import camera_of, trajectory_of
 from ground_station.service import live
-from ground_station.service.firmware import FirmwareProcess
-from ground_station.stream.receiver import Receiver
-from ground_station.stream.telemetry import TelemetryListener
+from ground_station.service.stand import LOOPBACK, Stand
+from pi_firmware.wire import config
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
 
 PAYLOAD_ID = "replay"
 _START_TIMEOUT_S = 30.0
+_AHEAD = 4
+"""Frames of a stepped flight that are on their way at a time: payload and localizer overlap."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,11 @@ class ReplaySettings:
     """Frames that may wait for the localizer before the oldest is dropped and counted."""
     pictures: int = 4
     """How many frames are kept with their matches, for the report."""
+    stepped: bool = False
+    """Each frame as soon as there is room, and no clock decides what becomes of it: the same poses,
+    bit for bit, however fast the machine. False: in real time."""
+    payload: tuple[str, ...] = ()
+    """More of the firmware's settings, each "key=value" as `--set` takes them."""
 
 
 _THESIS = {"rate_hz": 5.0, "init": "truth", "gate_min_entropy_bits": 7.0}
@@ -107,11 +113,14 @@ class ReplayResult:
 
 
 def replay(
-    map_: store.Map, localizer_settings: LocalizerSettings, settings: ReplaySettings
+    map_: store.Map,
+    localizer_settings: LocalizerSettings,
+    settings: ReplaySettings,
+    stand: Stand = LOOPBACK,
 ) -> ReplayResult:
     """Starts the firmware on the recording as its own process and localizes what it streams.
 
-    Ports are ephemeral. Raises a `BlimpError` with one line for a recording without a camera, a map
+    Raises a `BlimpError` with one line for a recording without a camera, a map
     of other features, a firmware that fails, or a stream that does not come.
     """
     reader = RecordingReader(settings.recording)
@@ -120,7 +129,8 @@ def replay(
         raise InputError(f"{settings.recording}: it carries no camera calibration")
     features = localizer_settings.features
     extract = extractors.create(features.extractor, features.max_features)
-    localizer_settings = for_live(localizer_settings)
+    if not settings.stepped:
+        localizer_settings = for_live(localizer_settings)
     localizer = Localizer(map_, camera, extract, localizer_settings)
     truth = None
     if TRUTH_TOPIC in reader.topics():
@@ -135,10 +145,11 @@ def replay(
 
     with (
         tempfile.TemporaryDirectory(prefix="blimp-replay-") as folder,
-        Receiver(port=0, queue_frames=settings.queue_frames) as receiver,
-        TelemetryListener(["tcp/127.0.0.1:0"]) as telemetry,
-        FirmwareProcess(
-            _payload_config(settings, camera, receiver.port, telemetry.endpoints), Path(folder)
+        stand.receiver(_AHEAD + 2 if settings.stepped else settings.queue_frames) as receiver,
+        stand.telemetry() as telemetry,
+        stand.link(receiver.port) as port,
+        stand.payload(
+            _payload_config(settings, camera, port, telemetry.endpoints), Path(folder)
         ) as firmware,
         Progress("live, frames", expected) as progress,
     ):
@@ -153,6 +164,7 @@ def replay(
             on_start=set_start,
             keep_picture=lambda frame: frame.sequence % every == every // 2,
             on_frame=lambda frame: progress.step(),
+            repeat=settings.stepped,
         )
     for event in result.events:
         if event.name not in ("started", "end-of-stream"):
@@ -193,13 +205,15 @@ def _payload_config(
         options.append(f"start_s={settings.start_s:g}")
     if settings.duration_s:
         options.append(f"duration_s={settings.duration_s:g}")
+    if settings.stepped:
+        options += ["pace=stepped", "max_hz=1000", f"ahead={_AHEAD}"]
     path = settings.recording.resolve()
     gate: dict[str, float] = {}
     if settings.preset == "thesis":  # its gate knows entropy only
         gate = {"min_sharpness_ratio": 0.0, "min_difference": 0.0}
     if settings.gate_min_entropy_bits is not None:
         gate["min_entropy_bits"] = settings.gate_min_entropy_bits
-    return {
+    document: dict[str, Any] = {
         "payload_id": PAYLOAD_ID,
         "camera": {
             "uri": f"replay:{path}?{'&'.join(options)}",
@@ -215,3 +229,6 @@ def _payload_config(
         "supervision": {"frame_timeout_s": 14.0},
         "wifi": {"interface": ""},
     }
+    for setting in settings.payload:
+        config.apply_override(document, setting)
+    return document

@@ -1,4 +1,4 @@
-"""`blimp replay`: a recorded flight through firmware, link and localizer, in real time."""
+"""`blimp replay`: a recorded flight through firmware, link and localizer."""
 
 from __future__ import annotations
 
@@ -47,6 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--min-entropy-bits", type=float, metavar="B",
         help="the payload's gate (its own default; with the preset thesis 7.0)",
     )  # fmt: skip
+    parser.add_argument(
+        "--stepped", action="store_true",
+        help="each frame as soon as the one before is done, and the same poses in each run",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write results here, too")
 
 
@@ -56,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.service import demo
 
     if args.demo:
-        if args.recording or args.map:
-            raise InputError("--demo brings its own recording and map")
+        if args.recording or args.map or args.stepped:
+            raise InputError("--demo brings its own recording, map and pace")
         return demo.run(args.out, preset=args.preset, init=args.init, rate_hz=args.rate_hz)
     if args.recording is None or args.map is None:
         raise InputError("a RECORDING and --map are needed (or --demo)")
@@ -81,6 +85,7 @@ def _replay(args: argparse.Namespace) -> int:
         gate_min_entropy_bits=args.min_entropy_bits,
         start_s=args.start_s,
         duration_s=args.duration_s,
+        stepped=args.stepped,
     )
     simulation = RecordingReader(args.recording).metadata_table("simulation")
     map_ = store.load(args.map)

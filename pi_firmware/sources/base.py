@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from pi_firmware.sources.window import Window
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -47,6 +48,9 @@ class Source(Protocol):
 
     dmabuf: bool
     """Whether the pictures are dmabufs, which a hardware encoder reads without a copy."""
+
+    window: Window | None
+    """Told of each frame that passes the gate, where the source waits for the ground's answers."""
 
     def elements(self) -> str:
         """The pipeline's text from the source to raw I420 or NV12 at the camera's size and rate."""

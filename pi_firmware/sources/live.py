@@ -9,6 +9,7 @@ from pi_firmware import clocks, gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Stamp
 from pi_firmware.sources.shutter import Mark, to_middle_ns
+from pi_firmware.sources.window import Window
 from pi_firmware.uri import Uri
 from pi_firmware.wire.errors import BlimpError
 
@@ -62,6 +63,7 @@ class LiveSource:
     ) -> None:
         self.rate_hz = camera.rate_hz
         self.dmabuf = False
+        self.window: Window | None = None
         self.cut_reason = ""
         self.error: BlimpError | None = None
         self._camera = camera

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from pi_firmware.sources.window import Window
+
 PACES = ("realtime", "stepped")
 MAX_STEPS_HZ = 120.0
 """Frames a second of the stepped pace where `max_hz` says nothing.
@@ -55,15 +57,20 @@ class RealTime:
 class Stepped:
     """Each frame when the pipeline has taken the one before, at most `max_hz` a second.
 
+    With a window it also waits for whoever works on the frames.
+
     Running time is the recording's, not the clock's: whatever is measured in it (heartbeats, IDR
     intervals, the encoder's bit rate) comes out as in a flight, the same in each run.
     """
 
     ahead_frames = 1
 
-    def __init__(self, max_hz: float, stopping: threading.Event) -> None:
+    def __init__(
+        self, max_hz: float, stopping: threading.Event, window: Window | None = None
+    ) -> None:
         self._least_s = 1 / max_hz
         self._stopping = stopping
+        self._window = window
         self._first_ns: int | None = None
         self._previous_s = -self._least_s
 
@@ -74,5 +81,7 @@ class Stepped:
             wait_s = self._previous_s + self._least_s - time.monotonic()
             if wait_s > 0 and self._stopping.wait(wait_s):
                 return None
+        if self._window is not None and not self._window.wait(self._stopping):
+            return None
         self._previous_s = time.monotonic()
         return None if self._stopping.is_set() else time_ns - self._first_ns

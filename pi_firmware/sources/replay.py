@@ -14,11 +14,12 @@ from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Stamp
 from pi_firmware.sources.decoding import Picture, RecordingDecoder
 from pi_firmware.sources.pacing import MAX_STEPS_HZ, PACES, Pace, RealTime, Stepped
+from pi_firmware.sources.window import Window
 from pi_firmware.uri import Uri
 from pi_firmware.wire.errors import BlimpError, RecordingError
 
-_OPTIONS = ("rate_hz", "start_s", "duration_s", "loop", "pace", "speed", "max_hz")
-_OF_PACE = {"realtime": "speed", "stepped": "max_hz"}
+_OPTIONS = ("rate_hz", "start_s", "duration_s", "loop", "pace", "speed", "max_hz", "ahead")
+_OF_PACE = {"realtime": ("speed",), "stepped": ("max_hz", "ahead")}
 
 
 class RateGrid:
@@ -63,6 +64,7 @@ class ReplaySource:
             raise uri.fail("expected replay:FLIGHT.mcap")
         self.rate_hz = uri.number("rate_hz", camera.rate_hz, 1, 120)
         self.dmabuf = False
+        self.window: Window | None = None
         self.cut_reason = ""
         self.error: BlimpError | None = None
         self._path = Path(uri.path)
@@ -137,12 +139,15 @@ class ReplaySource:
 
     def _chosen_pace(self, uri: Uri) -> Pace:
         name = uri.choice("pace", "realtime", PACES)
-        for pace, option in _OF_PACE.items():
-            if option in uri.options and pace != name:
-                raise uri.fail(f"{option} is for pace={pace} only")
+        for pace, options in _OF_PACE.items():
+            for option in options:
+                if option in uri.options and pace != name:
+                    raise uri.fail(f"{option} is for pace={pace} only")
         if name == "stepped":
             max_hz = uri.number("max_hz", MAX_STEPS_HZ, 0.1, 1000.0)
-            return Stepped(max_hz, self._stopping)
+            if "ahead" in uri.options:
+                self.window = Window(int(uri.number("ahead", 1, 1, 1000)))
+            return Stepped(max_hz, self._stopping, self.window)
         return RealTime(uri.number("speed", 1.0, 0.1, 10.0), self._running_ns, self._stopping)
 
     def _running_ns(self) -> int:

@@ -36,10 +36,11 @@ def key(
     return dataclasses.field(default=default, metadata=meta)
 
 
-def apply_override(document: dict[str, Any], override: str, cls: type) -> None:
+def apply_override(document: dict[str, Any], override: str, cls: type | None = None) -> None:
     """Puts `table.key=value` on top of a document that is to become a `cls`.
 
-    A key that holds text takes what stands there as it is, any other a TOML value. Raises
+    A key that holds text takes what stands there as it is, any other a TOML value. Without `cls`,
+    for a document that somebody else will check, what is no TOML value is text. Raises
     `ConfigError` with one line.
     """
     name, equals, text = override.partition("=")
@@ -50,7 +51,10 @@ def apply_override(document: dict[str, Any], override: str, cls: type) -> None:
         document = document.setdefault(part, {})
         if not isinstance(document, dict):
             raise ConfigError(f"--set {override!r}: '{part}' is not a table")
-    document[last] = text if _is_text([*tables, last], cls) else _toml_value(text, override)
+    if cls is None:
+        document[last] = _value_or_text(text)
+    else:
+        document[last] = text if _is_text([*tables, last], cls) else _toml_value(text, override)
 
 
 def _is_text(path: list[str], kind: Any) -> bool:
@@ -65,6 +69,13 @@ def _toml_value(text: str, override: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except (tomllib.TOMLDecodeError, KeyError):
         raise ConfigError(f"--set {override!r}: {text!r} is not a TOML value") from None
+
+
+def _value_or_text(text: str) -> Any:
+    try:
+        return _toml_value(text, text)
+    except ConfigError:
+        return text
 
 
 def range_of(cls: type, name: str) -> tuple[float, float]:

@@ -161,3 +161,16 @@ def test_a_shipped_file_with_an_unknown_key_does_not_load(tmp_path: Path) -> Non
     (tmp_path / "c.toml").write_text(FILE + "colour = 1\n")
     with pytest.raises(ConfigError, match=r"radio\.colour"):
         config.differences(tmp_path / "c.toml", Settings)
+
+
+def test_an_override_of_somebody_elses_document_takes_values_and_text() -> None:
+    document: dict[str, object] = {"encoder": {"adapt": False}}
+    for override in ("encoder.bitrate_kbps=800", "camera.uri=test:", "gate.enabled=false"):
+        config.apply_override(document, override)
+    assert document == {
+        "encoder": {"adapt": False, "bitrate_kbps": 800},
+        "camera": {"uri": "test:"},
+        "gate": {"enabled": False},
+    }
+    with pytest.raises(ConfigError, match="expected key=value"):
+        config.apply_override(document, "encoder")
