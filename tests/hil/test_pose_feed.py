@@ -106,6 +106,12 @@ def test_poses_reach_the_payload_they_are_of() -> None:
             time.sleep(0.05)
         first = heard["one"].get(timeout=LIMIT_S)
         assert first.state == "TRACKING" and first.capture_ns == CAPTURED_NS
+        said = first.sequence
+        while said < sequence - 1:  # all that was said before has come
+            said = heard["one"].get(timeout=LIMIT_S).sequence
+        feed.again("one")  # a payload that waits for it may have missed it
+        assert heard["one"].get(timeout=LIMIT_S).sequence == said
+        feed.again("two")  # to whom nothing was said yet
         assert heard["two"].empty()
         for telemetry in payloads.values():
             telemetry.close()
