@@ -26,8 +26,9 @@ class Limits:
     recovery_s_max: float | None = _bound(
         "from an outage's end to the first TRACKING pose of a frame taken after it", "s"
     )
-    tracking_min: float | None = _bound("frames called TRACKING, of those that reached the localizer",
-                                        "share", 1.0)  # fmt: skip
+    tracking_min: float | None = _bound(
+        "frames called TRACKING, of those that reached the localizer", "share", 1.0
+    )
     lost_max: float | None = _bound("frames lost, of those sent", "share", 1.0)
     payload_memory_MB_max: float | None = _bound("the firmware's resident memory, peak", "MB")
     ground_memory_MB_max: float | None = _bound("the ground station's resident memory, peak", "MB")

@@ -1,0 +1,221 @@
+"""What became of each frame of a run, as a table: a CSV file that keeps every bit of the poses."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import InputError
+from ground_station.files import write_text
+from ground_station.geometry import poses
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.estimate import State
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+UNKNOWN = -1
+"""A time that is not known, as of a capture by a clock that never answered."""
+_TIMES = ("sequence", "time_ns", "captured_ns", "arrival_ns", "done_ns")
+_POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+COLUMNS = (*_TIMES, "state", "reason", "relocalized", *_POSE, "pose_sha256")
+_MOST_BYTES = 256 << 20
+_STATES = tuple(state.value for state in State)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """N frames that reached the localizer, in the order in which they did.
+
+    Each is (N,): `sequence` the payload's number; `time_ns` the camera's capture time; by the
+    ground's clock `captured_ns` (`UNKNOWN` where the payload's clock never answered), `arrival_ns`
+    and `done_ns`, when the pose was there. `position_m` (N, 3) and `quaternion_xyzw` (N, 4) are
+    wTc, NaN without a pose; `digest` is "" there, else of the 16 numbers of wTc as they are in
+    memory: equal digests, equal bits.
+    """
+
+    sequence: Times
+    time_ns: Times
+    captured_ns: Times
+    arrival_ns: Times
+    done_ns: Times
+    state: tuple[str, ...]
+    reason: tuple[str, ...]
+    relocalized: npt.NDArray[np.bool_]
+    position_m: Array
+    quaternion_xyzw: Array
+    digest: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @property
+    def localized(self) -> npt.NDArray[np.bool_]:
+        """(N,), which have a pose, finite or not."""
+        return np.array([digest != "" for digest in self.digest], dtype=bool)
+
+    @property
+    def finite(self) -> npt.NDArray[np.bool_]:
+        """(N,), which have a pose of finite numbers."""
+        numbers = np.hstack([self.position_m, self.quaternion_xyzw])
+        return np.asarray(self.localized & np.isfinite(numbers).all(axis=1))
+
+    def called(self, state: str) -> npt.NDArray[np.bool_]:
+        """(N,), which have this state."""
+        return np.array([name == state for name in self.state], dtype=bool)
+
+    @property
+    def latency_ms(self) -> Array:
+        """(N,), capture to pose; NaN where the time of capture is not known."""
+        took = (self.done_ns - self.captured_ns) / 1e6
+        return np.where(self.captured_ns == UNKNOWN, np.nan, took)
+
+    def ordered(self) -> npt.NDArray[np.intp]:
+        """The indices of the finite poses by capture time."""
+        found = np.flatnonzero(self.finite)
+        return found[np.argsort(self.time_ns[found], kind="stable")]
+
+    def trajectory(self) -> Trajectory:
+        """The finite poses by capture time, whatever their state."""
+        k = self.ordered()
+        return Trajectory(self.time_ns[k], self.position_m[k], self.quaternion_xyzw[k])
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One frame on its way into the table; `wTc` (4, 4) or None."""
+
+    sequence: int
+    time_ns: int
+    captured_ns: int
+    arrival_ns: int
+    done_ns: int
+    state: str
+    reason: str = ""
+    relocalized: bool = False
+    wTc: Array | None = None
+
+
+def table(rows: Sequence[FrameRow]) -> Frames:
+    """The table of some frames."""
+    n = len(rows)
+    position, quaternion = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+    digests = [""] * n
+    for k, row in enumerate(rows):
+        if row.wTc is None:
+            continue
+        digests[k] = digest(row.wTc)
+        position[k] = row.wTc[:3, 3]
+        if np.isfinite(row.wTc).all():
+            quaternion[k] = poses.to_quaternion(row.wTc)
+    return Frames(
+        **_columns([[getattr(row, name) for name in _TIMES] for row in rows]),
+        state=tuple(row.state for row in rows),
+        reason=tuple(row.reason for row in rows),
+        relocalized=np.array([row.relocalized for row in rows], dtype=bool),
+        position_m=position,
+        quaternion_xyzw=quaternion,
+        digest=tuple(digests),
+    )
+
+
+def digest(wTc: npt.ArrayLike) -> str:
+    """Of a pose's numbers, bit for bit: 32 hexadecimal digits of their SHA-256."""
+    return hashlib.sha256(np.ascontiguousarray(wTc, dtype="<f8").tobytes()).hexdigest()[:32]
+
+
+def write_csv(path: str | Path, frames: Frames) -> None:
+    """Writes the table; numbers in the shortest form that reads back as the same double."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    times = np.column_stack([getattr(frames, name) for name in _TIMES]).tolist()
+    numbers = np.hstack([frames.position_m, frames.quaternion_xyzw]).tolist()
+    for k in range(len(frames)):
+        pose = numbers[k] if frames.digest[k] else [""] * len(_POSE)
+        told = (frames.state[k], _line(frames.reason[k]), int(frames.relocalized[k]))
+        writer.writerow([*times[k], *told, *pose, frames.digest[k]])
+    write_text(path, out.getvalue())
+
+
+def read_csv(path: str | Path) -> Frames:
+    """Reads what `write_csv` wrote; raises `InputError` with one line that names the line."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
+    if text and not text.endswith("\n"):
+        raise InputError(f"{path}: cut in the middle of its last line")
+    rows = _rows(path, text)
+    if next(rows, None) != list(COLUMNS):
+        raise InputError(f"{path}, line 1: not the columns {','.join(COLUMNS)}")
+    parsed = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            parsed.append(_parsed(row))
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{path}, line {number}: {str(error)[:100]!s}") from None
+    times, told, pose = zip(*parsed, strict=True) if parsed else ((), (), ())
+    numbers = np.array(pose, np.float64).reshape(-1, len(_POSE))
+    return Frames(
+        **_columns(times),
+        state=tuple(t[0] for t in told),
+        reason=tuple(t[1] for t in told),
+        relocalized=np.array([t[2] for t in told], dtype=bool),
+        position_m=numbers[:, :3].copy(),
+        quaternion_xyzw=numbers[:, 3:].copy(),
+        digest=tuple(t[3] for t in told),
+    )
+
+
+def _columns(times: Sequence[Sequence[int]]) -> dict[str, Any]:
+    numbers = np.array(times, np.int64).reshape(-1, len(_TIMES))
+    return {name: numbers[:, k].copy() for k, name in enumerate(_TIMES)}
+
+
+def _rows(path: Path, text: str) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(io.StringIO(text), strict=True)
+    except csv.Error as error:
+        raise InputError(f"{path}: not CSV: {error}") from None
+
+
+def _parsed(row: list[str]) -> tuple[list[int], tuple[str, str, bool, str], list[float]]:
+    if len(row) != len(COLUMNS):
+        raise ValueError(f"{len(row)} columns; {len(COLUMNS)} are needed")
+    n = len(_TIMES)
+    times = [int(text) for text in row[:n]]
+    if not all(UNKNOWN <= value < 1 << 63 for value in times):
+        raise ValueError("a time or number is not between 0 and 2^63")
+    state, reason, relocalized = row[n : n + 3]
+    if state not in _STATES:
+        raise ValueError(f"the state is {state[:40]!r}; allowed: {', '.join(_STATES)}")
+    if relocalized not in ("0", "1"):
+        raise ValueError(f"relocalized is {relocalized[:40]!r}; allowed: 0, 1")
+    pose, code = row[n + 3 : -1], row[-1]
+    if not code:
+        if any(pose):
+            raise ValueError("a pose without its digest")
+        return times, (state, reason, relocalized == "1", ""), [math.nan] * len(_POSE)
+    if len(code) != 32 or not set(code) <= set("0123456789abcdef"):
+        raise ValueError(f"pose_sha256 is {code[:40]!r}; allowed: 32 hexadecimal digits")
+    return times, (state, reason, relocalized == "1", code), [float(text) for text in pose]
+
+
+def _line(text: str) -> str:
+    """A reason as it may stand in a table: one line."""
+    return "".join(c if c.isprintable() else " " for c in text)[:200]
