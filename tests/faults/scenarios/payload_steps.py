@@ -1,0 +1,141 @@
+"""What befalls the payload: its process, clock, camera, encoder, gauge and card."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from scenarios import disk
+from scenarios.step import Step
+
+if TYPE_CHECKING:
+    from scenarios.world import World
+
+GAUGES = {
+    "absent": "i2c:ina219@fake:0x40?absent=1",
+    "failing": "i2c:ina219@fake:0x40?fail_every=3",
+    "nonsense": "i2c:ina219@fake:0x40?nonsense_every=3&nonsense=65535",
+    "none": "i2c:max17048@fake:0x36?nonsense_every=2&nonsense=65535",
+}
+_ENCODER_GIVES_NONE = 1
+
+
+@dataclass(frozen=True)
+class PayloadKilled(Step):
+    """SIGKILL, as when the supply's contact is lost; it starts again when that is mended."""
+
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        world.hold_payload(self, kill=True)
+
+    def mend(self, world: World) -> None:
+        world.let_payload(self)
+
+
+@dataclass(frozen=True)
+class PayloadRestarted(Step):
+    """It ends in order and starts as another session, with another SSRC or the same."""
+
+    same_ssrc: bool = False
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        if self.same_ssrc:
+            world.configure(self, {"ssrc": str(world.run.ssrc)})
+        else:
+            world.hold_payload(self)
+
+    def mend(self, world: World) -> None:
+        if not self.same_ssrc:
+            world.let_payload(self)
+
+
+@dataclass(frozen=True)
+class PayloadStopped(Step):
+    """SIGSTOP, as when its card holds it up; SIGCONT."""
+
+    def inject(self, world: World) -> None:
+        world.kept[id(self)] = world.run
+        world.run.send(signal.SIGSTOP)
+
+    def mend(self, world: World) -> None:
+        run = world.kept.pop(id(self))
+        if run.ended is None:
+            run.send(signal.SIGCONT)
+
+
+@dataclass(frozen=True)
+class PayloadClock(Step):
+    """Its wall clock is set by so many seconds, and set right again."""
+
+    by_s: float = 3600.0
+
+    def inject(self, world: World) -> None:
+        if world.shims:
+            world.shims["stepped_clock"].set(int(1e9 * self.by_s))
+
+    def mend(self, world: World) -> None:
+        if world.shims:
+            world.shims["stepped_clock"].set(0)
+
+
+@dataclass(frozen=True)
+class CameraFault(Step):
+    """It flies with another camera: one of `scenarios.camera.NAMES`."""
+
+    kind: str = "black"
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        world.configure(self, {"camera": self.kind})
+
+    def mend(self, world: World) -> None:
+        world.configure(self, None)
+
+
+@dataclass(frozen=True)
+class GaugeFault(Step):
+    """It flies with a gauge that is absent, fails, or talks nonsense: one of `GAUGES`."""
+
+    kind: str = "nonsense"
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        options = {"battery.uri": GAUGES[self.kind], "battery.period_s": "0.2"}
+        world.configure(self, options)
+
+    def mend(self, world: World) -> None:
+        world.configure(self, None)
+
+
+@dataclass(frozen=True)
+class EncoderStalls(Step):
+    """The encoder takes pictures and gives none."""
+
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        if world.shims:
+            world.shims["encoder_fault"].set(_ENCODER_GIVES_NONE)
+
+    def mend(self, world: World) -> None:
+        if world.shims:
+            world.shims["encoder_fault"].set(0)
+
+
+@dataclass(frozen=True)
+class CardFull(Step):
+    """The payload's card takes no more; with the fault the recording ends, and it flies on."""
+
+    def inject(self, world: World) -> None:
+        world.kept[id(self)] = (world.run, world.end_recording("card"))
+        disk.limit_files(world.run.process.pid, disk.largest(world.card))
+
+    def mend(self, world: World) -> None:
+        run, window = world.kept.pop(id(self))
+        window[1] = time.monotonic()
+        if run.ended is None:
+            disk.limit_files(run.process.pid, None)

@@ -1,0 +1,168 @@
+"""Faults across payload and ground station, and whether the invariants hold.
+
+    python tests/faults/scenarios/run.py matrix [--only outage]
+    python tests/faults/scenarios/run.py walks --seed 1 --walks 15
+    python tests/faults/scenarios/run.py walks --seed 7 --walks 1 --shrink   # a short reproduction
+    python tests/faults/scenarios/run.py again FOLDER/scenario-0.json
+
+Prints what was injected, a table of all invariants, and ends with status 1 when one was broken. The
+folder of a run that broke one is kept, with its steps, its story, logs and recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from scenarios import disk
+from scenarios.camera import Cameras
+from scenarios.judge import INVARIANTS, Verdict
+from scenarios.matrix import MATRIX, named
+from scenarios.play import RECOVERED_S, STARTED_S, found, play
+from scenarios.step import Scenario, StepError, as_json, from_json
+from scenarios.walk import WALK_S, drawn, shrunk
+from scenarios.world import shims_there
+
+LONG_WALKS, LONG_S = 60, 120.0
+BAD_INPUT = 2
+
+
+def main() -> int:
+    """Runs, prints, writes; 1 when an invariant was broken, 2 for bad input."""
+    arguments = _arguments()
+    try:
+        scenarios = _chosen(arguments)
+    except (StepError, OSError) as error:
+        print(f"run.py: {error}", file=sys.stderr)
+        return BAD_INPUT
+    if not shims_there():
+        print("run.py: no C compiler (cc): clocks and encoder cannot be disturbed", file=sys.stderr)
+        return BAD_INPUT
+    has_disk = disk.alone()
+    place = Path(tempfile.mkdtemp(prefix="scenarios-", dir=arguments.keep))
+    cameras = Cameras(place)
+    verdicts = []
+    for number, scenario in enumerate(scenarios):
+        began_s = time.monotonic()
+        print(f"[{number + 1} of {len(scenarios)}] {scenario.name}", flush=True)
+        for step in scenario.steps:
+            print(f"    {step}", flush=True)
+        if scenario.disk_MB and not has_disk:
+            print("    left out: a disk of its own needs root and unshare", flush=True)
+            continue
+        folder = place / f"{number:02d}-{scenario.name.replace(' ', '-')[:40]}"
+        (verdict,) = play(folder, cameras, [scenario], seed=arguments.seed + number)
+        verdict.figures["took_s"] = round(time.monotonic() - began_s, 1)
+        verdict.figures["load"] = round(os.getloadavg()[0], 1)
+        verdicts.append(verdict)
+        for line in found([verdict]):
+            print(f"    BROKEN {line}", flush=True)
+        if not verdict.holds:
+            print(f"    kept: {folder}", flush=True)
+            if arguments.shrink:
+                _shrink(scenario, folder, cameras, arguments.seed + number)
+    _table(verdicts)
+    _write(arguments.out, arguments.what, verdicts, scenarios)
+    return 0 if all(verdict.holds for verdict in verdicts) else 1
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Faults across payload and ground station.")
+    parser.add_argument("what", choices=("matrix", "walks", "again"))
+    parser.add_argument("file", nargs="?", type=Path, help="of `again`: a scenario as it was kept")
+    parser.add_argument(
+        "--only", default="", metavar="NAME", help="scenarios with this in the name"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the first walk")
+    parser.add_argument("--walks", type=int, default=15, help="of 30 s each")
+    long = f"{LONG_WALKS} walks of {LONG_S:g} s"
+    parser.add_argument("--long", action="store_true", help=long)
+    parser.add_argument("--shrink", action="store_true", help="finds the fewest steps that fail")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where folders are kept")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="all of it as JSON")
+    parser.add_argument("--list", action="store_true", help="prints the scenarios only")
+    arguments = parser.parse_args()
+    if not (1 <= arguments.walks <= 10_000 and 0 <= arguments.seed < 1 << 31):
+        parser.error("--walks: 1 to 10000; --seed: 0 to 2147483647")
+    if (arguments.what == "again") != (arguments.file is not None):
+        parser.error("again, and only again, takes a FILE")
+    if arguments.keep is not None and not arguments.keep.is_dir():
+        parser.error(f"--keep {arguments.keep}: no such folder")
+    if arguments.list:
+        for scenario in MATRIX:
+            print(f"{scenario.name}: {'; '.join(map(str, scenario.steps))}")
+        parser.exit()
+    return arguments
+
+
+def _chosen(arguments: argparse.Namespace) -> list[Scenario]:
+    if arguments.what == "again":
+        return [from_json(arguments.file.read_text())]
+    if arguments.what == "walks":
+        count, span_s = (LONG_WALKS, LONG_S) if arguments.long else (arguments.walks, WALK_S)
+        return [drawn(arguments.seed + n, span_s) for n in range(count)]
+    scenarios = named(arguments.only)
+    if not scenarios:
+        raise StepError(f"--only {arguments.only!r}: no scenario has this in its name (--list)")
+    return scenarios
+
+
+def _shrink(scenario: Scenario, folder: Path, cameras: Cameras, seed: int) -> None:
+    tried = 0
+
+    def fails(fewer: Scenario) -> bool:
+        nonlocal tried
+        tried += 1
+        place = folder.with_name(f"{folder.name}-fewer-{tried:02d}")
+        (verdict,) = play(place, cameras, [fewer], seed=seed)
+        print(f"    {fewer.name}: {'holds' if verdict.holds else 'fails'}", flush=True)
+        return not verdict.holds
+
+    least = shrunk(scenario, fails)
+    (folder / "shrunk.json").write_text(as_json(least))
+    for step in least.steps:
+        print(f"    least: {step}", flush=True)
+
+
+def _table(verdicts: Sequence[Verdict]) -> None:
+    print(f"\n{'scenario':42} {' '.join(f'{name:10}' for name in INVARIANTS)} {'back':>7} off")
+    for verdict in verdicts:
+        cells = " ".join(f"{'BROKEN' if verdict.broken[n] else 'ok':10}" for n in INVARIANTS)
+        back_s = verdict.figures.get("recovery_s")
+        back = "never" if back_s is None else f"{back_s:.1f} s"
+        off = f"{verdict.figures.get('off_m', float('nan')):.2f} m"
+        print(f"{verdict.name[:42]:42} {cells} {back:>7} {off}")
+    holding = sum(verdict.holds for verdict in verdicts)
+    print(
+        f"{holding} of {len(verdicts)} hold; bounds: 0.5 m, back within {RECOVERED_S:g} s, or"
+        f" {STARTED_S:g} s where a process starts anew"
+    )
+
+
+def _write(
+    out: Path | None, what: str, verdicts: Sequence[Verdict], scenarios: Sequence[Scenario]
+) -> None:
+    if out is None:
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    document = {
+        "what": what,
+        "verdicts": [dataclasses.asdict(verdict) for verdict in verdicts],
+        "scenarios": [json.loads(as_json(scenario)) for scenario in scenarios],
+    }
+    part = out.with_name(out.name + ".part")
+    part.write_text(json.dumps(document, indent=1) + "\n")
+    part.replace(out)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,354 @@
+"""What faults befall: the whole service, a payload's program, and the links between them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import random
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import httpx
+from impaired_link import CLEAN, ImpairedLink, Impairment
+from intake_stand import eventually
+from payload_process import PayloadProcess
+from shims import Shim
+from standing import Process, Service
+
+from scenarios import disk
+from scenarios.camera import Cameras
+from scenarios.heard import Heard
+from scenarios.payload_run import PayloadRun
+from scenarios.recordings import Window
+from scenarios.tcp_wire import TcpWire
+
+NAME = "blimp-1"
+RATE_HZ = 10.0
+LIMIT_S = 60.0
+_TICK_S = 0.05
+HOPELESS = 3
+"""The payload's exit status by which systemd starts it anew."""
+_SHIMS = ("stepped_clock", "encoder_fault")
+
+
+class Station(Service):
+    """The service with variables in its environment, such as a shim's."""
+
+    def __init__(self, folder: Path, *settings: str, env: Mapping[str, str]) -> None:
+        super().__init__(folder, *settings)
+        self.command = ["env", *(f"{name}={value}" for name, value in env.items()), *self.command]
+
+
+def shims_there() -> bool:
+    """Whether shims can be made here."""
+    return shutil.which("cc") is not None
+
+
+class World:
+    """A service that records, a payload that flies to it and records; a context manager.
+
+    Steps change it by what is below; more than one may hold the payload or the service down, and
+    it comes back when the last of them lets go.
+    """
+
+    def __init__(
+        self, folder: Path, cameras: Cameras, *, disk_MB: int = 0, foxglove: bool = False,
+        seed: int = 0,
+    ) -> None:  # fmt: skip
+        self.folder = folder
+        self.cameras = cameras
+        self.heard = Heard()
+        self.runs: list[PayloadRun] = []
+        self.said: list[str] = []
+        """What happened and when, for a person."""
+        self.complaints: list[str] = []
+        """What did not end or begin as it should."""
+        self.ended_s: dict[str, list[Window]] = {"ground": [], "card": []}
+        """When something ended a recording, and until when it may have, by whose it was."""
+        self.intake_anew_s: list[float] = []
+        """When the intake was killed, alone or with the service."""
+        self.kept: dict[int, Any] = {}
+        """What a step needs to mend itself, by its id()."""
+        self.service_runs = 0
+        self._draw = random.Random(seed)
+        self._options: dict[int, dict[str, str]] = {}
+        self._impairments: dict[int, Impairment] = {}
+        self._held: dict[str, set[int]] = {"payload": set(), "service": set()}
+        self._stack = contextlib.ExitStack()
+        self._bus = contextlib.ExitStack()
+        self._began_s = time.monotonic()
+        self.card = folder / "card"
+        self.shims: dict[str, Shim] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+        self.card.mkdir()
+        if shims_there():
+            self.shims = {name: Shim(folder, name) for name in _SHIMS}
+            ground = folder / "ground"
+            ground.mkdir()
+            self.shims["ground_clock"] = Shim(ground, "stepped_clock")
+        env = self.shims["ground_clock"].env if self.shims else {}
+        self.service = Station(
+            folder,
+            f"foxglove.enabled={json.dumps(foxglove)}",
+            "recording.at_start=true",
+            env=env,
+        )
+        self.disk = disk.mount(self.service.recordings, disk_MB) if disk_MB else None
+
+    def __enter__(self) -> World:
+        try:
+            self._stack.callback(self._bus.close)
+            self._stack.enter_context(self.service)
+            self._listen()
+            self.link = self._stack.enter_context(
+                ImpairedLink(self.service.video, tap=self._tap, seed=self._draw.randrange(1 << 30))
+            )
+            port = int(self.service.endpoint.rpartition(":")[2])
+            self.wire = self._stack.enter_context(TcpWire(port))
+            self._fly()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends whatever still runs, the hard way."""
+        for run in self.runs:
+            if run.ended is None:
+                run.kill()
+        self._bus.close()
+        if self.service.process.poll() is None:
+            self.service.kill()
+        self._stack.close()
+        if self.disk is not None:
+            self.disk.unmount(keep=self.folder / "disk")
+
+    def say(self, text: str) -> None:
+        """Notes what happens, with its time."""
+        self.said.append(f"{time.monotonic() - self._began_s:6.1f} s  {text}")
+
+    def end_recording(self, whose: str) -> Window:
+        """Something ends the recording of `ground` or `card` now; its window can be prolonged."""
+        now_s = time.monotonic()
+        self.ended_s[whose].append(window := [now_s, now_s])
+        return window
+
+    def draw(self) -> random.Random:
+        """Chance, by the world's seed."""
+        return random.Random(self._draw.randrange(1 << 30))
+
+    # The payload
+
+    @property
+    def run(self) -> PayloadRun:
+        """The payload's newest process."""
+        return self.runs[-1]
+
+    def hold_payload(self, step: object, *, kill: bool = False) -> None:
+        """Ends the payload until it is let go."""
+        self._held["payload"].add(id(step))
+        if self.run.ended is None:
+            if kill:
+                self.end_recording("card")
+                self.run.kill()
+            else:
+                self._end_payload()
+
+    def let_payload(self, step: object) -> None:
+        """Starts it again, unless another step holds it, too."""
+        self._held["payload"].discard(id(step))
+        self.tend()
+
+    def configure(self, step: object, options: Mapping[str, str] | None) -> None:
+        """The payload flies with these options from now on: None takes the step's away again."""
+        self._options.pop(id(step), None)
+        if options is not None:
+            self._options[id(step)] = dict(options)
+        if self.run.ended is None:
+            self._end_payload()
+        self.tend()
+
+    def tend(self) -> None:
+        """What an init system does: a payload that has ended, and is wanted, is started."""
+        run = self.run
+        if run.ended is None and not run.process.running:
+            run.note_end()
+            assert run.ended is not None
+            if run.ended.status == HOPELESS:
+                self.say(f"the payload ended for a new one: {run.ended.err.strip()[-160:]}")
+            else:
+                self.complain(f"the payload ended with {run.ended.status}: {run.ended.err[-300:]}")
+        if run.ended is not None and not self._held["payload"]:
+            self._fly()
+
+    def _end_payload(self) -> None:
+        try:
+            self.run.end()
+        except Exception as error:
+            self.complain(f"the payload did not end: {type(error).__name__}")
+            self.run.kill()
+
+    def _fly(self) -> None:
+        options = {"camera": "flight", "ssrc": str(self._draw.randrange(1, 1 << 32))}
+        for more in self._options.values():
+            options |= more
+        camera = self.cameras.get(options.pop("camera"))
+        ssrc = int(options.pop("ssrc"))
+        rate = f"&rate_hz={RATE_HZ:g}" if camera.uri.startswith("replay:") else ""
+        folder = self.folder / f"payload-{len(self.runs)}"
+        settings = {
+            "payload_id": NAME,
+            "camera.uri": camera.uri + rate,
+            "camera.rate_hz": f"{RATE_HZ:g}",
+            "link.port": str(self.link.port),
+            "link.ssrc": str(ssrc),
+            "telemetry.connect": json.dumps([f"tcp/127.0.0.1:{self.wire.port}"]),
+            "recording.folder": str(self.card),
+            "recording.at_start": "true",
+            "recording.min_free_MB": "0",
+            **options,
+        }
+        card = sorted(path.name for path in self.card.iterdir())
+        process = PayloadProcess(
+            folder, *(f"{name}={value}" for name, value in settings.items()), env=self._env()
+        )
+        self.runs.append(PayloadRun(ssrc, camera, process, time.monotonic(), folder, card=card))
+
+    def _env(self) -> dict[str, str]:
+        env: dict[str, str] = {}
+        for name in _SHIMS if self.shims else ():
+            one = self.shims[name].env
+            preload = ":".join(filter(None, (env.get("LD_PRELOAD"), one["LD_PRELOAD"])))
+            env |= one | {"LD_PRELOAD": preload}
+        return env
+
+    def _tap(self, datagram: bytes, lost: bool) -> None:
+        self.run.watch(datagram, lost)
+
+    # The link
+
+    def impair(self, step: object, impairment: Impairment | None) -> None:
+        """The link does this, too; None: no more. Shares of several steps add up."""
+        self._impairments.pop(id(step), None)
+        if impairment is not None:
+            self._impairments[id(step)] = impairment
+        self.link.impair(combined(list(self._impairments.values())))
+
+    # The service
+
+    def hold_service(self, step: object, *, kill: bool = True) -> None:
+        """Ends the whole service until it is let go."""
+        self._held["service"].add(id(step))
+        if self.service.process.poll() is not None:
+            return
+        self.end_recording("ground")
+        self.intake_anew_s.append(time.monotonic())
+        self._bus.close()
+        if kill:
+            self.service.kill()
+            self._try(self.service.assert_nobody_left, "after SIGKILL")
+        else:
+            self._try(self.service.end, "its end")
+
+    def let_service(self, step: object) -> None:
+        """Starts it again, unless another step holds it, too."""
+        self._held["service"].discard(id(step))
+        if not self._held["service"] and self.service.process.poll() is not None:
+            self.service.start()
+            self._listen()
+
+    def child(self, name: str) -> Process | None:
+        """A process of the service now: by its name, `localizer` for the payload's, `station`."""
+        if self.service.process.poll() is not None:
+            return None
+        if name == "station":
+            return self.service.parent()
+        return self.service.processes().get(f"localizer/{NAME}" if name == "localizer" else name)
+
+    def record(self, limit_s: float = 20.0) -> None:
+        """The dashboard's button, pressed until the ground records."""
+        until_s = time.monotonic() + limit_s
+        while time.monotonic() < until_s:
+            with contextlib.suppress(httpx.HTTPError, AssertionError):
+                if self.service.state()["recording"]["active"]:
+                    return
+                self.service.client.post("/api/recording", json={"active": True})
+            time.sleep(0.3)
+
+    def _listen(self) -> None:
+        run, self.service_runs = self.service_runs, self.service_runs + 1
+        self.heard.listen(self._bus.enter_context(self.service.bus()), run)
+
+    def complain(self, text: str) -> None:
+        """Something broke an invariant on the way."""
+        self.say(f"BROKEN {text}")
+        self.complaints.append(text)
+
+    def _try(self, what: Callable[[], object], name: str) -> None:
+        try:
+            what()
+        except Exception as error:
+            self.complain(f"service, {name}: {type(error).__name__}: {str(error)[-600:]}")
+
+    # Its end
+
+    def finish(self) -> None:
+        """Payload and service end in order; all that was on its way has come by then."""
+        with contextlib.suppress(AssertionError):
+            eventually(lambda: self.link.idle, 10.0)
+        if self.run.ended is None:
+            self.end_recording("card")
+            self._end_payload()
+        counts = self.run.ended.counts if self.run.ended else {}
+        with contextlib.suppress(AssertionError):
+            eventually(lambda: self._settled(counts), 15.0)
+        told = -1
+        while told != (told := len(self.heard.estimates())):
+            time.sleep(1.0)
+        self.end_recording("ground")
+        self._try(self.service.end, "its end")
+        self._bus.close()
+
+    def _settled(self, counts: Mapping[str, int]) -> bool:
+        note = self.heard.payload(NAME)
+        said = note.frames if note is not None else {}
+        return all(said.get(name) == value for name, value in counts.items())
+
+
+def combined(impairments: list[Impairment]) -> Impairment:
+    """All of them at once: shares and times add up, shares to less than 1."""
+    result = CLEAN
+    for one in impairments:
+        result = dataclasses.replace(
+            result,
+            **{
+                name: min(0.95, getattr(result, name) + getattr(one, name))
+                for name in ("loss", "burst_start", "reorder", "duplicate", "delay_s", "jitter_s")
+            },
+            burst_end=min(result.burst_end, one.burst_end),
+            burst_loss=max(result.burst_loss, one.burst_loss),
+            reorder_by=max(result.reorder_by, one.reorder_by),
+        )
+    return result
+
+
+def tick(world: World) -> None:
+    """A moment in which the world is looked after."""
+    world.tend()
+    time.sleep(_TICK_S)
+
+
+def running(pid: int) -> bool:
+    """Whether there is a process of an id."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 0)
+        return True
+    return False
