@@ -1,0 +1,70 @@
+"""What a long flight must add up to: each frame told, end to end, one by one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from soaking.table import Row
+from witness import Witness
+
+
+@dataclass
+class Account:
+    """What each party says of the frames and packets of a flight that has ended."""
+
+    seen: list[int] = field(default_factory=list)
+    """Numbers of the frames that the receiver gave, in order."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """The payload's own."""
+    status: int = -1
+    err: str = ""
+    witness: Witness = field(default_factory=Witness)
+    link: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
+
+
+def account_rows(account: Account) -> list[Row]:
+    """The frames: each party's numbers against the others'."""
+    counts, link, received = account.counts, account.link, account.received
+    ended = account.status == 0 and not account.err
+    rows = [Row("exit status", str(account.status), "0", ended)]
+    if not counts:
+        return [*rows, Row("frames", "the payload printed no counters", "", False)]
+    witness = account.witness
+    encoded = counts["captured"] - counts["gated"]
+    left, visible = [frame.sequence for frame in witness.left()], witness.visible()
+    damaged = sum(frame.damaged for frame in witness.left())
+    lost = counts["sent"] - len(account.seen)
+    given_up = received["packets_late"] - link["duplicated"]
+    return [
+        *rows,
+        Row("captured", str(counts["captured"]), "", counts["captured"] > 0),
+        Row("gated", str(counts["gated"])),
+        Row(
+            "encoded, sent + discarded",
+            f"{encoded} = {counts['sent']} + {counts['discarded']}",
+            "exact",
+            encoded == counts["sent"] + counts["discarded"],
+        ),
+        Row(
+            "sent, seen to leave",
+            f"{counts['sent']} = {len(left)}",
+            "exact",
+            left == sorted(set(left)) and len(left) == counts["sent"] and witness.gaps == 0,
+        ),
+        Row("received", str(len(account.seen)), "", len(account.seen) > 0),
+        Row(
+            "lost, damaged + following",
+            f"{lost} = {damaged} + {len(left) - len(visible) - damaged}",
+            "exact, one by one",
+            account.seen == visible,
+        ),
+        Row(
+            "packets lost, on the link",
+            f"{received['packets_lost']} = {link['lost']}",
+            "exact",
+            received["packets_lost"] - given_up == link["lost"]
+            and received["packets"] == link["passed"] == link["received"] - link["lost"],
+        ),
+        Row("packets given up too early", str(given_up)),
+    ]

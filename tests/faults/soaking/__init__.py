@@ -1,0 +1,1 @@
+"""What long runs have in common: sampling, trends, judgement, pictures. No test is in here."""
