@@ -51,7 +51,10 @@ uninstall-service:  ## Take the service away; configuration and recordings stay
 	@sh deploy/ground_station/service.sh uninstall
 
 test: setup  ## Run the tests of every room
-	@.venv/bin/python -m pytest -q tests
+	@failed=0; \
+	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
+	.venv/bin/python -m pytest -q -m "not beside" tests || failed=1; \
+	exit $$failed
 
 check: setup  ## Lint, formatting and types
 	@.venv/bin/ruff check .

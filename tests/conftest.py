@@ -1,9 +1,29 @@
-"""For all tests: a change is judged by the same examples each time it is checked (CI is set)."""
+"""For all tests: a change is judged by the same examples each time it is checked (CI is set).
+
+`make test` runs the tests marked `beside` on all cores at once, then the others one by one.
+"""
 
 import os
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")
+
+_ROOMS = {
+    "cli", "deploy", "evaluation", "features", "geometry", "hw", "localization", "mapping", "maps",
+    "recording", "simulator", "wire",
+}  # fmt: skip
+"""Rooms in whose tests nothing flies: no program that another one disturbs by using a core."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what may run beside other tests, all of these rooms but what measures."""
+    here = Path(__file__).parent
+    for item in items:
+        room = item.path.relative_to(here).parts[0]
+        if room in _ROOMS and item.get_closest_marker("alone") is None:
+            item.add_marker("beside")

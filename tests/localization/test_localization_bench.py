@@ -11,6 +11,8 @@ import pytest
 
 from ground_station import cli
 
+pytestmark = pytest.mark.alone
+
 ATRIUM = Path(__file__).parents[2] / "maps/atrium"
 
 
