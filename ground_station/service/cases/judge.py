@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 
 import numpy as np
 
@@ -89,6 +90,8 @@ def digits(value: float, bound: float | None) -> str:
     for count in range(4, 17):
         text = f"{value:.{count}g}"
         shown = float(text)
+        if 1e4 <= abs(shown) < 1e15:
+            text = format(Decimal(text), "f")
         if bound is None or (shown < bound, shown > bound) == (value < bound, value > bound):
             return text
     return repr(value)
