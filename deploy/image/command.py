@@ -32,7 +32,8 @@ inputs give the same bytes.
 
   qemu     for the emulator: Debian 13, arm64
   zero2w   Raspberry Pi Zero 2 W: Debian 13, arm64, with Raspberry Pi's kernel and firmware
-  zerow    Raspberry Pi Zero W: Raspberry Pi OS Lite (32-bit, trixie), named by --base
+  zerow    Raspberry Pi Zero W: Raspberry Pi OS Lite (32-bit, trixie), named by --base; what it
+           lacks is installed from its own sources, and kept for the next time
 
 zero2w and zerow are not verified on hardware.
 """
@@ -94,7 +95,7 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
     say("wheels")
     site = fetch_wheels(board, cache_folder)
     if board.base:
-        raspios.build(image, board, options.base, site, _CHECKOUT, epoch, say)
+        raspios.build(image, board, options.base, site, cache_folder, _CHECKOUT, epoch, say)
         return
     say("kernel")
     kernel = unpack_kernel(board, cache_folder)

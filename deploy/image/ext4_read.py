@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator
@@ -15,6 +16,8 @@ _ECHO = "debugfs: "
 _LINE = re.compile(
     r"/\d+/(?P<mode>[0-7]+)/(?P<uid>\d+)/(?P<gid>\d+)/(?P<name>[^/]*)/(?P<size>\d*)/"
 )
+_VERSION = re.compile(r"debugfs \d")
+_PERMISSIONS = 0o777
 _TARGET = re.compile(r'^Fast link dest: "(.*)"$')
 
 
@@ -56,6 +59,31 @@ def read_tree(image: Path, wanted: Callable[[str], bool], work: Path) -> Tree:
             raise DeployError(f"{image.name}: /{path}: cannot be read")
         tree.replace(path, content=Content.at(place))
     return tree
+
+
+def unpack(image: Path, tree: Tree, folder: Path) -> None:
+    """Writes a file system to a new folder of the disk, with owners, modes and times; needs root.
+
+    Not so device nodes, pipes, sockets and extended attributes; a file of two names becomes two.
+
+    Args:
+        image: the file system.
+        tree: what `read_tree` gave for it.
+        folder: made here.
+
+    Raises:
+        DeployError: damaged, or no room.
+    """
+    folder.mkdir()
+    said = run(["debugfs", "-R", f'rdump / "{folder}"', image], merge=True)
+    for line in said.decode(errors="replace").splitlines():
+        if not _VERSION.match(line):
+            raise DeployError(f"{image.name}: {line.strip()}")
+    # debugfs gives permissions only; the bits above them come from the tree.
+    for path, entry in tree.items():
+        place = folder / path
+        if entry.kind != "link" and entry.mode & ~_PERMISSIONS and os.path.lexists(place):
+            place.chmod(entry.mode)
 
 
 def _entries(folder: str, lines: Iterable[str]) -> Iterator[tuple[str, Entry]]:

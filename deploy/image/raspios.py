@@ -1,8 +1,10 @@
 """A card for the Zero W out of a Raspberry Pi OS Lite image: the root changed in place, unmounted.
 
 Debian's own armhf needs ARMv7, which the Zero W is not; Raspberry Pi OS has both its kernel and its
-packages. The base must hold the packages of `boards/zerow.toml` already. Not verified on hardware:
-it was tested with small images that have the layout of the real one.
+packages. Those of `boards/zerow.toml` that the base lacks are installed by its own apt, from its
+own sources (`packages/base.py`): once, then from the cache. Not verified on hardware, nor with
+Raspberry Pi OS itself, which was out of reach: it was tested with small images that have the layout
+of the real one, and with a Debian armhf in its place.
 
 The root partition is taken out, changed with debugfs, checked, and put into a card of the same
 layout as the other boards'. The boot partition is made anew from the base's files.
@@ -14,8 +16,20 @@ import shutil
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import boot, card, ext4, ext4_read, initrd, manifest, partitions, release, root
+from deploy.image import (
+    boot,
+    card,
+    ext4,
+    ext4_read,
+    initrd,
+    layer,
+    manifest,
+    partitions,
+    release,
+    root,
+)
 from deploy.image.card import Identifiers, beside, building
+from deploy.image.packages import add_packages
 from deploy.image.packages.board import Board
 from deploy.image.partitions import FAT32_LBA, LINUX
 from deploy.image.sparse import Range, cut_out, sha256
@@ -24,6 +38,8 @@ from deploy.run import run
 
 _OS_RELEASE = "usr/lib/os-release"
 _STATUS = "var/lib/dpkg/status"
+# What Raspberry Pi OS, 32 bit, calls itself; its packages are built for ARMv6.
+_ARMV6 = "raspbian"
 _KERNEL, _KERNEL_SUFFIX = "kernel.img", "-rpi-v6"
 # What of the root is looked at: accounts, units, the kernel's modules and what else the initrd has.
 _WANTED = ("etc/", "usr/lib/systemd/system", "usr/lib/sysusers.d/")
@@ -41,6 +57,7 @@ def build(
     board: Board,
     base: Path,
     site: Path | None,
+    cache_folder: Path,
     checkout: Path,
     epoch: int,
     say: card.Say = lambda line: None,
@@ -52,6 +69,7 @@ def build(
         board: the Zero W.
         base: a Raspberry Pi OS Lite image, 32 bit, trixie; `.xz` is unpacked.
         site: a folder of unpacked wheels for it.
+        cache_folder: where what is installed into the base is kept.
         checkout: of this project, with git.
         epoch: the time of everything that is ours, s since 1970.
         say: takes a line of progress.
@@ -68,17 +86,23 @@ def build(
         contents.mkdir()
         run(["e2fsck", "-fp", root_place], ok=(0, 1), env=ext4.clock(epoch))
         before = ext4_read.read_tree(root_place, _is_wanted, contents)
-        packages = _check(base, before, board)
+        missing = _check(base, before, board)
         tree = Tree()
         for path, entry in before.items():
             tree.put(path, entry)
+        digest_of_base = sha256(base)
+        if missing:
+            say(f"{len(missing)} packages that the base lacks (emulated, the first time)")
+            added = add_packages(board, digest_of_base, root_place, before, missing, cache_folder)
+            layer.lay_over(tree, Tree.from_tar(added))
+        packages = manifest.packages_of(tree)
         firmware = release.build(checkout, site, board.machine, board.python, epoch)
         units = root.customise(tree, checkout, board.name, firmware, epoch)
         ours = tree.changed(before)
-        new = Identifiers(board.name.encode(), sha256(base).encode(), ours.digest(epoch))
+        new = Identifiers(board.name.encode(), digest_of_base.encode(), ours.digest(epoch))
         first = initrd.build(tree, _kernel_release(base, tree))
         say(f"root: {len(ours)} files and folders of ours, {len(units)} units enabled")
-        _grow(root_place, ext4.bytes_needed(ours) + _SPARE_BYTES, epoch)
+        _grow(root_place, ours, epoch)
         run(["tune2fs", "-L", card.ROOT_LABEL, root_place], env=ext4.clock(epoch))
         ext4.fill(root_place, tree, epoch, before)
         where = f"UUID={ext4.facts(root_place)['Filesystem UUID']}"
@@ -133,8 +157,8 @@ def _is_wanted(path: str) -> bool:
     return path.startswith(_WANTED) or path in _WANTED_FILES
 
 
-def _check(base: Path, tree: Tree, board: Board) -> list[tuple[str, str, str]]:
-    """Refuses another system than the board's; gives the installed packages."""
+def _check(base: Path, tree: Tree, board: Board) -> list[str]:
+    """Refuses another system than the board's; gives the packages that it lacks, sorted."""
     if _OS_RELEASE not in tree or _STATUS not in tree:
         raise DeployError(f"{base}: no /{_OS_RELEASE} and /{_STATUS} in it")
     lines = tree.read(_OS_RELEASE).decode("utf-8", "replace").splitlines()
@@ -148,9 +172,10 @@ def _check(base: Path, tree: Tree, board: Board) -> list[tuple[str, str, str]]:
         found = ", ".join(architectures) or "no package base-files"
         raise DeployError(f"{base}: for {found}; expected {board.architecture}")
     missing = sorted(set(board.package_names) - {row[0] for row in packages})
-    if missing:
+    if missing and says.get("ID") != _ARMV6:
+        # Nobody but Raspberry Pi OS has packages for the Zero W's processor.
         raise DeployError(f"{base}: install there first: {' '.join(missing)}")
-    return packages
+    return missing
 
 
 def _kernel_release(base: Path, tree: Tree) -> str:
@@ -162,12 +187,17 @@ def _kernel_release(base: Path, tree: Tree) -> str:
     return found[0]
 
 
-def _grow(place: Path, needed: int, epoch: int) -> None:
-    facts = ext4.facts(place)
-    free = int(facts["Free blocks"]) * int(facts["Block size"])
-    if free < needed:
+def _grow(place: Path, added: Tree, epoch: int) -> None:
+    """Makes room in the file system for entries, by their bytes and their number."""
+    facts = {name: int(value) for name, value in ext4.facts(place).items() if value.isdigit()}
+    block = facts["Block size"]
+    lacking = ext4.bytes_needed(added) + _SPARE_BYTES - facts["Free blocks"] * block
+    # Inodes come with whole groups of blocks.
+    groups = -(-(len(added) - facts["Free inodes"]) // facts["Inodes per group"])
+    lacking = max(lacking, groups * facts["Blocks per group"] * block)
+    if lacking > 0:
         with open(place, "r+b") as file:
-            file.truncate(partitions.align(place.stat().st_size + needed - free))
+            file.truncate(partitions.align(place.stat().st_size + lacking))
         run(["resize2fs", place], env=ext4.clock(epoch))
 
 

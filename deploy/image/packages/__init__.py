@@ -4,6 +4,7 @@ Everything comes through a signature (apt) or a hash (`requirements.lock`), is k
 is keyed by its inputs, and appears there whole or not at all. What is cached needs no network.
 """
 
+from deploy.image.packages.base import add_packages
 from deploy.image.packages.board import Archive, Board, load_board, with_archives
 from deploy.image.packages.kernel import Kernel, unpack_kernel
 from deploy.image.packages.python import byte_compile
@@ -14,6 +15,7 @@ __all__ = [
     "Archive",
     "Board",
     "Kernel",
+    "add_packages",
     "build_rootfs",
     "byte_compile",
     "fetch_wheels",

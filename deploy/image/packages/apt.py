@@ -21,6 +21,18 @@ from deploy.run import run
 
 _PIN_WINS, _PIN_NEVER = 990, -1
 _NETWORK_TRIES, _NETWORK_LIMIT_S = 3, 60
+# How any apt of a build behaves, ours or a base image's: nothing unasked, nothing unsigned.
+SETTINGS = (
+    'APT::Install-Recommends "false";\n'
+    'APT::Sandbox::User "root";\n'
+    'APT::Update::Error-Mode "any";\n'
+    f'Acquire::Retries "{_NETWORK_TRIES}";\n'
+    f'Acquire::http::Timeout "{_NETWORK_LIMIT_S}";\n'
+    f'Acquire::https::Timeout "{_NETWORK_LIMIT_S}";\n'
+    'Acquire::Languages "none";\n'
+    'Acquire::AllowInsecureRepositories "false";\n'
+    'Acquire::AllowDowngradeToInsecureRepositories "false";\n'
+)
 _INSTALLS = re.compile(r"^Inst (\S+) \((\S+) (.+?) \[([a-z0-9-]+)\]\)", re.MULTILINE)
 
 
@@ -92,16 +104,7 @@ class Apt:
             f'Dir::Etc "{etc}";\n'
             f'Dir::State::status "{root}/var/lib/dpkg/status";\n'
             f'APT::Architecture "{board.architecture}";\n'
-            f'APT::Architectures {{ "{board.architecture}"; }};\n'
-            'APT::Install-Recommends "false";\n'
-            'APT::Sandbox::User "root";\n'
-            'APT::Update::Error-Mode "any";\n'
-            f'Acquire::Retries "{_NETWORK_TRIES}";\n'
-            f'Acquire::http::Timeout "{_NETWORK_LIMIT_S}";\n'
-            f'Acquire::https::Timeout "{_NETWORK_LIMIT_S}";\n'
-            'Acquire::Languages "none";\n'
-            'Acquire::AllowInsecureRepositories "false";\n'
-            'Acquire::AllowDowngradeToInsecureRepositories "false";\n'
+            f'APT::Architectures {{ "{board.architecture}"; }};\n{SETTINGS}'
         )
 
     def update(self) -> None:

@@ -72,13 +72,20 @@ class LocalArchive:
         version: str,
         files: Mapping[str, bytes] | None = None,
         depends: str = "",
+        conflicts: str = "",
+        postinst: str = "",
     ) -> Path:
-        """Puts a package into the pool."""
+        """Puts a package into the pool; `postinst` is the shell script that dpkg runs after it."""
         tree = self.folder / "trees" / f"{name}_{version.replace(':', '%')}"
         (tree / "DEBIAN").mkdir(parents=True)
         control = f"Package: {name}\nVersion: {version}\nArchitecture: {self._architecture}\n"
         control += f"Maintainer: A <a@example.org>\nDescription: for a test\n"  # noqa: F541
-        (tree / "DEBIAN/control").write_text(control + (f"Depends: {depends}\n" if depends else ""))
+        control += f"Depends: {depends}\n" if depends else ""
+        control += f"Conflicts: {conflicts}\nReplaces: {conflicts}\n" if conflicts else ""
+        (tree / "DEBIAN/control").write_text(control)
+        if postinst:
+            (tree / "DEBIAN/postinst").write_text(f"#!/bin/sh\nset -e\n{postinst}\n")
+            (tree / "DEBIAN/postinst").chmod(0o755)
         for path, data in (files or {}).items():
             (tree / path).parent.mkdir(parents=True, exist_ok=True)
             (tree / path).write_bytes(data)

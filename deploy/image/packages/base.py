@@ -1,0 +1,139 @@
+"""Packages that a base image lacks, installed into its root by its own apt.
+
+The base's own sources and keys say where packages come from, as on the board itself: Raspberry Pi
+OS's are the only ones built for ARMv6. Its programs run in a chroot, emulated. Kept is what that
+changed, as a layer (`deploy.image.layer`), so that nothing else of the base is ever written anew.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import shutil
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+from deploy.errors import DeployError
+from deploy.image import layer
+from deploy.image.ext4_read import unpack
+from deploy.image.packages import apt, cache, foreign, libraries
+from deploy.image.packages.board import Board, Group
+from deploy.image.packages.long import run_long
+from deploy.image.tree import Tree
+
+_HERE = Path(__file__).parent
+# Raised when this module makes another layer of the same inputs.
+_RECIPE = 1
+# Beside the base's unpacked root: downloads, what they unpack to, and the layer.
+_ROOM_BYTES = 3 << 30
+
+_SETTINGS = "etc/apt/apt.conf.d/zz-blimp"
+_OPTIONS = (
+    'APT::Get::Show-Upgraded "false";\n'
+    'Dpkg::Use-Pty "0";\n'
+    # All is thrown away unless it ends well; files of settings stay as the base has them.
+    'DPkg::Options { "--force-unsafe-io"; "--force-confdef"; "--force-confold"; };\n'
+)
+# What the work itself leaves, or what is another in each build; a pattern ends with `*`.
+_NOT_KEPT = (
+    _SETTINGS, "etc/resolv.conf", "usr/sbin/policy-rc.d", "var/lib/man-db/auto-update",
+    "etc/initramfs-tools/update-initramfs.conf", "etc/machine-id", "etc/.pwd.lock",
+    *(f"etc/{name}-" for name in ("passwd", "group", "shadow", "gshadow", "subuid", "subgid")),
+    "etc/ssh/ssh_host_*", "var/lib/dpkg/status-old", "var/lib/dpkg/diversions-old",
+    "var/lib/dpkg/statoverride-old", "var/lib/dpkg/lock*", "var/lib/dpkg/triggers/Lock",
+    "var/lib/systemd/catalog/database", "var/lib/apt", "var/cache", "var/log", "var/tmp",
+    "dev", "proc", "run", "sys", "tmp",
+)  # fmt: skip
+
+
+def add_packages(
+    board: Board,
+    base: str,
+    file_system: Path,
+    tree: Tree,
+    missing: Sequence[str],
+    cache_folder: Path,
+) -> Path:
+    """The layer that installing packages puts over a base's root: made once, then from the cache.
+
+    Which versions come is what the base's sources have on that day: the same base and the same
+    cache give the same card, another day's cache may not. The card's manifest lists them.
+
+    Args:
+        board: whose.
+        base: the base image's SHA-256.
+        file_system: its root's, ext4 in a file; only read.
+        tree: what `ext4_read.read_tree` gave for it.
+        missing: names of the packages.
+        cache_folder: where layers are kept, as `base-BOARD-KEY.tar`.
+
+    Raises:
+        DeployError: not root, no emulator, no room, a source is out of reach or not trusted, a
+            package isn't there or doesn't install; nothing half-made is left. What the tools said
+            then stands in `base-BOARD.log` there.
+    """
+    made_by = (_RECIPE, _HERE / "install.sh", _HERE.parent / "layer.py")
+    names = sorted(missing)
+    key = cache.key(base, board.architecture, names, board.left_out, *made_by)
+    target = cache_folder / f"base-{board.name}-{key}.tar"
+    with cache.made(target) as work:
+        if work is None:
+            return target
+        if os.geteuid() != 0:
+            raise DeployError(
+                f"packages are added to a base as root: sudo (once; kept in {cache_folder})"
+            )
+        emulated = foreign.prefix(board.architecture)
+        free = shutil.disk_usage(work).free
+        needed = _ROOM_BYTES + file_system.stat().st_size
+        if free < needed:
+            raise DeployError(
+                f"{cache_folder}: {free >> 20} MiB free; the base's root and its new packages "
+                f"need {needed >> 20} MiB"
+            )
+        root = work / "root"
+        unpack(file_system, tree, root)
+        before = layer.snapshot(root, _not_kept)
+        lacked = set(libraries.missing(root))
+        (root / _SETTINGS).parent.mkdir(parents=True, exist_ok=True)
+        (root / _SETTINGS).write_text(apt.SETTINGS + _OPTIONS)
+        script = str(_HERE / "install.sh")
+        words = [*emulated, "unshare", "--mount", "sh", script, str(root), *names]
+        environment = {
+            **foreign.environment(),
+            "DEBIAN_FRONTEND": "noninteractive",
+            # Byte code of the same sources is then the same.
+            "PYTHONHASHSEED": "0",
+            "SYSTEMD_OFFLINE": "1",
+        }
+        log = cache_folder / f"base-{board.name}.log"
+        run_long(words, log, f"packages of {board.name}", environment)
+        leave_out(root, before, board.left_out)
+        if lost := sorted(set(libraries.missing(root)) - lacked):
+            raise DeployError(f"packages of {board.name}: misses a library: {lost[0]}")
+        layer.write(root, before, layer.snapshot(root, _not_kept), work / target.name)
+    return target
+
+
+def leave_out(root: Path, before: dict[str, layer.State], rules: Sequence[Group]) -> None:
+    """Takes what is new and left out on purpose from a root; what the base had, it keeps.
+
+    dpkg itself, told so, would leave it out of an upgrade of the base's own packages, too. As with
+    dpkg, the last rule that fits counts.
+    """
+    patterns = [name for group in rules for name in group.names]
+    states = layer.snapshot(root, _not_kept)
+    # What lies in a folder goes before it.
+    for path in sorted(states.keys() - before.keys(), reverse=True):
+        fits = [name for name in patterns if fnmatch.fnmatchcase(f"/{path}", name.lstrip("!"))]
+        if not fits or fits[-1].startswith("!"):
+            continue
+        if not stat.S_ISDIR(states[path][0]):
+            (root / path).unlink()
+        elif not any((root / path).iterdir()):
+            (root / path).rmdir()
+
+
+def _not_kept(path: str) -> bool:
+    return any(fnmatch.fnmatchcase(path, pattern) for pattern in _NOT_KEPT)
