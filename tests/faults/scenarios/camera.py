@@ -42,11 +42,11 @@ class Truth:
         self._position_m = np.array([pose.position_m for pose in poses])
         # As `pi_firmware.sources.replay` shifts a round: by its length, and one frame more.
         first, before, last = (int(self._time_ns[i]) for i in (0, -2, -1))
-        self._first_ns, self._round_ns = first, last - first + (last - before)
+        self._first_ns, self.round_ns = first, last - first + (last - before)
 
     def at(self, time_ns: int) -> Position:
         """Where the camera was, (3,), at the frame nearest to a capture time of any round."""
-        own_ns = self._first_ns + (time_ns - self._first_ns) % self._round_ns
+        own_ns = self._first_ns + (time_ns - self._first_ns) % self.round_ns
         return np.asarray(self._position_m[int(np.argmin(np.abs(self._time_ns - own_ns)))])
 
 

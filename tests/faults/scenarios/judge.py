@@ -32,6 +32,13 @@ class Verdict:
     injected: list[str] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
 
+    def share(self, flight: Verdict) -> None:
+        """Takes over what was found of the flight as a whole; the recovery stays its own."""
+        for invariant, texts in flight.broken.items():
+            if invariant != "recovery":
+                self.broken[invariant] += texts
+        self.figures = flight.figures | self.figures
+
     @property
     def holds(self) -> bool:
         """Whether all did."""

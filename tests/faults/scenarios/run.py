@@ -48,31 +48,87 @@ def main() -> int:
         print("run.py: no C compiler (cc): clocks and encoder cannot be disturbed", file=sys.stderr)
         return BAD_INPUT
     has_disk = disk.alone()
+    if any(one.disk_MB for one in scenarios) and not has_disk:
+        print("left out: a disk of its own needs root and unshare(2)", flush=True)
+        scenarios = [one for one in scenarios if not one.disk_MB]
     place = Path(tempfile.mkdtemp(prefix="scenarios-", dir=arguments.keep))
-    cameras = Cameras(place)
-    verdicts = []
-    for number, scenario in enumerate(scenarios):
+    runner = Runner(place, arguments.seed)
+    flights = grouped(scenarios, arguments.together)
+    for number, flight in enumerate(flights):
+        print(f"flight {number + 1} of {len(flights)}", flush=True)
+        runner.fly(flight, f"{number:02d}", shrink=arguments.shrink)
+    _table(runner.verdicts)
+    _write(arguments.out, arguments.what, runner.verdicts, scenarios)
+    return 0 if all(verdict.holds for verdict in runner.verdicts) else 1
+
+
+class Runner:
+    """Flies scenarios and prints what came of each."""
+
+    def __init__(self, place: Path, seed: int) -> None:
+        self.verdicts: list[Verdict] = []
+        self._place, self._seed = place, seed
+        self._cameras = Cameras(place)
+
+    def fly(self, flight: Sequence[Scenario], name: str, *, shrink: bool) -> None:
+        """One flight; when it breaks an invariant, again each of its scenarios alone.
+
+        Where none of these does, it was what one left to the next, and the flight's verdict stays.
+        """
+        verdicts = self._play(flight, name)
+        if not all(verdict.holds for verdict in verdicts) and len(flight) > 1:
+            print("  each alone:", flush=True)
+            alone = [self._play([one], f"{name}-{n}") for n, one in enumerate(flight)]
+            if not all(verdict.holds for (verdict,) in alone):
+                verdicts = [verdict for (verdict,) in alone]
+        elif shrink and not verdicts[0].holds:
+            self._shrink(flight[0], name)
+        self.verdicts += verdicts
+
+    def _play(self, flight: Sequence[Scenario], name: str) -> list[Verdict]:
+        for scenario in flight:
+            print(f"  {scenario.name}", flush=True)
+            for step in scenario.steps:
+                print(f"      {step}", flush=True)
         began_s = time.monotonic()
-        print(f"[{number + 1} of {len(scenarios)}] {scenario.name}", flush=True)
-        for step in scenario.steps:
-            print(f"    {step}", flush=True)
-        if scenario.disk_MB and not has_disk:
-            print("    left out: a disk of its own needs root and unshare", flush=True)
-            continue
-        folder = place / f"{number:02d}-{scenario.name.replace(' ', '-')[:40]}"
-        (verdict,) = play(folder, cameras, [scenario], seed=arguments.seed + number)
-        verdict.figures["took_s"] = round(time.monotonic() - began_s, 1)
-        verdict.figures["load"] = round(os.getloadavg()[0], 1)
-        verdicts.append(verdict)
-        for line in found([verdict]):
-            print(f"    BROKEN {line}", flush=True)
-        if not verdict.holds:
-            print(f"    kept: {folder}", flush=True)
-            if arguments.shrink:
-                _shrink(scenario, folder, cameras, arguments.seed + number)
-    _table(verdicts)
-    _write(arguments.out, arguments.what, verdicts, scenarios)
-    return 0 if all(verdict.holds for verdict in verdicts) else 1
+        verdicts = play(self._place / name, self._cameras, flight, seed=self._seed)
+        load = os.getloadavg()[0]
+        for verdict in verdicts:
+            verdict.figures |= {"flight_s": round(time.monotonic() - began_s, 1), "load": load}
+        for line in found(verdicts):
+            print(f"  BROKEN {line}", flush=True)
+        if not all(verdict.holds for verdict in verdicts):
+            print(f"  kept: {self._place / name}", flush=True)
+        return verdicts
+
+    def _shrink(self, scenario: Scenario, name: str) -> None:
+        tried = 0
+
+        def fails(fewer: Scenario) -> bool:
+            nonlocal tried
+            tried += 1
+            (verdict,) = self._play([fewer], f"{name}-fewer-{tried:02d}")
+            return not verdict.holds
+
+        least = shrunk(scenario, fails)
+        (self._place / name / "shrunk.json").write_text(as_json(least))
+        print("  the least that fails:", flush=True)
+        for step in least.steps:
+            print(f"      {step}", flush=True)
+
+
+def grouped(scenarios: Sequence[Scenario], together: int) -> list[list[Scenario]]:
+    """Flights of so many scenarios at most, of those that need the same service."""
+    flights: list[list[Scenario]] = []
+    open_ones: dict[tuple[int, bool], list[Scenario]] = {}
+    for scenario in scenarios:
+        needs = scenario.disk_MB, scenario.foxglove
+        flight = open_ones.get(needs)
+        if flight is None or len(flight) >= together:
+            flight = open_ones[needs] = []
+            flights.append(flight)
+        flight.append(scenario)
+    return flights
 
 
 def _arguments() -> argparse.Namespace:
@@ -86,6 +142,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--walks", type=int, default=15, help="of 30 s each")
     long = f"{LONG_WALKS} walks of {LONG_S:g} s"
     parser.add_argument("--long", action="store_true", help=long)
+    parser.add_argument("--together", type=int, default=0, help="scenarios a flight (6; walks: 1)")
     parser.add_argument("--shrink", action="store_true", help="finds the fewest steps that fail")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where folders are kept")
     parser.add_argument("--out", type=Path, metavar="FILE", help="all of it as JSON")
@@ -97,6 +154,10 @@ def _arguments() -> argparse.Namespace:
         parser.error("again, and only again, takes a FILE")
     if arguments.keep is not None and not arguments.keep.is_dir():
         parser.error(f"--keep {arguments.keep}: no such folder")
+    if not 0 <= arguments.together <= 100:
+        parser.error("--together: 1 to 100")
+    if arguments.together == 0:
+        arguments.together = 6 if arguments.what == "matrix" else 1
     if arguments.list:
         for scenario in MATRIX:
             print(f"{scenario.name}: {'; '.join(map(str, scenario.steps))}")
@@ -116,35 +177,21 @@ def _chosen(arguments: argparse.Namespace) -> list[Scenario]:
     return scenarios
 
 
-def _shrink(scenario: Scenario, folder: Path, cameras: Cameras, seed: int) -> None:
-    tried = 0
-
-    def fails(fewer: Scenario) -> bool:
-        nonlocal tried
-        tried += 1
-        place = folder.with_name(f"{folder.name}-fewer-{tried:02d}")
-        (verdict,) = play(place, cameras, [fewer], seed=seed)
-        print(f"    {fewer.name}: {'holds' if verdict.holds else 'fails'}", flush=True)
-        return not verdict.holds
-
-    least = shrunk(scenario, fails)
-    (folder / "shrunk.json").write_text(as_json(least))
-    for step in least.steps:
-        print(f"    least: {step}", flush=True)
-
-
 def _table(verdicts: Sequence[Verdict]) -> None:
-    print(f"\n{'scenario':42} {' '.join(f'{name:10}' for name in INVARIANTS)} {'back':>7} off")
+    print(
+        f"\n{'scenario':42} {' '.join(f'{name:10}' for name in INVARIANTS)} {'back':>7} burden off"
+    )
     for verdict in verdicts:
         cells = " ".join(f"{'BROKEN' if verdict.broken[n] else 'ok':10}" for n in INVARIANTS)
         back_s = verdict.figures.get("recovery_s")
         back = "never" if back_s is None else f"{back_s:.1f} s"
         off = f"{verdict.figures.get('off_m', float('nan')):.2f} m"
-        print(f"{verdict.name[:42]:42} {cells} {back:>7} {off}")
+        burden = f"{verdict.figures.get('burden', 1.0):.1f}"
+        print(f"{verdict.name[:42]:42} {cells} {back:>7} {burden:>6} {off}")
     holding = sum(verdict.holds for verdict in verdicts)
     print(
         f"{holding} of {len(verdicts)} hold; bounds: 0.5 m, back within {RECOVERED_S:g} s, or"
-        f" {STARTED_S:g} s where a process starts anew"
+        f" {STARTED_S:g} s where a process starts anew, times the machine's burden"
     )
 
 

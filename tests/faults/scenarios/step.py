@@ -80,7 +80,7 @@ class Scenario:
 
 def as_json(scenario: Scenario) -> str:
     """The scenario as text from which it can be run again."""
-    steps = [{"kind": type(step).__name__, **dataclasses.asdict(step)} for step in scenario.steps]
+    steps = [{"step": type(step).__name__, **dataclasses.asdict(step)} for step in scenario.steps]
     lines = ",\n  ".join(json.dumps(step) for step in steps)
     rest = {"disk_MB": scenario.disk_MB, "foxglove": scenario.foxglove}
     head = json.dumps({"name": scenario.name, **rest})[:-1]
@@ -99,7 +99,7 @@ def from_json(text: str) -> Scenario:
 
 def _step(document: dict[str, Any]) -> Step:
     given = dict(document)
-    kind = KINDS.get(name := str(given.pop("kind")))
+    kind = KINDS.get(name := str(given.pop("step")))
     if kind is None:
         raise StepError(f"no step '{name[:40]}' (there are: {', '.join(sorted(KINDS))})")
     step = kind(**given)

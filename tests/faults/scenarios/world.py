@@ -29,7 +29,8 @@ from scenarios.tcp_wire import TcpWire
 
 NAME = "blimp-1"
 RATE_HZ = 10.0
-LIMIT_S = 60.0
+SPEED = 0.5
+"""Of the recorded flight: a machine that is busy, too, skips frames and still tracks."""
 _TICK_S = 0.05
 HOPELESS = 3
 """The payload's exit status by which systemd starts it anew."""
@@ -202,11 +203,13 @@ class World:
             options |= more
         camera = self.cameras.get(options.pop("camera"))
         ssrc = int(options.pop("ssrc"))
-        rate = f"&rate_hz={RATE_HZ:g}" if camera.uri.startswith("replay:") else ""
+        rate_hz = RATE_HZ / SPEED  # of the recording's own seconds
+        flies = camera.uri.startswith("replay:")
+        pace = f"&rate_hz={rate_hz:g}&speed={SPEED:g}" if flies else ""
         folder = self.folder / f"payload-{len(self.runs)}"
         settings = {
             "payload_id": NAME,
-            "camera.uri": camera.uri + rate,
+            "camera.uri": camera.uri + pace,
             "camera.rate_hz": f"{RATE_HZ:g}",
             "link.port": str(self.link.port),
             "link.ssrc": str(ssrc),
@@ -264,6 +267,13 @@ class World:
         if not self._held["service"] and self.service.process.poll() is not None:
             self.service.start()
             self._listen()
+
+    def pids(self) -> list[int]:
+        """All processes that fly or serve now."""
+        served = [] if self.service.process.poll() is not None else [self.service.process.pid]
+        if served:
+            served += [one.pid for one in self.service.processes().values()]
+        return [*served, self.run.process.pid]
 
     def child(self, name: str) -> Process | None:
         """A process of the service now: by its name, `localizer` for the payload's, `station`."""
