@@ -35,6 +35,8 @@ _OPTIONS = (
     # All is thrown away unless it ends well; files of settings stay as the base has them.
     'DPkg::Options { "--force-unsafe-io"; "--force-confdef"; "--force-confold"; };\n'
 )
+# Of the builder's environment, what names places that the chroot has not.
+_NOT_INSIDE = ("TMPDIR", "PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "LD_PRELOAD")
 # What the work itself leaves, or what is another in each build; a pattern ends with `*`.
 _NOT_KEPT = (
     _SETTINGS, "etc/resolv.conf", "usr/sbin/policy-rc.d", "var/lib/man-db/auto-update",
@@ -99,10 +101,12 @@ def add_packages(
         (root / _SETTINGS).parent.mkdir(parents=True, exist_ok=True)
         (root / _SETTINGS).write_text(apt.SETTINGS + _OPTIONS)
         script = str(_HERE / "install.sh")
-        words = [*emulated, "unshare", "--mount", "sh", script, str(root), *names]
+        clean = ["env", *(f"--unset={name}" for name in _NOT_INSIDE)]
+        words = [*emulated, *clean, "unshare", "--mount", "sh", script, str(root), *names]
         environment = {
             **foreign.environment(),
             "DEBIAN_FRONTEND": "noninteractive",
+            "APT_LISTCHANGES_FRONTEND": "none",
             # Byte code of the same sources is then the same.
             "PYTHONHASHSEED": "0",
             "SYSTEMD_OFFLINE": "1",

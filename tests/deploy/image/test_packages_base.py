@@ -48,6 +48,7 @@ mkdir /var/lib/tool
 chown 1:44 /var/lib/tool
 chmod 2770 /var/lib/tool
 ln -s /usr/bin/tool /usr/bin/also
+[ -z "$TMPDIR$PYTHONPATH" ] || exit 1
 touch /etc/ssh/ssh_host_rsa_key /var/cache/tool /tmp/tool
 if sh /usr/sbin/policy-rc.d tool start; then exit 1; else [ $? = 101 ]; fi
 """
@@ -105,6 +106,8 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
     ):
         # Small, and no waiting for an archive that was taken away on purpose.
         patch.setitem(card.BOOT_BYTES, "zerow", 40 << 20)
+        # Of this machine, and nowhere in the base.
+        patch.setenv("TMPDIR", str(folder))
         patch.setattr(apt, "SETTINGS", apt.SETTINGS + 'Acquire::Retries "0";\n')
         archive = LocalArchive(folder / "archive", "Base", architecture)
         archive.add("helper", "1.5", {"usr/share/helper": b"helps"})
