@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 import struct
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pi_firmware.wire import annexb
@@ -81,11 +82,10 @@ def find(access_unit: bytes) -> FrameInfo | None:
     return None
 
 
-def _messages(rbsp: bytes) -> list[tuple[int, bytes]]:
+def _messages(rbsp: bytes) -> Iterator[tuple[int, bytes]]:
     """The SEI messages of a unit (H.264, 7.3.2.3.1), up to the first that does not fit."""
-    result: list[tuple[int, bytes]] = []
     at = 0
-    while at + 2 <= len(rbsp) and rbsp[at:] != b"\x80":
+    while at + 2 <= len(rbsp):  # the trailing bits are one byte
         values = []
         for _ in range(2):  # payload type, then size: 255s add up until a smaller byte
             value = 0
@@ -93,15 +93,14 @@ def _messages(rbsp: bytes) -> list[tuple[int, bytes]]:
                 value += 255
                 at += 1
             if at >= len(rbsp):
-                return result
+                return
             values.append(value + rbsp[at])
             at += 1
         kind, size = values
         if at + size > len(rbsp):
-            return result
-        result.append((kind, rbsp[at : at + size]))
+            return
+        yield kind, rbsp[at : at + size]
         at += size
-    return result
 
 
 def _decode(body: bytes) -> FrameInfo | None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import struct
+import time
 
 import pytest
 from hypothesis import given, settings
@@ -90,6 +91,17 @@ def test_a_body_cut_short_is_none(size: int) -> None:
 def test_numbers_that_are_not_finite_are_none() -> None:
     assert sei.find(carried(dataclasses.replace(INFO, entropy_bits=float("nan")))) is None
     assert sei.find(carried(dataclasses.replace(INFO, sharpness=float("inf")))) is None
+
+
+@pytest.mark.parametrize("message", [b"\x04\x00", b"\xff", b"\x04\xff"])
+def test_a_unit_of_nothing_but_messages_takes_linear_time(message: bytes) -> None:
+    def time_of(count: int) -> float:
+        began_s = time.process_time()
+        assert sei.find(b"\x00\x00\x01\x06" + message * count) is None
+        return time.process_time() - began_s
+
+    # 32 times as many would take 1024 times as long if each looked at all behind it.
+    assert time_of(640_000) < 200 * max(time_of(20_000), 1e-3)
 
 
 @settings(deadline=None, max_examples=300)
