@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import tomllib
 import types
 import typing
@@ -14,6 +15,13 @@ from typing import Any, TypeVar
 from pi_firmware.wire.errors import ConfigError
 
 T = TypeVar("T")
+
+_MOST_BYTES = 4 << 20
+# Python's parser takes memory with the square of a dotted key's parts: 100 kB of them, gigabytes.
+_DEEPEST = 32
+_TOO_DEEP = re.compile(
+    r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){%d}""" % _DEEPEST
+)
 
 
 def key(
@@ -45,12 +53,12 @@ def apply_override(document: dict[str, Any], override: str, cls: type | None = N
     """
     name, equals, text = override.partition("=")
     if not equals:
-        raise ConfigError(f"--set {override!r}: expected key=value, as in the file")
+        raise ConfigError(f"--set {_shown(override)}: expected key=value, as in the file")
     *tables, last = name.strip().split(".")
     for part in tables:
         document = document.setdefault(part, {})
         if not isinstance(document, dict):
-            raise ConfigError(f"--set {override!r}: '{part}' is not a table")
+            raise ConfigError(f"--set {_shown(override)}: {_shown(part)} is not a table")
     if cls is None:
         document[last] = _value_or_text(text)
     else:
@@ -66,9 +74,11 @@ def _is_text(path: list[str], kind: Any) -> bool:
 
 def _toml_value(text: str, override: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError):
-        raise ConfigError(f"--set {override!r}: {text!r} is not a TOML value") from None
+        return _parsed(f"value = {text}")["value"]
+    except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
+        raise ConfigError(
+            f"--set {_shown(override)}: {_shown(text)} is not a TOML value"
+        ) from None
 
 
 def _value_or_text(text: str) -> Any:
@@ -95,11 +105,21 @@ def read(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     try:
         with path.open("rb") as file:
-            return tomllib.load(file)
+            data = file.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise ConfigError(f"{path}: more than {_MOST_BYTES} bytes, which no configuration has")
+        return _parsed(data.decode())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError, too
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+        raise ConfigError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    """A TOML document; raises `ValueError` or `RecursionError`."""
+    if _TOO_DEEP.search(text):
+        raise ValueError(f"a key has more than {_DEEPEST} parts")
+    return tomllib.loads(text)
 
 
 def load(path: str | Path, cls: type[T]) -> T:
@@ -189,7 +209,10 @@ def _shown(value: Any) -> str:
     """A value as one short line."""
     if isinstance(value, int) and value.bit_length() > 128:  # Python refuses to print huge ones
         return f"a number of {value.bit_length()} bits"
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # such a number inside a list, or tables without end
+        text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

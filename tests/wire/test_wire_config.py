@@ -102,6 +102,13 @@ def test_values_are_read_and_whole_numbers_serve_as_numbers(tmp_path: Path) -> N
         ("rate_hz = 5\nrate_hz = 6", "not valid TOML"),
         (f"rate_hz = {'9' * 5000}", "not valid TOML"),
         ("words = " + "[" * 3000, "not valid TOML"),
+        (f"words = [0x{'F' * 5000}]", "'words'[0] must be a string, not a number of"),
+        (f"words = [[0x{'F' * 5000}]]", "'words'[0] must be a string, not a list"),
+        (f"encoder = {{{'a.' * 30}a = [{'[' * 300}{']' * 300}]}}", "'encoder' must be a string"),
+        ("encoder" + ".a" * 60_000 + " = 1", "a key has more than 32 parts"),
+        ("encoder" + ' . "a"' * 60_000 + " = 1", "a key has more than 32 parts"),
+        (f"words = {{{'a.' * 60_000}a = 1}}", "a key has more than 32 parts"),
+        ("rate_hz = 5 # " + "x" * 4_194_304, "more than 4194304 bytes"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, text: str, says: str) -> None:
@@ -127,6 +134,24 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     for name in ("missing.toml", "b.toml", "."):
         with pytest.raises(ConfigError, match=r"^[^\n]+$"):
             config.load(tmp_path / name, Settings)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["rate_hz", "rate_hz=" + "[" * 3000, f"words=[0x{'F' * 5000}]", "rate_hz=" + "9" * 5000,
+     "rate_hz" + ".a" * 3000 + "=1", "rate_hz=1\n\n="],
+)  # fmt: skip
+def test_an_override_that_cannot_be_is_refused_in_one_short_line(override: str) -> None:
+    document: dict[str, object] = {"rate_hz": 5}
+    with pytest.raises(ConfigError, match=r"^[^\n]{1,400}$"):
+        config.apply_override(document, override, Settings)
+        config.from_mapping(document, Settings)
+
+
+def test_text_with_many_dots_is_no_deep_key(tmp_path: Path) -> None:
+    words = ["a.b." * 10, "1.5, " * 100, "..." * 100, "a, " * 100]
+    settings = load(tmp_path, f"words = {words}\noffsets_m = {[0.5] * 200}\n")
+    assert isinstance(settings, Settings) and settings.words == words
 
 
 def test_defaults_that_are_lists_are_not_shared() -> None:
