@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,8 +106,8 @@ def read_tum(path: str | Path) -> Trajectory:
             raise GeometryError(f"{path}, line {number}: the time {words[0]:.40} s is out of range")
         if len(values) != 7 or not np.all(np.isfinite(values)):
             raise GeometryError(f"{path}, line {number}: eight finite numbers are needed")
-        if np.linalg.norm(values[3:]) < 1e-6:
-            raise GeometryError(f"{path}, line {number}: the quaternion is zero")
+        if not 1e-6 <= math.hypot(*values[3:]) <= 1e100:  # beyond, its square is infinite
+            raise GeometryError(f"{path}, line {number}: the quaternion is zero or too large")
         rows.append((time_ns, values))
     if not rows:
         raise GeometryError(f"{path}: it holds no poses")

@@ -59,6 +59,7 @@ def test_exponents_and_short_fractions_are_read() -> None:
         (LINE + "1e300 1 2 3 0 0 0 1\n", "line 2"),
         (LINE + "9" * 30 + " 1 2 3 0 0 0 1\n", "line 2"),
         (LINE + "2.5 1 2 3 0 0 0 0\n", "zero"),
+        (LINE + "2.5 1 2 3 1e200 0 0 1e200\n", "too large"),
         ("# only a comment\n", "no poses"),
         ("", "no poses"),
     ],
