@@ -197,8 +197,10 @@ def load_info(folder: str | Path) -> MapInfo:
             registration=dict(document.get("registration", {})),
             refined=dict(document.get("refined", {})),
         )
-    except (ConfigError, ValueError, TypeError) as error:
+    except ConfigError as error:
         raise MapError(str(error)) from None
+    except (ValueError, TypeError, OverflowError):
+        raise MapError(f"{path}: a key is not of its kind") from None
 
 
 def load(folder: str | Path) -> Map:

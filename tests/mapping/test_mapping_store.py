@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import numpy as np
@@ -85,6 +86,15 @@ def _swap(old, new=None, value=None):
     return edit
 
 
+def _dimension(value):
+    def edit(path):
+        text, count = re.subn(r"dimension = \d+", f"dimension = {value}", path.read_text())
+        assert count == 1
+        path.write_text(text)
+
+    return edit
+
+
 def _nan(array):
     array.flat[0] = np.nan
     return array
@@ -119,6 +129,9 @@ def _huge(array):
         ("keyframes.safetensors", _edit("offset", lambda a: a[::-1]), "do not fit each other"),
         ("keyframes.safetensors", _edit("time_ns", lambda a: a[1:]), "do not fit each other"),
         ("map.toml", lambda p: p.unlink(), "map.toml"),
+        ("map.toml", _dimension("inf"), "map.toml.*not of its kind"),
+        ("map.toml", _dimension("nan"), "map.toml.*not of its kind"),
+        ("map.toml", _dimension("[]"), "map.toml.*not of its kind"),
         ("map.toml", lambda p: p.write_bytes(b"\x00\xfe not toml"), "not valid TOML"),
         ("map.toml", lambda p: p.write_text("format = 1\n"), "'features' and 'camera'"),
         ("map.toml", lambda p: p.write_text(p.read_text().replace("fx_px", "fxx")), "'fxx'"),
