@@ -1,0 +1,169 @@
+"""The measured trials on disk: written after each one, taken up again by level and seed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from limits_axes import Axis, Level
+from limits_search import BORNE, Found
+from limits_stand import Flight, Measured
+
+from ground_station.errors import GroundStationError
+from ground_station.files import write_json
+
+SCHEMA = 1
+
+
+def machine() -> dict[str, Any]:
+    """The machine that measures, before it does: cores, model, load (proc(5))."""
+    model = ""
+    try:
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        model = found.group(1).strip() if found else ""
+    except OSError:
+        pass
+    return {
+        "cores": len(os.sched_getaffinity(0)),
+        "model": model or platform.machine(),
+        "load_before": round(os.getloadavg()[0], 2),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+
+
+class Store:
+    """A document of trials in a file, which goes on from what the file has already.
+
+    A trial counts again where level and seed are the same: a changed level's are measured anew, and
+    with `undisturbed` those, too, during which others used more of the machine than that, cores.
+    Raises `GroundStationError` for a file of another flight, duration, machine or kind.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        flight: Flight,
+        seeds: Sequence[int],
+        undisturbed: float | None = None,
+    ) -> None:
+        self._path = path
+        self._flight = f"{flight.recording.name}, {_sha256(flight.recording)}"
+        self._seeds = list(seeds)
+        self.document: dict[str, Any] = {
+            "schema": SCHEMA,
+            "flight": self._flight,
+            "simulated": True,
+            "duration_s": flight.duration_s,
+            "seeds": self._seeds,
+            "borne_from": BORNE,
+            "machine": machine(),
+            "axes": {},
+            "trials": [],
+        }
+        if path.exists():
+            self._take_up(path, undisturbed)
+
+    def _take_up(self, path: Path, undisturbed: float | None) -> None:
+        before, mine = read(path), self.document
+        for name in ("flight", "duration_s", "seeds"):
+            if before.get(name) != mine[name]:
+                raise GroundStationError(
+                    f"{path}: its {name} is {before.get(name)} and not {mine[name]}: name another"
+                    " file, or delete this one"
+                )
+        for name in ("cores", "model"):
+            if before["machine"].get(name) != mine["machine"][name]:
+                raise GroundStationError(f"{path}: measured on another machine: name another file")
+        mine["machine"], mine["axes"] = before["machine"], before["axes"]
+        for trial in before["trials"]:
+            others = trial["measured"]["others_cores"]
+            if undisturbed is None or (others is not None and others <= undisturbed):
+                mine["trials"].append(trial)
+
+    def measured(self, level: Level, seed: int) -> Measured | None:
+        """An earlier trial's result; None when there is none."""
+        key = _key(level, seed)
+        for trial in self.document["trials"]:
+            if trial["key"] == key:
+                return Measured(**trial["measured"])
+        return None
+
+    def add(self, axis: Axis, level: Level, seed: int, measured: Measured) -> None:
+        """Keeps a trial, on disk at once."""
+        self.document["trials"].append(
+            {
+                "axis": axis.name,
+                "level": level.text,
+                "seed": seed,
+                "key": _key(level, seed),
+                "measured": asdict(measured),
+            }
+        )
+        self.write()
+
+    def conclude(self, axis: Axis, found: Found, *, complete: bool, problem: str = "") -> None:
+        """Keeps what is known of an axis."""
+        text = [level.text for level in axis.levels]
+        borne, refused = found.borne, found.refused
+        self.document["axes"][axis.name] = {
+            "title": axis.title,
+            "complete": complete,
+            "problem": problem,
+            "borne": None if borne is None else text[borne],
+            "refused": None if refused is None else text[refused],
+            "last": borne is not None and borne == len(text) - 1,
+            "odd": [text[n] for n in found.odd],
+            "shares": {text[n]: list(one.shares) for n, one in sorted(found.tried.items())},
+            **self._beside(axis, found),
+        }
+        self.write()
+
+    def _beside(self, axis: Axis, found: Found) -> dict[str, Any]:
+        """What used the machine meanwhile, and how a process was held back."""
+        keys = {_key(axis.levels[n], seed) for n in found.tried for seed in self._seeds}
+        trials = [t["measured"] for t in self.document["trials"] if t["key"] in keys]
+        others = [t["others_cores"] for t in trials if t["others_cores"] is not None]
+        return {
+            "held_by": sorted({trial["held_by"] for trial in trials if trial["held_by"]}),
+            "others_cores_most": round(max(others), 2) if others else None,
+        }
+
+    def write(self) -> None:
+        """Writes the document, beside and renamed."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self._path, self.document)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A document that was kept; raises `GroundStationError` with one line for another file."""
+    try:
+        document = json.loads(path.read_text())
+        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+            raise ValueError(f"its schema is not {SCHEMA}")
+        if not all(isinstance(document[name], dict) for name in ("axes", "machine")):
+            raise ValueError("it has no axes or no machine")
+        for trial in document.get("trials", []):
+            Measured(**trial["measured"])
+        return document
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GroundStationError(f"{path}: no document of limits: {error}") from None
+
+
+def _key(level: Level, seed: int) -> str:
+    under = json.dumps(asdict(level.under), sort_keys=True)
+    return f"{under} seed {seed}"
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise GroundStationError(f"{path}: {error.strerror or error}") from None

@@ -1,0 +1,95 @@
+"""The limits as README shows them: a table made of an accepted run, between two markers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import GroundStationError
+from ground_station.files import write_json, write_text
+
+BEGIN = "<!-- limits: made by `make limits` and its --accept; do not edit -->"
+END = "<!-- limits: end -->"
+ACCEPTED = Path(__file__).with_name("limits_accepted.json")
+README = Path(__file__).resolve().parents[2] / "README.md"
+QUIET_CORES = 0.2
+"""What others may use of the machine during any trial of a run that is accepted."""
+
+
+def render(document: dict[str, Any]) -> str:
+    """The table in Markdown, with the machine and the conditions in a sentence before it."""
+    machine, seeds = document["machine"], document["seeds"]
+    others = [axis["others_cores_most"] or 0.0 for axis in document["axes"].values()]
+    model = str(machine["model"]).replace("|", "/")
+    lines = [
+        f"Borne is the highest level at which at least {100 * document['borne_from']:g} % of the"
+        f" captured frames are TRACKING in each of {len(seeds)} runs of"
+        f" {document['duration_s']:g} s, and at all easier levels that were tried; measured by"
+        f" `make limits` with a simulated flight ({document['flight'].split(',')[0]}) on"
+        f" {machine['cores']} cores ({model}), {machine['date']}, load"
+        f" {machine['load_before']:g} before; others used {max(others, default=0.0):.2f} cores at"
+        " most meanwhile. Of a link only the video's packets are burdened.",
+        "",
+        "| burden | borne | TRACKING there | not borne | TRACKING there |",
+        "|---|---|---|---|---|",
+    ]
+    notes: list[str] = []
+    for axis in document["axes"].values():
+        shares = axis["shares"]
+        borne, refused = axis["borne"], axis["refused"]
+        name = axis["title"]
+        if axis["odd"]:
+            notes.append(
+                f"Not monotonous: {name}: {', '.join(axis['odd'])} is borne again beyond {refused}."
+            )
+            name += " (see below)"
+        least = "more was not tried" if axis["last"] else "none of those tried"
+        lines.append(
+            f"| {name} | {borne or 'nothing'} | {_spread(shares.get(borne))}"
+            f" | {refused or least} | {_spread(shares.get(refused))} |"
+        )
+    held = sorted({by for axis in document["axes"].values() for by in axis["held_by"]})
+    if held:
+        notes.append(f"The processor was held back by {' and '.join(held)}.")
+    return "\n".join([*lines, *(["", " ".join(notes)] if notes else [])]) + "\n"
+
+
+def _spread(shares: list[float] | None) -> str:
+    """Least to most, in percent; rounded away from what would make a missed bound look kept."""
+    if not shares:
+        return "–"
+    least, most = int(1000 * min(shares)) / 10, int(1000 * max(shares)) / 10
+    return f"{least:g} %" if least == most else f"{least:g} to {most:g} %"
+
+
+def table_in(readme: str) -> str | None:
+    """What stands between the markers; None without them."""
+    if BEGIN not in readme or END not in readme:
+        return None
+    return readme.split(BEGIN, 1)[1].split(END, 1)[0].strip("\n") + "\n"
+
+
+def accept(document: dict[str, Any], readme: Path = README, accepted: Path = ACCEPTED) -> None:
+    """Makes a run the one that README shows.
+
+    Raises `GroundStationError` in one line for a run that was interrupted or disturbed, and for a
+    README without the two markers.
+    """
+    for name, axis in document["axes"].items():
+        if not axis["complete"]:
+            raise GroundStationError(f"limits: {name} was not measured to its end: not accepted")
+        others = axis["others_cores_most"]
+        if others is None or others > QUIET_CORES:
+            raise GroundStationError(
+                f"limits: {name}: others used {others} cores of the machine meanwhile, at most"
+                f" {QUIET_CORES:g} are accepted: measure again with --undisturbed when it is quiet"
+            )
+    if not document["axes"]:
+        raise GroundStationError("limits: nothing was measured: not accepted")
+    text = readme.read_text()
+    if table_in(text) is None:
+        raise GroundStationError(f"{readme}: the lines {BEGIN!r} and {END!r} are not in it")
+    kept = {name: value for name, value in document.items() if name != "trials"}
+    before, rest = text.split(BEGIN, 1)
+    write_json(accepted, kept)
+    write_text(readme, f"{before}{BEGIN}\n{render(kept)}{END}{rest.split(END, 1)[1]}")
