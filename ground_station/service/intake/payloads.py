@@ -48,6 +48,9 @@ class Payload:
         self._lock = threading.Lock()  # two streams overlap for a moment when it starts anew
         self._frame_s = float("-inf")
         self._first: tuple[int, int, int] | None = None
+        self._last_sequence = -1
+        self._base = Counters()
+        """Of the stream, before the payload's newest session: one may keep its SSRC."""
         self._before: int | None = None
         self._dropped = 0
         self._samples: deque[tuple[float, int, int]] = deque()
@@ -64,6 +67,14 @@ class Payload:
             if self._first is None or self._first[0] != frame.ssrc:
                 units = self.stream.counters.access_units if self.stream else 1
                 self._first = (frame.ssrc, frame.sequence, units)
+            elif frame.sequence <= self._last_sequence and self.stream is not None:
+                counters = self.stream.counters
+                self._base = dataclasses.replace(
+                    counters, access_units=counters.access_units - 1, decoded=counters.decoded - 1
+                )
+                self._first = (frame.ssrc, frame.sequence, 1)
+                self._before, self._dropped = None, 0
+            self._last_sequence = frame.sequence
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
         self._recorder.frame(self.id, frame, log_ns)
@@ -109,6 +120,7 @@ class Payload:
             anew = self.stream is None or stream.ssrc != self.stream.ssrc
             self.stream = stream
             if anew:
+                self._base = Counters()
                 self._before, self._dropped = None, 0
                 self._samples.clear()
         return anew
@@ -165,15 +177,15 @@ class Payload:
         return (decoded - frames) / span_s, (received_bytes - size) * 8e-3 / span_s
 
     def _frames(self, state: PayloadState | None, counters: Counters) -> dict[str, int]:
-        """Frames by fate, since this stream was first seen: sent = received + withheld + lost.
+        """Frames by fate, since this session was first seen: sent = received + withheld + lost.
 
         What was sent before that is none of the lost: the payload's own account is told as it is.
         """
-        withheld = counters.withheld + counters.failed + counters.unstamped
+        base = self._base  # a frame's thread may have set it after these counters were read
         result = {
-            "received": counters.decoded,
+            "received": max(0, counters.decoded - base.decoded),
             "lost": 0,
-            "withheld": withheld,
+            "withheld": max(0, _withheld(counters) - _withheld(base)),
             "dropped": self._dropped,
         }
         said = state.frames if state is not None else None
@@ -187,7 +199,7 @@ class Payload:
         }
         if self._before is None:
             self._before = self._sent_before(state)
-        arrived = counters.access_units + (self._before or 0)
+        arrived = counters.access_units - base.access_units + (self._before or 0)
         result["lost"] = max(0, said.sent - arrived) if self._before is not None else 0
         return result
 
@@ -202,6 +214,11 @@ class Payload:
         if gate is None:
             return None
         return max(0, gate.captured - gate.gated - gate.discarded - units)
+
+
+def _withheld(counters: Counters) -> int:
+    """Frames that came and cannot be shown."""
+    return counters.withheld + counters.failed + counters.unstamped
 
 
 def _document(message: messages.Message | None) -> dict[str, object] | None:
