@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,8 +71,8 @@ def frames_accounted(world: World) -> list[str]:
     """Invariant 1 of every payload process, of the intake and of every localizer process."""
     complaints: list[str] = []
     heard = world.heard
-    for run in world.runs:
-        complaints += _of_run(run, heard)
+    for run, later in zip(world.runs, [*world.runs[1:], None], strict=True):
+        complaints += _of_run(run, later.began_s if later is not None else math.inf, heard)
     last = world.runs[-1]
     counts = last.ended.counts if last.ended is not None else {}
     note = heard.payload(NAME)
@@ -100,7 +101,7 @@ def _one_intake(world: World, run: PayloadRun) -> bool:
     return len(same) == 1 and not any(run.began_s < at_s for at_s in world.intake_anew_s)
 
 
-def _of_run(run: PayloadRun, heard: Heard) -> list[str]:
+def _of_run(run: PayloadRun, until_s: float, heard: Heard) -> list[str]:
     complaints: list[str] = []
     if run.killed:
         said = [
@@ -119,8 +120,7 @@ def _of_run(run: PayloadRun, heard: Heard) -> list[str]:
             frame.key[1]
             for frames in heard.shown.values()
             for frame in frames
-            if frame.key[0] == run.ssrc and run.began_s < frame.at_s
-            if frame.at_s < run.ended_s + 5.0
+            if frame.key[0] == run.ssrc and run.began_s < frame.at_s < until_s
         ]
         complaints += accounts.of_shown(shown, run.watch.visible(run.ssrc), f"stream {run.ssrc}")
     return complaints

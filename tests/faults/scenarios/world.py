@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import random
 import shutil
 import time
@@ -354,11 +353,3 @@ def tick(world: World) -> None:
     """A moment in which the world is looked after."""
     world.tend()
     time.sleep(_TICK_S)
-
-
-def running(pid: int) -> bool:
-    """Whether there is a process of an id."""
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, 0)
-        return True
-    return False
