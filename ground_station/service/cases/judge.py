@@ -211,7 +211,7 @@ def _unasked(limits: Limits, figures: dict[str, Figure], outcome: Outcome) -> li
 
 def _conditions(outcome: Outcome) -> list[Row]:
     found = [
-        Row(b.name, float(b.off), "frames", 0.0, b.holds, EXACTLY, b.told)
+        Row(b.name, float(b.off), "frames off", 0.0, b.holds, EXACTLY, b.told)
         for b in accounting.balances(outcome)
     ]
     broken = int((outcome.frames.localized & ~outcome.frames.finite).sum())

@@ -41,7 +41,7 @@ def write_suite_json(
         "schema": "blimp.suite/1",
         "name": name,
         "began": began,
-        "passed": all(case.passed for case in cases),
+        "passed": bool(cases) and all(case.passed for case in cases),
         **more,
         "cases": [_document(case) for case in cases],
     }
