@@ -41,6 +41,14 @@ def test_no_rules_at_all_let_everything_pass() -> None:
     assert firewall.judge(firewall.from_iptables("", "udp", 5600)) == Fate(ACCEPT)
 
 
+def test_chains_that_jump_to_each_other_without_end_are_gone_through_once() -> None:
+    names = [f"c{number}" for number in range(9)]
+    jumps = [f"-A {one} -j {other}" for one in names for other in names]
+    rules = ["*filter", ":INPUT DROP [0:0]", "-A INPUT -j c0", *jumps]
+    fate = firewall.judge(firewall.from_iptables("\n".join(rules), "udp", 5600))
+    assert fate == Fate(DROP, depends=True)
+
+
 def test_a_closed_host_drops_what_it_does_not_name() -> None:
     rules = ([LOOPBACK, {"accept": None}], [ESTABLISHED, {"accept": None}])
     assert nft(ruleset(*rules)) == Fate(DROP)

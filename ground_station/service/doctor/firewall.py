@@ -62,7 +62,7 @@ def judge(chains: Chains) -> Fate:
     ends = []
     for name, chain in chains.items():
         if chain.base:
-            way = _walk(chains, name, 0)
+            way = _walk(chains, name, 0, {})
             verdict = chain.policy if way.end == NEXT else way.end
             ends.append(Fate(verdict, bool(way.others - {verdict})))
     dropped = [end for end in ends if end.verdict == DROP]
@@ -71,17 +71,28 @@ def judge(chains: Chains) -> Fate:
     return Fate(ACCEPT, any(end.depends for end in ends))
 
 
-def _walk(chains: Chains, name: str, depth: int) -> _Way:
-    """A packet's way through a chain; it ends with `NEXT` where there is no verdict."""
-    chain, others = chains.get(name), set[str]()
-    if chain is None or depth > _DEEPEST:
+def _walk(chains: Chains, name: str, depth: int, known: dict[str, _Way]) -> _Way:
+    """A packet's way through a chain; it ends with `NEXT` where there is no verdict.
+
+    `known` are the chains gone through already: many jumps to a few would else take for ever.
+    """
+    if name in known:
+        return known[name]
+    if name not in chains or depth > _DEEPEST:
         return _Way(NEXT, {_UNKNOWN})
+    known[name] = _Way(NEXT, {_UNKNOWN})  # for a chain that comes back to itself
+    known[name] = _through(chains, chains[name], depth, known)
+    return known[name]
+
+
+def _through(chains: Chains, chain: Chain, depth: int, known: dict[str, _Way]) -> _Way:
+    others = set[str]()
     for rule in chain.rules:
         if rule.met is False or rule.verdict == NEXT:
             continue
         end = rule.verdict
         if end in (JUMP, GOTO):
-            way = _walk(chains, rule.target, depth + 1)
+            way = _walk(chains, rule.target, depth + 1, known)
             end = way.end
             others |= way.others
             if end == NEXT and rule.verdict == JUMP:
