@@ -21,6 +21,7 @@ import pycolmap
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.mapping import colmap_files
 from ground_station.mapping.matching import TwoView
 
 F64 = npt.NDArray[np.float64]
@@ -362,6 +363,7 @@ def write(model: Reconstruction, folder: Path) -> None:
 
 def read(folder: Path) -> Reconstruction:
     """Reads a model; raises `MapError` with one line."""
+    colmap_files.check(folder)
     _quiet()
     try:
         return pycolmap.Reconstruction(folder)
