@@ -47,14 +47,18 @@ PARSE_ERRORS = (
 )
 """What the record parsers raise on bytes that are not what they claim to be."""
 
+_HEAD, _LENGTH = struct.Struct("<BQ"), struct.Struct("<Q")
 _CHUNK_HEAD_BYTES = 8 + 8 + 8 + 4
 """Start and end time, unpacked size, checksum."""
 
 _SALVAGE_LIMIT_BYTES = 1 << 26
 """How much of a chunk without an end is looked through."""
 
-_CHUNK_LIMIT_BYTES = 1 << 30
+_CHUNK_LIMIT_BYTES = 1 << 27
 """No sane writer's chunk unpacks to more; compressed ones could claim anything."""
+
+_USED = (Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE, Opcode.CHUNK)
+_PIECE_BYTES = 1 << 20
 
 
 def records(file: IO[bytes]) -> Iterator[Record | Footer]:
@@ -70,7 +74,7 @@ def records(file: IO[bytes]) -> Iterator[Record | Footer]:
     crc = zlib.crc32(MAGIC)
     while size - at >= 9:
         head = file.read(9)
-        opcode, length = struct.unpack("<BQ", head)
+        opcode, length = _HEAD.unpack(head)
         if opcode == 0:
             raise Damage(f"damaged at byte {at}: no record starts here")
         if length > size - at - 9:
@@ -81,6 +85,14 @@ def records(file: IO[bytes]) -> Iterator[Record | Footer]:
             if opcode == Opcode.CHUNK:
                 yield from _whole_ones(file.read(min(size - at - 9, _SALVAGE_LIMIT_BYTES)))
             return
+        if opcode not in (*_USED, Opcode.DATA_END, Opcode.FOOTER):
+            crc = zlib.crc32(head, crc)
+            for size_left in range(length, 0, -_PIECE_BYTES):  # an attachment may be of any size
+                crc = zlib.crc32(file.read(min(size_left, _PIECE_BYTES)), crc)
+            at += 9 + length
+            continue
+        if length > _CHUNK_LIMIT_BYTES:
+            raise Damage(f"damaged at byte {at}: a record of {length} bytes")
         content = file.read(length)
         try:
             if opcode == Opcode.DATA_END:
@@ -112,13 +124,12 @@ def _parse_record(opcode: int, content: bytes) -> Iterator[Record]:
         data = _unpacked(chunk)
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise _WrongChecksum
-        inside, end = _inside(data, 0)
-        if end != len(data):
+        if _end_of_whole_ones(data, 0) != len(data):
             raise ValueError("the chunk's last record is not whole")
-        yield from inside
+        yield from _inside(data, 0)
 
 
-def _whole_ones(content: bytes) -> list[Record]:
+def _whole_ones(content: bytes) -> Iterator[Record]:
     """The whole records in the beginning of a chunk whose end is missing, if not compressed.
 
     Its checksum cannot be verified: it stands for bytes that are not there.
@@ -127,24 +138,34 @@ def _whole_ones(content: bytes) -> list[Record]:
         stream = _stream(content)
         stream.read(_CHUNK_HEAD_BYTES)
         if stream.read_prefixed_string() != "":
-            return []
+            return
         stream.read8()
-        return _inside(content, stream.count)[0]
+        yield from _inside(content, stream.count)
     except PARSE_ERRORS:
-        return []
+        return
 
 
-def _inside(content: bytes, at: int) -> tuple[list[Record], int]:
-    """The records of a chunk's content from byte `at` on, and where the last whole one ends."""
-    result: list[Record] = []
+def _inside(content: bytes, at: int) -> Iterator[Record]:
+    """The whole records of a chunk's content from byte `at` on.
+
+    One after the other: those of nothing but small ones would take many times the chunk's size.
+    """
+    end = _end_of_whole_ones(content, at)
+    while at < end:
+        opcode, length = _HEAD.unpack_from(content, at)
+        if opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
+            yield from _parse_record(opcode, content[at + 9 : at + 9 + length])
+        at += 9 + length
+
+
+def _end_of_whole_ones(content: bytes, at: int) -> int:
+    """Where the last whole record of a chunk's content ends."""
     while len(content) - at >= 9:
-        opcode, length = struct.unpack_from("<BQ", content, at)
+        (length,) = _LENGTH.unpack_from(content, at + 1)
         if length > len(content) - at - 9:
             break
-        if opcode in (Opcode.CHANNEL, Opcode.MESSAGE):
-            result += _parse_record(opcode, content[at + 9 : at + 9 + length])
         at += 9 + length
-    return result, at
+    return at
 
 
 def _stream(content: bytes) -> ReadDataStream:

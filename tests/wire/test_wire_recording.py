@@ -268,6 +268,7 @@ def bombs() -> dict[str, bytes]:
         "chunk claims 2^60": chunk(b"x" * 20, claimed=1 << 60),
         "zstd bomb": chunk(zstandard.compress(zeros), compression="zstd", claimed=1000),
         "lz4 bomb": chunk(lz4.frame.compress(zeros), compression="lz4", claimed=1000),
+        "zstd claims 1 GB": chunk(zstandard.compress(b"\0"), compression="zstd", claimed=1 << 30),
         "unknown compression": chunk(b"x" * 20, compression="brotli"),
         "message too short": record(Opcode.MESSAGE, b"x" * 5),
     }
@@ -288,6 +289,31 @@ def test_hostile_sizes_ask_for_no_memory(tmp_path: Path, name: str) -> None:
         tracemalloc.stop()
     assert len(read) >= 1 and reader.cut
     assert peak < 4 << 20
+
+
+def test_an_attachment_of_any_size_is_passed_over_in_pieces(tmp_path: Path) -> None:
+    path = tmp_path / "large.mcap"
+    path.write_bytes(MAGIC + CHANNEL + record(Opcode.ATTACHMENT, bytes(40 << 20)) + MESSAGE)
+    tracemalloc.start()
+    try:
+        assert len(list(RecordingReader(path).messages())) == 1
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_chunk_of_small_messages_is_not_held_as_objects(tmp_path: Path) -> None:
+    inner = CHANNEL + MESSAGE * 100_000
+    path = tmp_path / "small.mcap"
+    path.write_bytes(
+        MAGIC + chunk(zstandard.compress(inner), compression="zstd", claimed=len(inner))
+    )
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in RecordingReader(path).messages()) == 100_000
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(inner)
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_chunk_with_a_wrong_checksum_is_where_reading_ends(tmp_path: Path) -> None:
