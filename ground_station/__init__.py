@@ -1,3 +1,9 @@
 """The ground station: receives the payload's video, maps the building, finds the camera in it."""
 
+import os
+
 __version__ = "0.1.0"
+
+# OpenCV reads it when it is imported: no picture here has more pixels, and a small file of zeros
+# could else ask for a gigabyte.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))

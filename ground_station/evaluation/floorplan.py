@@ -13,6 +13,8 @@ import yaml
 from ground_station.errors import InputError
 from ground_station.recording.folder import read_grey
 
+_MOST_BYTES = 64 << 10
+
 
 @dataclass(frozen=True)
 class FloorPlan:
@@ -36,15 +38,22 @@ def load_floorplan(path: str | Path) -> FloorPlan:
     """Reads `floorplan.yaml` and its picture; raises `InputError` with one line."""
     path = Path(path)
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            text = file.read(_MOST_BYTES + 1)
+        if len(text) > _MOST_BYTES:
+            raise InputError(f"{path}: more than {_MOST_BYTES} bytes, which no floor plan's has")
+        document = yaml.safe_load(text)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
+    # Its numbers and dates are converted as it is read, and its nests call themselves.
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError):
         raise InputError(f"{path}: not valid YAML") from None
     try:
-        name, resolution_m = str(document["image"]), float(document["resolution"])
+        name, resolution_m = document["image"], float(document["resolution"])
         x, y, yaw = (float(value) for value in document["origin"])
-    except (KeyError, TypeError, ValueError):
+        if not isinstance(name, str) or "\0" in name:  # a list of aliases to lists has no end
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{path}: needs image, resolution and origin [x, y, yaw]") from None
     if not all(map(math.isfinite, (resolution_m, x, y, yaw))) or not 1e-4 <= resolution_m <= 10:
         raise InputError(f"{path}: resolution is {resolution_m}; allowed: 0.0001 to 10 m a pixel")

@@ -13,6 +13,7 @@ from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 
+_MOST_BYTES = 512 << 20
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
@@ -57,9 +58,14 @@ class ImageFolder:
 def read_grey(path: Path) -> npt.NDArray[np.uint8]:
     """An image file as (H, W) grey, as stored (no turning by EXIF); raises `InputError`."""
     try:
-        data = path.read_bytes()
+        if path.exists() and not path.is_file():  # a device may have no end
+            raise InputError(f"{path}: not a file")
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
+    if len(data) > _MOST_BYTES:
+        raise InputError(f"{path}: more than {_MOST_BYTES >> 20} MiB")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     image = None
     if data and not _jpeg_is_cut(data):

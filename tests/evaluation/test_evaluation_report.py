@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -278,7 +279,11 @@ def test_plots_keep_no_global_state() -> None:
         ({"resolution": float("nan")}, "allowed"),
         ({"origin": [0.0, 0.0]}, "needs image, resolution and origin"),
         ({"image": "missing.png"}, "missing.png"),
-        ({"image": None}, "None"),
+        ({"image": None}, "needs image, resolution and origin"),
+        ({"image": "a\0b"}, "needs image, resolution and origin"),
+        ({"image": "/dev/zero"}, "not a file"),
+        ({"resolution": 10**400}, "needs image, resolution and origin"),
+        ({"note": "x" * 70_000}, "more than 65536 bytes"),
     ],
 )
 def test_a_wrong_floor_plan_is_refused_in_one_line(
@@ -294,6 +299,11 @@ def test_files_that_are_no_floor_plan_are_refused(tmp_path: Path) -> None:
     (tmp_path / "list.yaml").write_text("- 1\n- 2\n")
     (tmp_path / "bad.yaml").write_text("image: [\n")
     (tmp_path / "code.yaml").write_text("image: !!python/object/apply:os.getcwd []\n")
-    for name in ("list", "bad", "code", "missing"):
+    (tmp_path / "date.yaml").write_text("image: a.png\nresolution: 2001-13-41\n")
+    (tmp_path / "deep.yaml").write_text("[" * 5000)
+    laughs = "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghi"))
+    text = f"a: &a [x, x, x, x, x, x, x, x, x]\n{laughs}image: *i\nresolution: 1\norigin: [0, 0, 0]"
+    (tmp_path / "laughs.yaml").write_text(text)
+    for name in ("list", "bad", "code", "missing", "date", "deep", "laughs"):
         with pytest.raises(InputError, match=rf"{name}\.yaml"):
             load_floorplan(tmp_path / f"{name}.yaml")

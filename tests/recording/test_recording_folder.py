@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -79,6 +83,38 @@ def test_a_cut_jpeg_is_refused_rather_than_filled_with_grey(folder: Path, tmp_pa
 def test_files_that_only_look_like_images_are_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "bad.png").write_bytes(content)
     with pytest.raises(InputError, match=r"bad\.png"):
+        list(open_input(tmp_path))
+
+
+def test_a_small_file_of_many_pixels_is_refused(tmp_path: Path) -> None:
+    side = 14_000  # a row is its filter's byte and its pixels
+
+    def part(name: bytes, data: bytes) -> bytes:
+        sum_ = zlib.crc32(name + data)
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", sum_)
+
+    rows = zlib.compress(bytes(side * (side + 1)), 1)
+    head = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", rows) + part(b"IEND", b"")
+    (tmp_path / "a.png").write_bytes(png)
+    # OpenCV takes the limit when it is imported, which in this process was long ago.
+    code = f"""
+from pathlib import Path
+from ground_station.errors import InputError
+from ground_station.recording.folder import read_grey
+try:
+    read_grey(Path({str(tmp_path / "a.png")!r}))
+except InputError as error:
+    assert "a.png: not a whole, readable image" in str(error)
+else:
+    raise SystemExit("it was read")
+"""
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.png").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=r"a\.png: not a file"):
         list(open_input(tmp_path))
 
 
