@@ -1,7 +1,8 @@
 """A UDP relay that does to packets what Wi-Fi does, by a seed, and counts it exactly.
 
 The kernel's netem is not everywhere. What happens to the n-th packet depends on the seed, on n and
-on the impairment then in force, and on no clock: only outages, which last seconds, follow the time.
+on the impairment then in force, and on no clock: only outages, which last seconds, and the queue
+before a limited rate follow the time.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 _BUFFER_BYTES = 8 << 20
@@ -40,6 +41,8 @@ class Impairment:
     duplicate: float = 0.0
     delay_s: float = 0.0
     jitter_s: float = 0.0  # up to this much more, drawn for each packet
+    rate_kbps: float = 0.0  # of the datagrams' own bytes; 0: unlimited
+    queue_s: float = 0.5  # a packet that would wait longer for the rate is lost
 
 
 CLEAN = Impairment()
@@ -47,13 +50,34 @@ CLEAN = Impairment()
 
 @dataclass
 class LinkCounts:
-    """`received` = `passed` + `lost` once nothing waits; `duplicated` copies went out beside."""
+    """`received` = `passed` + `lost` once nothing waits; `duplicated` copies went out beside.
+
+    Of the lost, `overflowed` found the queue before the limited rate full.
+    """
 
     received: int = 0
     passed: int = 0
     lost: int = 0
     duplicated: int = 0
     delayed: int = 0  # of the passed: held back until others had overtaken, or for a time
+    overflowed: int = 0
+
+
+class Bottleneck:
+    """A link that carries so much and no more: first come, first served, in a bounded queue."""
+
+    def __init__(self) -> None:
+        self._free_s = 0.0
+
+    def wait_s(self, size: int, now_s: float, does: Impairment) -> float | None:
+        """How long a packet of `size` bytes takes from now, waiting and sending; None: overflow."""
+        if does.rate_kbps <= 0:
+            return 0.0
+        waits_s = max(0.0, self._free_s - now_s)
+        if waits_s > does.queue_s:
+            return None
+        self._free_s = now_s + waits_s + size * 8 / (1e3 * does.rate_kbps)
+        return self._free_s - now_s
 
 
 @dataclass
@@ -72,6 +96,8 @@ class ImpairedLink:
 
     `tap` is called for each datagram that comes, in order and before it goes on, with whether it is
     lost. Packets to a port where nobody listens count as passed, as they would on the air.
+    `outages` are (at_s, for_s) from the first packet on, in which nothing passes. `port` 0 is a
+    free one.
     """
 
     def __init__(
@@ -82,7 +108,12 @@ class ImpairedLink:
         seed: int = 0,
         tap: Callable[[bytes, bool], None] | None = None,
         host: str = "127.0.0.1",
+        port: int = 0,
+        outages: Sequence[tuple[float, float]] = (),
     ) -> None:
+        self._outages = tuple(outages)
+        self._first_s: float | None = None
+        self._bottleneck = Bottleneck()
         self._counts = LinkCounts()
         self._impairment = impairment
         self._random = random.Random(seed)
@@ -97,7 +128,7 @@ class ImpairedLink:
         for option in (socket.SO_RCVBUF, _SO_RCVBUFFORCE):
             with contextlib.suppress(OSError):
                 self._in.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
-        self._in.bind((host, 0))
+        self._in.bind((host, port))
         self.port: int = self._in.getsockname()[1]
         self.retarget(to_port)
         self._closing = threading.Event()
@@ -122,6 +153,11 @@ class ImpairedLink:
     def counts(self) -> LinkCounts:
         """A snapshot of the counts."""
         return replace(self._counts)
+
+    @property
+    def first_s(self) -> float | None:
+        """When the first packet came, on the monotonic clock; None before."""
+        return self._first_s
 
     @property
     def idle(self) -> bool:
@@ -155,6 +191,8 @@ class ImpairedLink:
 
     def _take(self, datagram: bytes) -> None:
         now_s, does = time.monotonic(), self._impairment
+        if self._first_s is None:
+            self._first_s = now_s
         # As many draws for each packet, whatever becomes of it: the next ones' fates stay the same.
         turn, lost, burst, late, twice, jitter = (self._random.random() for _ in range(6))
         self._bad = turn >= does.burst_end if self._bad else turn < does.burst_start
@@ -163,7 +201,13 @@ class ImpairedLink:
             lost < does.loss
             or (self._bad and burst < does.burst_loss)
             or now_s < self._gone_until_s
+            or self._is_out(now_s - self._first_s)
         )
+        # What is lost on the air has taken its time on it, too.
+        queued_s = self._bottleneck.wait_s(len(datagram), now_s, does)
+        if queued_s is None:
+            drops = True
+            self._counts.overflowed += 1
         if self._tap is not None:
             self._tap(datagram, drops)
         for held in self._held:
@@ -172,12 +216,15 @@ class ImpairedLink:
             self._counts.lost += 1
             return
         copies = 1 + (twice < does.duplicate)
-        delay_s = does.delay_s + jitter * does.jitter_s
+        delay_s = (queued_s or 0.0) + does.delay_s + jitter * does.jitter_s
         if late < does.reorder:
             until_s = now_s + _HOLD_LIMIT_S
             self._held.append(_Held(does.reorder_by, until_s, datagram, copies, delay_s))
         else:
             self._go_on(datagram, copies, delay_s, now_s, delayed=delay_s > 0)
+
+    def _is_out(self, since_s: float) -> bool:
+        return any(at_s <= since_s < at_s + for_s for at_s, for_s in self._outages)
 
     def _release(self, now_s: float) -> None:
         """Sends what is due; all of it when `now_s` is infinite."""
