@@ -8,22 +8,20 @@ from __future__ import annotations
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 from deploy.errors import DeployError
-from deploy.provisioning import Provisioning
+from deploy.provisioning import Provisioning, toml_text
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
-_BOM = b"\xef\xbb\xbf"
 CABLE, RADIO = "eth0", "wlan0"
 
 
 def read(text: bytes, name: str) -> dict[str, Any]:
     """A TOML file's document; raises `DeployError` that begins with `name`."""
     try:
-        return tomllib.loads(text.removeprefix(_BOM).decode())
+        return toml_text.read(text)
     except UnicodeDecodeError:
         raise DeployError(f"{name}: not UTF-8 text") from None
     except (ValueError, RecursionError) as error:

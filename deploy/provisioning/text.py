@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 from deploy.errors import DeployError
+from deploy.provisioning import toml_text
 from deploy.provisioning.model import (
     AUTO,
     VIDEO_PORT,
@@ -20,7 +20,6 @@ from deploy.provisioning.model import (
 FILE = "blimp.toml"
 SCHEMA = 1
 MAX_BYTES = 256 * 1024
-_BOM = b"\xef\xbb\xbf"
 
 _KEYS: dict[str, dict[str, type]] = {
     "payload": {"id": str},
@@ -71,7 +70,7 @@ def _document(text: bytes) -> dict[str, Any]:
     if b"\0" in text:
         raise DeployError("it holds a NUL byte: the file is cut or damaged, write it anew")
     try:
-        return tomllib.loads(text.removeprefix(_BOM).decode())
+        return toml_text.read(text)
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
         raise DeployError(f"line {line} is not UTF-8; save it as UTF-8") from None
@@ -261,7 +260,7 @@ def _shown(value: object) -> str:
         return f"a number of {value.bit_length()} bits"
     try:
         text = repr(value)
-    except ValueError:  # such a number inside a list
+    except (ValueError, RecursionError):  # such a number inside a list, or tables without end
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 

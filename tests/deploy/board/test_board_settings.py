@@ -82,7 +82,8 @@ def test_what_no_configuration_holds_is_refused(text: bytes, told: str) -> None:
     assert str(error.value) == told
 
 
-@pytest.mark.parametrize("text", [b"\xff\xfe", b"a = 1\na = 2\n", b"a" * 100, b"[[" * 5000])
+@pytest.mark.parametrize("text", [b"\xff\xfe", b"a = 1\na = 2\n", b"a" * 100, b"[[" * 5000,
+                                  b"a." * 60_000 + b"b = 1"])  # fmt: skip
 def test_what_is_no_toml_is_one_line(text: bytes) -> None:
     with pytest.raises(DeployError) as error:
         settings.read(text, "payload.toml")

@@ -152,6 +152,7 @@ def test_defaults_are_those_of_the_format() -> None:
         (('[]', '["ssh-rsa AAAAB3NzaC1yc2EAAAADAQABAAAAAf8="]'), "of 8 bits; allowed: 2048"),
         (('[payload]', '[payload'), "not valid TOML"),
         (('schema = 1', f'schema = {"[" * 5000}'), "not valid TOML"),
+        (('schema = 1', f'schema{".a" * 60_000} = 1'), "a key has more than 32 parts"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_refused_in_one_line(change: tuple[str, str], said: str) -> None:
@@ -215,6 +216,13 @@ def test_countries_are_those_of_iso_3166() -> None:
         pytest.skip("no list of ISO 3166 on this machine (tzdata)")
     lines = [line for line in table.read_text().splitlines() if not line.startswith("#")]
     assert {line.split("\t")[0] for line in lines} == CODES
+
+
+def test_how_deep_a_key_may_be_follows_the_firmware() -> None:
+    from deploy.provisioning import toml_text
+    from pi_firmware.wire import config
+
+    assert (toml_text.TOO_DEEP, toml_text.DEEPEST) == (config._TOO_DEEP, config._DEEPEST)
 
 
 def test_names_and_endpoints_follow_the_firmware() -> None:
