@@ -26,6 +26,8 @@ RECORDING_RESUMED = "recording-resumed"
 
 N = TypeVar("N", bound="Note")
 
+_DEEPEST, _FLAT_BRACKETS = 32, 32
+
 
 class NoteError(GroundStationError):
     """Bytes on the bus that are no note of the kind."""
@@ -170,9 +172,22 @@ def decode(kind: type[N], data: bytes) -> N:
     """A note of a kind; raises `NoteError` with one line."""
     try:
         document = json.loads(data)
+        # No note of ours has so many; one that nests without end could be read and not be written.
+        if data.count(b"[") + data.count(b"{") > _FLAT_BRACKETS and _depth(document) > _DEEPEST:
+            raise ValueError(f"it nests deeper than {_DEEPEST}")
         return kind(**document)
     except (ValueError, TypeError, RecursionError) as error:
         raise NoteError(f"{kind.__name__}: {str(error)[:120]}") from None
+
+
+def _depth(value: Any) -> int:
+    """How deep a document nests, as far as it matters."""
+    level, depth = [value], 0
+    while level and depth <= _DEEPEST:
+        depth += 1
+        inner = [list(i.values()) if isinstance(i, dict) else i for i in level]
+        level = [v for i in inner if isinstance(i, list) for v in i if isinstance(v, dict | list)]
+    return depth
 
 
 def as_document(note: Note) -> dict[str, Any]:

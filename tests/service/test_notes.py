@@ -1,0 +1,28 @@
+"""Notes that cannot be said on again are none: they would end whoever shows them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ground_station.service import notes
+from ground_station.service.notes import NoteError, PayloadNote
+
+
+def payload(battery: str) -> bytes:
+    return f'{{"alive": true, "seen_ns": 1, "battery": {{"a": {battery}}}}}'.encode()
+
+
+@pytest.mark.parametrize("depth", [40, 300, 900])
+@pytest.mark.parametrize(("begin", "end"), [("[", "]"), ('{"a":', "}"), ("[1,", "]")])
+def test_a_note_that_nests_without_end_is_refused(depth: int, begin: str, end: str) -> None:
+    with pytest.raises(NoteError, match=r"PayloadNote: it nests deeper than 32"):
+        notes.decode(PayloadNote, payload(begin * depth + "1" + end * depth))
+
+
+def test_a_note_of_many_lists_and_few_levels_is_taken() -> None:
+    text = payload(json.dumps([[1, {"b": [2]}]] * 100))
+    note = notes.decode(PayloadNote, text)
+    assert notes.decode(PayloadNote, notes.encode(note)) == note
+    assert notes.as_document(note)["battery"] == {"a": [[1, {"b": [2]}]] * 100}
