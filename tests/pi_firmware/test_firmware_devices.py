@@ -52,12 +52,16 @@ def test_a_camera_that_cannot_be_opened_is_named(text: str, named: str) -> None:
         ("gauge:", "unknown scheme"),
         ("fake:1", "takes no path"),
         ("fake:?percentage=2", "percentage is '2'; allowed: 0 to 1"),
+        ("fake:?a=1&a=" + "2" * 9000, "option 'a' is given twice"),
+        ("fake:\n?x", "the options are not name=value"),
+        ("fake:?a\n=1", "unknown option"),
     ],
 )
 def test_a_gauge_that_cannot_be_opened_is_named(text: str, named: str) -> None:
     with pytest.raises(SourceError) as caught:
         battery.open_gauge(text)
     assert named in str(caught.value)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
 def test_options_are_split_from_the_path() -> None:
