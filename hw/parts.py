@@ -101,7 +101,8 @@ def load_parts(path: str | Path = PARTS_FILE) -> dict[str, Part]:
         raise HardwareError(f"{path}: unknown key {unknown[0]!r} (known here: part)")
     parts: dict[str, Part] = {}
     for number, entry in enumerate(entries_of(document, "part", path), 1):
-        where = f"{path}: part {entry.get('id', number)!r}"
+        name = entry.get("id")
+        where = f"{path}: part {name!r:.60}" if isinstance(name, str) else f"{path}: part {number}"
         for name in _REQUIRED:
             if name not in entry:
                 raise HardwareError(f"{where}: the key '{name}' is missing")

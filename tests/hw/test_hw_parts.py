@@ -84,6 +84,11 @@ def test_a_part_that_cannot_be_is_refused_by_name(
     assert "brick" in line and says in line
 
 
+def test_a_part_whose_id_is_no_text_is_refused_by_its_place(tmp_path: Path) -> None:
+    line = refusal(tmp_path, GOOD.replace('id = "brick"', f"id = [0x{'f' * 5000}]"))
+    assert "part 1: 'id' must be a string, not a list" in line
+
+
 def test_one_part_twice_is_refused(tmp_path: Path) -> None:
     assert "'brick' stands there twice" in refusal(tmp_path, GOOD + GOOD)
 
