@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import sys
 import tempfile
@@ -184,7 +185,7 @@ def rows(flown: Flown, options: Any) -> list[Row]:
 
 def level_rows(measures: Sequence[Measure], from_s: float) -> list[Row]:
     """The payload's resident memory once it had settled."""
-    (memory,) = [m for m in measures if (m.kind, m.name) == (MEMORY, PAYLOAD)] or [None]
+    memory = next((m for m in measures if (m.kind, m.name) == (MEMORY, PAYLOAD)), None)
     settled = np.empty((0, 2)) if memory is None else memory.settled(from_s)
     if not len(settled):
         return [Row("memory, payload: mean", "no sample", "", False)]
@@ -202,10 +203,11 @@ def clock_rows(clock: Measure, flown_s: float) -> list[Row]:
     found = trend(points)
     drift_ms = found.slope * flown_s / 3600.0
     holds = abs(drift_ms) <= 1e3 * TRUE_S  # false for NaN, too
-    off_ms = float(abs(points[:, 1] - np.median(points[:, 1])).max()) if len(points) else np.nan
+    off_ms = float(abs(points[:, 1] - np.median(points[:, 1])).max()) if len(points) else math.nan
+    drift = f"{drift_ms:+.3f} ms" if math.isfinite(drift_ms) else "?"
     return [
-        Row("clock, drift over the flight", f"{drift_ms:+.3f} ms", f"±{1e3 * TRUE_S:g} ms", holds),
-        Row("clock, off its median", f"{off_ms:.3f} ms"),
+        Row("clock, drift over the flight", drift, f"±{1e3 * TRUE_S:g} ms", holds),
+        Row("clock, off its median", f"{off_ms:.3f} ms" if math.isfinite(off_ms) else "?"),
     ]
 
 

@@ -20,4 +20,4 @@ def show(rows: Iterable[Row]) -> None:
     """Prints the table."""
     for row in rows:
         verdict = ("ok" if row.holds else "MISSED") if row.bound or not row.holds else ""
-        print(f"{row.name:34} {row.value:>42}  {row.bound:20} {verdict}".rstrip())
+        print(f"{row.name:38} {row.value:>42}  {row.bound:20} {verdict}".rstrip())
