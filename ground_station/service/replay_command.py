@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
+
+from ground_station.service.cases import command as cases
 
 _EPILOG = """\
 examples:
   blimp replay flight.mcap --map maps/atrium --out out/replay
   blimp replay --demo --out out/demo
+  blimp replay --compare out/before out/after
+  blimp replay --make-case flight.mcap --map maps/atrium --truth recording --out flight.toml
+  blimp replay --accept out/replay --by "$USER" --tolerance-m 0.05 --tolerance-deg 1 \\
+      --out flight.golden.txt
 
 The firmware runs as a process of its own; video crosses RTP and telemetry Zenoh, on loopback."""
+
+OUTCOME = "outcome"
+"""The folder in --out with every frame, which --accept and --compare take."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--demo", action="store_true", help="map the sample building first, then fly its flight"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("out/replay"), metavar="DIR",
-        help="results.json and report.html go here (default: out/replay)",
+        "--out", type=Path, metavar="DIR",
+        help="results.json, report.html and outcome/, every frame, go here (default: out/replay)",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("default", "thesis"), default="default", help="default: default"
@@ -52,16 +62,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="each frame as soon as the one before is done, and the same poses in each run",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write results here, too")
+    cases.add_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Flies, writes the report, prints the pilot's table; 1 when the demo misses a bound."""
-    from ground_station.errors import InputError
-    from ground_station.service import demo
+    """Flies, writes the report, prints the pilot's table; 1 when the demo misses a bound.
 
+    Or makes, accepts or compares; 1 when the second run is worse.
+    """
+    from ground_station.errors import InputError
+
+    if mode := cases.mode_of(args):
+        return cases.run(mode, args)
+    args.out = args.out or Path("out/replay")
     if args.demo:
         if args.recording or args.map or args.stepped:
             raise InputError("--demo brings its own recording, map and pace")
+        from ground_station.service import demo
+
         return demo.run(args.out, preset=args.preset, init=args.init, rate_hz=args.rate_hz)
     if args.recording is None or args.map is None:
         raise InputError("a RECORDING and --map are needed (or --demo)")
@@ -74,7 +92,11 @@ def _replay(args: argparse.Namespace) -> int:
     from ground_station.localization.settings import load_preset
     from ground_station.mapping import store
     from ground_station.service import flight_report
+    from ground_station.service.cases.observed import Observed
+    from ground_station.service.cases.outcome import write_outcome
+    from ground_station.service.cases.taken import outcome_of
     from ground_station.service.replay import replay, settings_for
+    from ground_station.service.stand import LOOPBACK
     from pi_firmware.wire.recording import RecordingReader
 
     settings = settings_for(
@@ -90,7 +112,9 @@ def _replay(args: argparse.Namespace) -> int:
     simulation = RecordingReader(args.recording).metadata_table("simulation")
     map_ = store.load(args.map)
     args.out.mkdir(parents=True, exist_ok=True)
-    result = replay(map_, load_preset(args.preset), settings)
+    began_s = time.monotonic()
+    with Observed(LOOPBACK) as observed:
+        result = replay(map_, load_preset(args.preset), settings, observed.stand)
     plan = args.map / "floorplan.yaml"
     data = flight_report.report_data(
         f"Replay of {args.recording.name}",
@@ -104,6 +128,16 @@ def _replay(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, result.document())
     write_report(args.out / "report.html", data)
+    outcome = outcome_of(
+        result,
+        map_,
+        seconds=time.monotonic() - began_s,
+        health=observed.health,
+        refused=observed.refused,
+        payload_side=observed.payload_side,
+        ground_side=observed.ground_side,
+    )
+    write_outcome(args.out / OUTCOME, outcome)
     print(summary_table(data))
     print(f"\n{args.out / 'report.html'}")
     return 0

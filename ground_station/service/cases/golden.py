@@ -97,7 +97,7 @@ def accept(
 def write_golden(path: str | Path, golden: Golden) -> None:
     """Writes the file, beside and renamed."""
     terms = tomli_w.dumps(asdict(golden.accepted)).splitlines()
-    lines = [f"# A run that was {golden}.", *(MARK + line for line in terms)]
+    lines = [f"# A run that was {golden}.", *((MARK + line).rstrip() for line in terms)]
     lines.append("# timestamp tx ty tz qx qy qz qw")
     poses = golden.poses
     for time_ns, p, q in zip(

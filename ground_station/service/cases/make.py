@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,17 @@ from ground_station.recording.flight import trajectory_of
 from ground_station.service.cases.case import GOLDEN, NONE, RECORDING, SURVEY, Keys, Truth
 from ground_station.service.cases.commented import commented
 from ground_station.service.cases.extract import extract
-from ground_station.service.cases.limits import Bounds
 from ground_station.service.cases.measure import figures
 from ground_station.service.cases.outcome import Outcome
 from ground_station.service.cases.propose import propose
-from ground_station.service.cases.source import Source, examine, missing, payloads_of
+from ground_station.service.cases.source import Source, check_start, examine, missing, payloads_of
 from ground_station.service.cases.truth import Reference
 from pi_firmware.wire import config
+from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
 
 GOLDEN_SUFFIX = ".golden.txt"
+_BRIEF = ("bounds.image", "bounds.ssh")
 _HEAD = """\
 # A replay test; make hil flies it. Paths are relative to this file's folder.
 # Every key stands here with what it is, its unit, range and default; leave out what you don't
@@ -41,7 +42,7 @@ class Asked:
     """What a case is made of.
 
     `truth` is None, `golden`, `recording`, `recording:TOPIC` or a TUM file; `outcome` a run whose
-    figures the bounds are proposed from.
+    figures the bounds are proposed from, `flown` the case's keys on how it is flown, by name.
     """
 
     recording: Path
@@ -51,6 +52,8 @@ class Asked:
     payload_id: str | None = None
     outcome: Outcome | None = None
     force: bool = False
+    flown: dict[str, Any] = field(default_factory=dict)
+    settings: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -64,9 +67,9 @@ class Made:
 def make_case(asked: Asked) -> Made:
     """Writes the case, and a recording of its own where the payload is one of several.
 
-    Raises a `BlimpError` with one line; then nothing was written but what is whole.
+    Raises a `BlimpError` with one line; then nothing was written.
     """
-    out, made = asked.out, Made()
+    out = asked.out
     if out.suffix != ".toml" or not out.stem:
         raise InputError(f"{out}: a case is a .toml file")
     if not out.resolve().parent.is_dir():
@@ -74,13 +77,22 @@ def make_case(asked: Asked) -> Made:
     _free(out, asked.force)
     map_ = store.load(asked.map)
     prefix = _prefix(asked)
-    recording = asked.recording
-    if prefix:
-        recording = out.with_suffix(".mcap")
-        _free(recording, asked.force)
-        count = extract(asked.recording, prefix, recording)
-        made.files.append(recording)
-        made.notes.append(f"{count} frames of {prefix.strip('/')} are in a recording of their own")
+    if not prefix:
+        return _make(asked, map_, asked.recording, Made())
+    recording = out.with_suffix(".mcap")
+    _free(recording, asked.force)
+    count = extract(asked.recording, prefix, recording)
+    note = f"the {count} frames of {prefix.strip('/')} are in a recording of their own"
+    try:
+        return _make(asked, map_, recording, Made([recording], [note]))
+    except BlimpError:
+        recording.unlink(missing_ok=True)
+        raise
+
+
+def _make(asked: Asked, map_: store.Map, recording: Path, made: Made) -> Made:
+    """The case of a recording whose only flight is the one that is wanted."""
+    out = asked.out
     source = examine(recording)
     made.notes += source.notes
     truth, poses = _truth(asked, source)
@@ -95,27 +107,52 @@ def make_case(asked: Asked) -> Made:
         reference = None if poses is None else Reference(poses, "the truth")
         limits, more = propose(figures(asked.outcome, reference))
         remarks |= more
-    keys = Keys(
-        title=_line(f"{asked.recording.stem} in {map_.info.name}"),
-        recording=_relative(recording, out),
-        map=_relative(asked.map, out),
-        truth=truth,
-        bounds=Bounds(**limits),
+    text = (
+        _HEAD
+        + "\n"
+        + commented(
+            _keys(asked, recording, map_, truth, limits, source), remarks=remarks, brief=_BRIEF
+        )
     )
-    text = _HEAD + "\n" + commented(keys, remarks=remarks, brief=("bounds.image", "bounds.ssh"))
-    # What is written is what will be read.
-    if config.from_mapping(tomllib.loads(text), Keys, where=str(out)) != keys:
-        raise InputError(f"{out}: a name cannot be written as TOML")
+    config.from_mapping(tomllib.loads(text), Keys, where=str(out))  # it reads back
     write_text(out, text)
     made.files.append(out)
     if truth.kind == GOLDEN:
         made.notes.append(
-            f"fly it, then accept the run: blimp replay --accept OUTCOME --by NAME --tolerance-m M "
+            "fly it, then accept the run: blimp replay --accept OUTCOME --by NAME --tolerance-m M "
             f"--tolerance-deg D --out {out.with_suffix(GOLDEN_SUFFIX)}"
         )
     if not limits:
         made.notes.append("no bounds are set: only the frames' accounts and telemetry are judged")
     return made
+
+
+def _keys(
+    asked: Asked,
+    recording: Path,
+    map_: store.Map,
+    truth: Truth,
+    limits: dict[str, Any],
+    source: Source,
+) -> Keys:
+    """The case's keys, each checked."""
+    flown = dict(asked.flown)
+    if flown.get("init", "none") not in ("none", "truth"):
+        flown["init"] = _relative(Path(flown["init"]), asked.out)
+    document = {
+        "title": _line(f"{asked.recording.stem} in {map_.info.name}"),
+        "recording": _relative(recording, asked.out),
+        "map": _relative(asked.map, asked.out),
+        "payload": {"settings": asked.settings},
+        "truth": asdict(truth),
+        "bounds": limits,
+        **flown,
+    }
+    keys = config.from_mapping(document, Keys, where="--make-case")
+    check_start(source, "--start-s", keys.start_s)
+    if keys.init == "truth" and not source.topics.get(TRUTH_TOPIC):
+        raise InputError(f"--init truth: {missing(source, TRUTH_TOPIC)}")
+    return keys
 
 
 def _free(path: Path, force: bool) -> None:

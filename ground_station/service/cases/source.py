@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from ground_station.geometry.camera import Camera
 from ground_station.recording.flight import camera_of
 from ground_station.service.cases.case import RECORDING, Case
 from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader
-
-POSE_SCHEMA_SUFFIX = "/pose"
 
 
 @dataclass(frozen=True)
@@ -89,17 +86,10 @@ def check_case(case: Case) -> Source:
     Raises a `BlimpError` with one line that names the case's file, key, value and range.
     """
     source = examine(case.recording_path)
-    for place, start_s in (
-        ("start_s", case.start_s),
-        ("kinds.image.start_s", case.kinds.image.start_s),
-        ("kinds.ssh.start_s", case.kinds.ssh.start_s),
-    ):
-        if start_s is not None and start_s > 0 and start_s >= source.span_s:
-            readable = "readable " if source.cut else ""
-            raise InputError(
-                f"{case.path}: '{place}' is {start_s:g} s; allowed: less than the {readable}"
-                f"{source.span_s:.3f} s of {source.path}"
-            )
+    check_start(source, f"{case.path}: 'start_s'", case.start_s)
+    for kind in ("image", "ssh"):
+        start_s = getattr(case.kinds, kind).start_s
+        check_start(source, f"{case.path}: 'kinds.{kind}.start_s'", start_s or 0.0)
     if case.init == "truth" and not source.topics.get(case.truth.topic):
         raise InputError(f"{case.path}: 'init' is 'truth', but {missing(source, case.truth.topic)}")
     if case.truth.kind == RECORDING and not source.topics.get(case.truth.topic):
@@ -109,17 +99,19 @@ def check_case(case: Case) -> Source:
     return source
 
 
+def check_start(source: Source, what: str, start_s: float) -> None:
+    """Raises `InputError` where a flight would begin behind a recording's readable end."""
+    if start_s and not start_s < source.span_s:
+        readable = "readable " if source.cut else ""
+        raise InputError(
+            f"{what} is {start_s:g} s; allowed: less than the {readable}{source.span_s:.3f} s of"
+            f" {source.path}"
+        )
+
+
 def missing(source: Source, topic: str) -> str:
     """That a recording has no poses on a topic, and which others it has."""
     found = sorted(name for name in source.topics if name.endswith("/pose"))
     others = f" (poses are on {', '.join(found)})" if found else " and no other poses"
     cut = f"; it was cut ({source.cut})" if source.cut else ""
     return f"{source.path} has no poses on {topic}{others}{cut}"
-
-
-def expected_frames(source: Source, rate_hz: float, start_s: float, duration_s: float) -> int:
-    """About how many frames a camera at this rate takes of a stretch; 0 s: to the end."""
-    span_s = max(0.0, source.span_s - start_s)
-    if duration_s:
-        span_s = min(span_s, duration_s)
-    return max(1, math.floor(span_s * rate_hz))
