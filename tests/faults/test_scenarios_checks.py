@@ -54,6 +54,10 @@ def test_the_intakes_account_is_held_against_the_payloads() -> None:
     assert accounts.of_intake(frames, 89)
     for name in ("received", "withheld", "lost"):
         assert accounts.of_intake(frames | {name: frames[name] - 1}, 88)
+    # An intake that began on the way does not count the 30 frames before it.
+    began = frames | {"received": 50}
+    assert accounts.of_intake(began, 88, (28, 31)) == []
+    assert accounts.of_intake(began, 88, (20, 29)) and accounts.of_intake(began, 88, (31, 40))
     assert accounts.of_received(79, 80, 1) == []
     assert accounts.of_received(78, 80, 1) and accounts.of_received(80, 80, 1)
 
@@ -120,7 +124,8 @@ def test_a_recording_that_lacks_a_frame_is_told() -> None:
     holed = FRAMES[:50] + FRAMES[51:]
     assert lacking([Recorded("a", holed)], CAME, END)
     assert lacking([Recorded("a", holed, left_out=1)], CAME, END) == []
-    assert lacking([Recorded("a", [*FRAMES, (7, 7)])], CAME, END)
+    assert lacking([Recorded("a", [*FRAMES[:9], (7, 7), *FRAMES[9:]])], CAME, END)
+    assert lacking([Recorded("a", [(7, 7), *FRAMES, (8, 8)])], CAME, END) == []
     assert lacking([Recorded("a", FRAMES, problem="a: broken")], CAME, END) == ["a: broken"]
 
 

@@ -20,6 +20,8 @@ from scenarios.world import NAME, World
 TRACKING = "TRACKING"
 OFF_M = 0.5
 """No pose called TRACKING is farther from the truth."""
+_ON_ITS_WAY = 5
+"""Frames that had left and not come when an intake was killed."""
 INVARIANTS = ("accounts", "poses", "recordings", "recovery", "order")
 
 
@@ -79,7 +81,7 @@ def frames_accounted(world: World) -> list[str]:
     if note is None or not counts:
         complaints.append("intake: it told nothing of the payload")
     else:
-        complaints += accounts.of_intake(note.frames, counts["sent"])
+        complaints += accounts.of_intake(note.frames, counts["sent"], _before_intake(world, last))
         frames = [one for one in heard.frames(NAME) if one.key[0] == last.ssrc]
         if frames and _one_intake(world, last):
             received = note.frames.get("received", 0), note.frames.get("dropped", 0)
@@ -99,6 +101,18 @@ def _one_intake(world: World, run: PayloadRun) -> bool:
     """Whether the same intake took all of a payload's last stream."""
     same = [other for other in world.runs if other.ssrc == run.ssrc]
     return len(same) == 1 and not any(run.began_s < at_s for at_s in world.intake_anew_s)
+
+
+def _before_intake(world: World, run: PayloadRun) -> tuple[int, int]:
+    """How many frames of a stream had left before the newest intake began: at least, at most."""
+    anew_s = max(world.intake_anew_s, default=0.0)
+    if anew_s < run.began_s:
+        return 0, 0
+    sent_before = sum(at_s < anew_s for at_s in run.watch.at_s)
+    # Those that it has shown came after all of its own that it could not show.
+    shown = {f.key[1] for f in world.heard.frames(NAME) if f.key[0] == run.ssrc and f.at_s > anew_s}
+    first = (n for n, frame in enumerate(run.watch.left()) if frame.sequence in shown)
+    return sent_before - _ON_ITS_WAY, next(first, len(run.watch.left()))
 
 
 def _of_run(run: PayloadRun, until_s: float, heard: Heard) -> list[str]:

@@ -88,11 +88,11 @@ class Outage(Step):
     def inject(self, world: World) -> None:
         world.link.gone(self.for_s)
         if self.telemetry:
-            world.wire.block()
+            world.wire.block(self)
 
     def mend(self, world: World) -> None:
         if self.telemetry:
-            world.wire.mend()
+            world.wire.mend(self)
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,10 @@ class TelemetryCut(Step):
     """The payload's Zenoh session is reset, and cannot come back meanwhile."""
 
     def inject(self, world: World) -> None:
-        world.wire.cut()
+        world.wire.cut(self)
 
     def mend(self, world: World) -> None:
-        world.wire.mend()
+        world.wire.mend(self)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class TelemetryBlocked(Step):
     """Its connection stays, and nothing comes through in either direction."""
 
     def inject(self, world: World) -> None:
-        world.wire.block()
+        world.wire.block(self)
 
     def mend(self, world: World) -> None:
-        world.wire.mend()
+        world.wire.mend(self)

@@ -74,12 +74,10 @@ class PayloadClock(Step):
     by_s: float = 3600.0
 
     def inject(self, world: World) -> None:
-        if world.shims:
-            world.shims["stepped_clock"].set(int(1e9 * self.by_s))
+        world.disturb(self, "stepped_clock", int(1e9 * self.by_s))
 
     def mend(self, world: World) -> None:
-        if world.shims:
-            world.shims["stepped_clock"].set(0)
+        world.disturb(self, "stepped_clock", 0)
 
 
 @dataclass(frozen=True)
@@ -118,12 +116,10 @@ class EncoderStalls(Step):
     STARTS: ClassVar[bool] = True
 
     def inject(self, world: World) -> None:
-        if world.shims:
-            world.shims["encoder_fault"].set(_ENCODER_GIVES_NONE)
+        world.disturb(self, "encoder_fault", _ENCODER_GIVES_NONE)
 
     def mend(self, world: World) -> None:
-        if world.shims:
-            world.shims["encoder_fault"].set(0)
+        world.disturb(self, "encoder_fault", 0)
 
 
 @dataclass(frozen=True)

@@ -77,12 +77,14 @@ def lacking(
     complaints = [file.problem for file in files if file.problem]
     kept = {frame for file in files for frame in file.frames}
     for file in files:
-        places = sorted(place[frame] for frame in file.frames if frame in place)
-        unknown = len(file.frames) - len(places)
-        if unknown:
-            complaints.append(f"{file.name}: {unknown} frames that never came")
-        if not places:
+        known = [index for index, frame in enumerate(file.frames) if frame in place]
+        if not known:
             continue
+        # Who listens beside it begins later, and ends earlier, than a recorder that is killed.
+        inner = file.frames[known[0] : known[-1] + 1]
+        if len(inner) > len(known):
+            complaints.append(f"{file.name}: {len(inner) - len(known)} frames that never came")
+        places = sorted(place[file.frames[index]] for index in known)
         begin, end = places[0], places[-1]
         missing = [one for one in came[begin : end + 1] if one.frame not in kept]
         if len(missing) > file.left_out:

@@ -15,6 +15,7 @@ import argparse
 import dataclasses
 import json
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -54,12 +55,18 @@ def main() -> int:
     place = Path(tempfile.mkdtemp(prefix="scenarios-", dir=arguments.keep))
     runner = Runner(place, arguments.seed)
     flights = grouped(scenarios, arguments.together)
-    for number, flight in enumerate(flights):
-        print(f"flight {number + 1} of {len(flights)}", flush=True)
-        runner.fly(flight, f"{number:02d}", shrink=arguments.shrink)
+    stopped = False
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a flight ends all that it started
+    try:
+        for number, flight in enumerate(flights):
+            print(f"flight {number + 1} of {len(flights)}", flush=True)
+            runner.fly(flight, f"{number:02d}", shrink=arguments.shrink)
+    except KeyboardInterrupt:
+        print("stopped; what had ended is told", file=sys.stderr)
+        stopped = True
     _table(runner.verdicts)
     _write(arguments.out, arguments.what, runner.verdicts, scenarios)
-    return 0 if all(verdict.holds for verdict in runner.verdicts) else 1
+    return 0 if all(verdict.holds for verdict in runner.verdicts) and not stopped else 1
 
 
 class Runner:
@@ -136,7 +143,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("what", choices=("matrix", "walks", "again"))
     parser.add_argument("file", nargs="?", type=Path, help="of `again`: a scenario as it was kept")
     parser.add_argument(
-        "--only", default="", metavar="NAME", help="scenarios with this in the name"
+        "--only", nargs="+", default=[], metavar="NAME", help="scenarios with this in the name"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the first walk")
     parser.add_argument("--walks", type=int, default=15, help="of 30 s each")
@@ -171,9 +178,11 @@ def _chosen(arguments: argparse.Namespace) -> list[Scenario]:
     if arguments.what == "walks":
         count, span_s = (LONG_WALKS, LONG_S) if arguments.long else (arguments.walks, WALK_S)
         return [drawn(arguments.seed + n, span_s) for n in range(count)]
-    scenarios = named(arguments.only)
+    scenarios = named(*arguments.only)
     if not scenarios:
-        raise StepError(f"--only {arguments.only!r}: no scenario has this in its name (--list)")
+        raise StepError(
+            f"--only {' '.join(arguments.only)}: no scenario has this in its name (--list)"
+        )
     return scenarios
 
 

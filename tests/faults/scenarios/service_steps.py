@@ -88,12 +88,10 @@ class GroundClock(Step):
     by_s: float = 3600.0
 
     def inject(self, world: World) -> None:
-        if world.shims:
-            world.shims["ground_clock"].set(int(1e9 * self.by_s))
+        world.disturb(self, "ground_clock", int(1e9 * self.by_s))
 
     def mend(self, world: World) -> None:
-        if world.shims:
-            world.shims["ground_clock"].set(0)
+        world.disturb(self, "ground_clock", 0)
 
 
 @dataclass(frozen=True)

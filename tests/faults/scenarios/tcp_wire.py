@@ -14,7 +14,7 @@ class TcpWire:
     """Relays connections from its own loopback `port` to another; a context manager.
 
     Cut, all connections are reset and none is taken. Blocked, they stay and nothing comes through:
-    it waits, as on a radio out of reach.
+    it waits, as on a radio out of reach. It is a cable again when all have mended what they did.
     """
 
     def __init__(self, to_port: int) -> None:
@@ -24,7 +24,8 @@ class TcpWire:
         self.port: int = self._listening.getsockname()[1]
         self._closing, self._open = threading.Event(), threading.Event()
         self._open.set()
-        self._is_cut = False
+        self._cutting: set[int] = set()
+        self._blocking: set[int] = set()
         self._lock = threading.Lock()
         self._sockets: set[socket.socket] = set()
         self._threads = [threading.Thread(target=self._accept, name="wire", daemon=True)]
@@ -41,23 +42,27 @@ class TcpWire:
             thread.join()
         self._listening.close()
 
-    def cut(self) -> None:
+    def cut(self, who: object = None) -> None:
         """Resets all connections, and takes no other."""
         with self._lock:
-            self._is_cut = True
+            self._cutting.add(id(who))
             for one in self._sockets:
                 with contextlib.suppress(OSError):
                     one.shutdown(socket.SHUT_RDWR)
 
-    def block(self) -> None:
+    def block(self, who: object = None) -> None:
         """Lets nothing through, in both directions."""
-        self._open.clear()
-
-    def mend(self) -> None:
-        """It is a cable again."""
         with self._lock:
-            self._is_cut = False
-        self._open.set()
+            self._blocking.add(id(who))
+            self._open.clear()
+
+    def mend(self, who: object = None) -> None:
+        """Takes back what somebody did."""
+        with self._lock:
+            self._cutting.discard(id(who))
+            self._blocking.discard(id(who))
+            if not self._blocking:
+                self._open.set()
 
     def _accept(self) -> None:
         while not self._closing.is_set():
@@ -66,7 +71,7 @@ class TcpWire:
             except OSError:
                 continue
             with self._lock:
-                far = None if self._is_cut else self._dial()
+                far = None if self._cutting else self._dial()
                 if far is None:
                     near.close()
                     continue

@@ -77,6 +77,7 @@ class World:
         self.service_runs = 0
         self._draw = random.Random(seed)
         self._options: dict[int, dict[str, str]] = {}
+        self._shimmed: dict[str, dict[int, int]] = {}
         self._impairments: dict[int, Impairment] = {}
         self._held: dict[str, set[int]] = {"payload": set(), "service": set()}
         self._stack = contextlib.ExitStack()
@@ -234,6 +235,14 @@ class World:
 
     def _tap(self, datagram: bytes, lost: bool) -> None:
         self.run.watch(datagram, lost)
+
+    def disturb(self, step: object, name: str, number: int) -> None:
+        """A step sets a shim's number, 0 no more; times of several steps add up."""
+        numbers = self._shimmed.setdefault(name, {})
+        numbers[id(step)] = number
+        if name in self.shims:
+            together = max if name == "encoder_fault" else sum
+            self.shims[name].set(together(numbers.values()))
 
     # The link
 
