@@ -76,9 +76,7 @@ def _toml_value(text: str, override: str) -> Any:
     try:
         return _parsed(f"value = {text}")["value"]
     except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
-        raise ConfigError(
-            f"--set {_shown(override)}: {_shown(text)} is not a TOML value"
-        ) from None
+        raise ConfigError(f"--set {_shown(override)}: {_shown(text)} is not a TOML value") from None
 
 
 def _value_or_text(text: str) -> Any:
