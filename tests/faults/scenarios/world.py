@@ -296,7 +296,8 @@ class World:
         until_s = time.monotonic() + limit_s
         while time.monotonic() < until_s:
             with contextlib.suppress(httpx.HTTPError, AssertionError):
-                if self.service.state()["recording"]["active"]:
+                recording = self.service.state()["recording"]  # None: it was not told yet
+                if recording is not None and recording["active"]:
                     return
                 self.service.client.post("/api/recording", json={"active": True})
             time.sleep(0.3)
