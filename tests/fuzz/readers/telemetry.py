@@ -1,0 +1,55 @@
+"""`ground_station.stream.telemetry`: what a listener keeps of payloads that say anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+from pieces import Picker
+
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.wire import messages
+from readers.messages import KINDS, text
+
+_NAMES = ("battery", "gate", "event", "pose", "autopilot", "health", "link", "alive", "command/x")
+
+
+@dataclasses.dataclass
+class _Sample:
+    key_expr: str
+    payload: _Sample | None = None
+    data: bytes = b""
+
+    def to_bytes(self) -> bytes:
+        return self.data
+
+
+def fuzz(data: bytes) -> None:
+    """A hundred messages of a few payloads; what is kept stays bounded and readable."""
+    picker = Picker(data)
+    listener = TelemetryListener.__new__(TelemetryListener)
+    listener._states, listener._changed = {}, threading.Condition()
+    listener._on_event = lambda *_: None
+    for _ in range(100):
+        if not picker.left():
+            break
+        name = picker.of(_NAMES)
+        payload = f"blimp-{picker.number(1)}" if picker.number(1) < 250 else picker.bytes(8).hex()
+        message = text(picker, picker.of(KINDS) if name == "battery" else _of(name))
+        listener._take(_Sample(f"blimp/{payload}/{name}", _Sample("", data=message)))
+    for payload in listener.payloads():
+        state = listener.state(payload)
+        assert state is not None
+        _ = state.frames, state.ssrc
+
+
+def _of(name: str) -> messages.Message:
+    return next((kind for kind in KINDS if f"blimp.{name}" == kind.SCHEMA), KINDS[2])
+
+
+def seeds() -> list[bytes]:
+    """A flight's beginning, of two payloads."""
+    return [
+        bytes([1, 1, 0, 0]) + bytes(16) + bytes([2, 1, 0, 0]) + bytes(8),
+        bytes([2, 1, 0, 0]) + bytes(8) + bytes([1, 2, 0, 0]) + bytes(16),
+    ]
