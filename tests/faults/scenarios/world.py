@@ -30,7 +30,7 @@ NAME = "blimp-1"
 RATE_HZ = 10.0
 SPEED = 0.5
 """Of the recorded flight: a machine that is busy, too, skips frames and still tracks."""
-_TICK_S = 0.05
+_TICK_S, _LOOK_S = 0.05, 0.5
 HOPELESS = 3
 """The payload's exit status by which systemd starts it anew."""
 _SHIMS = ("stepped_clock", "encoder_fault")
@@ -71,7 +71,9 @@ class World:
         self.ended_s: dict[str, list[Window]] = {"ground": [], "card": []}
         """When something ended a recording, and until when it may have, by whose it was."""
         self.intake_anew_s: list[float] = []
-        """When the intake was killed, alone or with the service."""
+        """When the intake was killed: alone, with the service, or by its parent for its silence."""
+        self._intake: tuple[Process, float] | None = None
+        self._looked_s = 0.0
         self.kept: dict[int, Any] = {}
         """What a step needs to mend itself, by its id()."""
         self.service_runs = 0
@@ -179,6 +181,7 @@ class World:
 
     def tend(self) -> None:
         """What an init system does: a payload that has ended, and is wanted, is started."""
+        self._follow_intake()
         run = self.run
         if run.ended is None and not run.process.running:
             run.note_end()
@@ -189,6 +192,19 @@ class World:
                 self.complain(f"the payload ended with {run.ended.status}: {run.ended.err[-300:]}")
         if run.ended is not None and not self._held["payload"]:
             self._fly()
+
+    def _follow_intake(self) -> None:
+        """Its parent ends one that a busy machine keeps silent for long, whatever is injected."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = now_s
+        found, before = self.child("intake"), self._intake
+        if before is not None and found != before[0]:
+            self.say("the intake's process ended")
+            self.intake_anew_s.append(before[1])
+            self.ended_s["ground"].append([before[1], now_s])
+        self._intake = None if found is None else (found, now_s)
 
     def _end_payload(self) -> None:
         try:
