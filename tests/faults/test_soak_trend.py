@@ -98,6 +98,21 @@ def test_one_step_in_the_middle_is_not_told_from_a_leak() -> None:
     assert word(values, matters=1.0) == SHORT
 
 
+def test_what_creeps_a_little_is_told_from_a_leak_that_matters() -> None:
+    """Pools that fill: 0.3 MB in an hour, each sample hanging on the one before."""
+    values = 33 + 0.3 * (1 - np.exp(-np.arange(HOUR) / 100)) + noise(HOUR, 0.0, 0.001)
+    assert word(values, matters=1.0) in (FLAT, SMALL)
+    assert word(10 * values, matters=1.0) in (SHORT, GROWS)
+
+
+def test_a_walk_without_aim_is_mostly_no_leak() -> None:
+    held = 0
+    for seed in range(40):
+        found = trend(series(np.cumsum(noise(HALF_HOUR, 0.0, 1.0, seed))))
+        held += found.low <= 0.0 <= found.high and math.isfinite(found.high)
+    assert held >= 28
+
+
 def test_one_step_early_in_a_long_run_is_forgiven() -> None:
     values = 80 + 2.0 * (np.arange(20 * HOUR) > HOUR) + noise(20 * HOUR, 0.0, 0.05)
     assert word(values, matters=1.0) == FLAT
