@@ -26,8 +26,8 @@ def check_name(name: str) -> str:
     """Returns an interface's name; raises `ConfigError` for one that cannot be."""
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"'wifi.interface' is {name!r}; expected a name of 1 to 15 letters, digits, '_', '-'"
-            " and '.', as wlan0"
+            f"'wifi.interface' is {name!r:.60}; expected a name of 1 to 15 letters, digits, '_',"
+            " '-' and '.', as wlan0"
         )
     return name
 

@@ -19,7 +19,7 @@ def check_payload_id(payload_id: str) -> str:
     """Returns the id; raises `TelemetryError` when it could not be one chunk of a key."""
     if not _PAYLOAD_ID.fullmatch(payload_id):
         raise TelemetryError(
-            f"payload_id {payload_id!r}: allowed are 1 to 32 of a-z, 0-9, - and _, "
+            f"payload_id {payload_id!r:.60}: allowed are 1 to 32 of a-z, 0-9, - and _, "
             "starting with a letter or digit"
         )
     return payload_id

@@ -63,17 +63,18 @@ def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or int(match[3]) > 65535:
         expected = "tls/HOST:PORT" if certified else "tcp/HOST:PORT"
-        raise TelemetryError(f"telemetry endpoint {endpoint!r}: expected {expected}")
+        raise TelemetryError(f"telemetry endpoint {endpoint!r:.80}: expected {expected}")
     scheme, host = match[1], match[2].strip("[]")
     if certified:
         if scheme != "tls":
             raise TelemetryError(
-                f"telemetry endpoint {endpoint!r}: with certificates only tls/HOST:PORT is allowed"
+                f"telemetry endpoint {endpoint!r:.80}: with certificates only tls/HOST:PORT"
+                " is allowed"
             )
         return match[2], int(match[3])
     if scheme == "tls":
         raise TelemetryError(
-            f"telemetry endpoint {endpoint!r}: tls needs a folder of certificates (blimp keys)"
+            f"telemetry endpoint {endpoint!r:.80}: tls needs a folder of certificates (blimp keys)"
         )
     try:
         loopback = ipaddress.ip_address(host).is_loopback
@@ -81,7 +82,7 @@ def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]
         loopback = host == "localhost"
     if not loopback:
         raise TelemetryError(
-            f"telemetry endpoint {endpoint!r}: only loopback is allowed without certificates"
+            f"telemetry endpoint {endpoint!r:.80}: only loopback is allowed without certificates"
         )
     return match[2], int(match[3])
 

@@ -226,8 +226,10 @@ def test_endpoints_and_certificates_must_fit(authority: Authority, tmp_path: Pat
         ("tcp/10.0.0.1:7447", False, "only loopback"),
         ("tcp/127.0.0.1:7447", True, "only tls/HOST:PORT"),
         ("tls/10.0.0.1:7447?x=1", True, "expected tls/HOST:PORT"),
+        ("tls/" + "a" * 50_000, True, "expected tls/HOST:PORT"),
     ):
-        with pytest.raises(TelemetryError, match=reason):
+        with pytest.raises(TelemetryError, match=reason) as error:
             check_endpoint(endpoint, certified=certified)
+        assert len(str(error.value)) < 300
     with pytest.raises(TelemetryError, match=r"'ca.pem' is missing"):
         open_session(listen=[FREE], certificates=tmp_path)
