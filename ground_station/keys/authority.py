@@ -53,7 +53,14 @@ class Authority:
             raise KeysError(f"{folder}: no authority here; make one with 'init'") from None
         except OSError as error:
             raise KeysError(f"{folder}: {error.strerror or error}") from None
-        except (ValueError, KeyError, TypeError, RecursionError, AttributeError):
+        except (
+            LookupError,
+            ValueError,
+            TypeError,
+            ArithmeticError,
+            RecursionError,
+            AttributeError,
+        ):
             known = False
         if not known:
             raise KeysError(f"{folder}/authority.json: not of schema {SCHEMA}")

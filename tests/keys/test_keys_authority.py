@@ -129,7 +129,12 @@ def test_check_finds_a_key_that_is_not_the_certificates(authority: Authority) ->
     assert authority.check(NOW) == ["authority 1: the private key is not the certificate's"]
 
 
-@pytest.mark.parametrize("body", [b"", b"\xff", b"[]", b"{}", b'{"schema": 3}', b"[" * 9999])
+ENDLESS = b'{"schema":"blimp.authority/1","members":{},"trusted":[1],"signing":1e999,"step":0}'
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"\xff", b"[]", b"{}", b'{"schema": 3}', b"[" * 9999, ENDLESS]
+)
 def test_a_hostile_folder_is_one_line(authority: Authority, body: bytes) -> None:
     (authority.folder / "authority.json").write_bytes(body)
     with pytest.raises(KeysError) as caught:
