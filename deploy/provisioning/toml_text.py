@@ -10,7 +10,7 @@ from typing import Any
 # rule (pi_firmware/wire/config.py); a test compares them.
 DEEPEST = 32
 TOO_DEEP = re.compile(
-    r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){%d}""" % DEEPEST
+    rf"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST}}}"""
 )
 _BOM = b"\xef\xbb\xbf"
 

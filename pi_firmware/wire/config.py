@@ -20,7 +20,7 @@ _MOST_BYTES = 4 << 20
 # Python's parser takes memory with the square of a dotted key's parts: 100 kB of them, gigabytes.
 _DEEPEST = 32
 _TOO_DEEP = re.compile(
-    r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){%d}""" % _DEEPEST
+    rf"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST}}}"""
 )
 
 
