@@ -88,7 +88,8 @@ def mode_of(args: argparse.Namespace) -> str | None:
     mode = asked[0] if asked else None
     allowed = set(_OF[mode]) if mode else {"json"}
     for name in sorted({name for names in _OF.values() for name in names} - allowed):
-        if getattr(args, name) not in (None, False):
+        value = getattr(args, name)
+        if value is not None and value is not False:
             homes = [_option(m) for m, names in _OF.items() if name in names]
             raise InputError(f"{_option(name)} is for {' and '.join(homes)}")
     flown = () if mode is None else ("recording", "demo", *(_FLOWN if mode != "make_case" else ()))

@@ -39,7 +39,7 @@ def _table(
     lines += _remark(remarks, name)
     prefix = f"{name}." if name else ""
     for item, value in plain:
-        if name in brief and value in (None, False):
+        if name in brief and (value is None or value is False):
             continue
         lines += [f"# {line}" for line in _wrapped(_about(item))]
         lines += _remark(remarks, prefix + item.name)

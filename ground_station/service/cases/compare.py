@@ -219,7 +219,7 @@ def _measured(a: dict[str, Figure], b: dict[str, Figure], allowed: Allowed) -> l
         "lost": allowed.over_share,
         "position_rmse_m": allowed.over_m,
         "rotation_rmse_deg": allowed.over_deg,
-        "position_m": allowed.over_max_m,
+        "tracking_worst_m": allowed.over_max_m,
         "latency_p50_ms": allowed.over_ms,
     }
     found = []

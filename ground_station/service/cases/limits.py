@@ -73,6 +73,7 @@ class Bounds(Limits):
         own = getattr(self, kind, None)
         if isinstance(own, KindLimits):
             given = {name: getattr(own, name) for name in NAMES}
-            values |= {name: value for name, value in given.items() if value not in (None, False)}
+            # By identity: a bound of 0 is a bound.
+            values |= {k: v for k, v in given.items() if v is not None and v is not False}
             values |= {name: False if name == "identical" else None for name in own.drop}
         return Limits(**values)

@@ -94,7 +94,7 @@ def _shares(outcome: Outcome) -> dict[str, Figure]:
     return found
 
 
-_OF_ERRORS = ("position_rmse_m", "rotation_rmse_deg", "position_worst_m", "position_m")
+_OF_ERRORS = ("position_rmse_m", "rotation_rmse_deg", "position_worst_m", "tracking_worst_m")
 
 
 def _errors(outcome: Outcome, reference: Reference | str | None) -> dict[str, Figure]:
@@ -122,7 +122,7 @@ def _errors(outcome: Outcome, reference: Reference | str | None) -> dict[str, Fi
         "position_rmse_m": Figure(position.rmse, told),
         "rotation_rmse_deg": Figure(rotation.rmse, told),
         "position_worst_m": Figure(position.max, told),
-        "position_m": worst,
+        "tracking_worst_m": worst,
     }
 
 
