@@ -50,4 +50,5 @@ READERS = (
     Reader("firewall", "the output of nft and iptables"),
     Reader("web", "the dashboard's HTTP API"),
     Reader("live", "the dashboard's WebSocket"),
+    Reader("cases", "replay cases, accepted runs and runs' folders"),
 )  # fmt: skip
