@@ -83,6 +83,7 @@ class Ground:
 
     def __init__(self, keys: Path) -> None:
         folder = keys / "ground" / "main"
+        self._closed = False
         self.telemetry = TelemetryListener(["tls/127.0.0.1:7447"], certificates=folder)
         self.video = Receiver(5600, queue_frames=8, color=False, srtp_keys=load_keys(folder))
 
@@ -90,8 +91,14 @@ class Ground:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.video.close()
-        self.telemetry.close()
+        self.close()
+
+    def close(self) -> None:
+        """Gives the ports away; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self.video.close()
+            self.telemetry.close()
 
     def state(self) -> PayloadState | None:
         return self.telemetry.state(PAYLOAD)

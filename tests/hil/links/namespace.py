@@ -1,0 +1,276 @@
+"""Payload and ground as two hosts: a network namespace for the firmware, a cable to this one.
+
+Off loopback nobody speaks without keys, so that a flight gets its own: mutual TLS and SRTP. What
+the cable does to packets is the kernel's netem, where there is one; an outage is the cable pulled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+from links.proxy import told
+
+from ground_station.errors import GroundStationError
+from ground_station.keys.authority import Authority
+from ground_station.service.cases.case import Link
+from ground_station.service.cases.outcome import Outage
+from ground_station.service.replay import PAYLOAD_ID
+from ground_station.service.stand import Stand
+from ground_station.stream.receiver import Receiver
+from ground_station.stream.srtp import load_keys
+from ground_station.stream.telemetry import TelemetryListener
+
+_TOOLS = ("ip", "tc", "unshare", "nsenter")
+_LIMIT_S = 30.0
+_PACKET_BYTES = 1400
+_END_S = 10.0
+
+
+class NamespaceError(GroundStationError):
+    """The namespace or its cable cannot be made; one line."""
+
+
+class NamespaceLink:
+    """One flight's two hosts; a context manager. `stand` is what is to be flown on."""
+
+    kind = "namespace"
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._stack = contextlib.ExitStack()
+        self._outages: list[Outage] = []
+        self._receiver: Receiver | None = None
+        self._firmware: _Firmware | None = None
+
+    def lacks(self) -> str:
+        """Why it cannot be flown here, in words; "" when it can."""
+        if os.geteuid() != 0:
+            return "network namespaces need root"
+        if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
+            return f"{', '.join(missing)}: not installed"
+        if _tried("unshare", "-n", "true"):
+            return "this machine allows no network namespace"
+        words = netem(self._link)
+        if isinstance(words, str):
+            return words
+        script = f"ip link set lo up && tc qdisc add dev lo root netem {' '.join(words)}"
+        if words and _tried("unshare", "-n", "sh", "-c", script):
+            return "this kernel has no sch_netem, or another one"
+        return ""
+
+    def __enter__(self) -> NamespaceLink:
+        with contextlib.ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="blimp-netns-")))
+            self._ground, self._payload = _keys(folder / "keys")
+            # It holds the namespace, ends with its standard input, and all with it.
+            holder = stack.enter_context(_Holder())
+            self._pid = holder.pid
+            number = os.getpid()
+            self._address = f"10.{200 + number // 250 % 50}.{number % 250}."
+            self._cable = f"hil{self._pid}"
+            _ip("link", "add", self._cable, "type", "veth", "peer", "name", "eth0", "netns",
+                str(self._pid))  # fmt: skip
+            _ip("address", "add", f"{self._address}1/30", "dev", self._cable)
+            _ip("link", "set", self._cable, "up")
+            self._inside("ip", "link", "set", "lo", "up")
+            self._inside("ip", "address", "add", f"{self._address}2/30", "dev", "eth0")
+            self._inside("ip", "link", "set", "eth0", "up")
+            if words := netem(self._link):
+                self._inside("tc", "qdisc", "add", "dev", "eth0", "root", "netem", *words)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def stand(self) -> Stand:
+        """The ground's ends on the cable, and the firmware in its namespace."""
+        return Stand(self._open, self._listen, self, self._fly)
+
+    @contextlib.contextmanager
+    def __call__(self, receiver_port: int) -> Iterator[int]:
+        ended = threading.Event()
+        thread = threading.Thread(target=self._pull, args=(ended,), daemon=True)
+        thread.start()
+        try:
+            yield receiver_port
+        finally:
+            ended.set()
+            thread.join()
+
+    def injected(self) -> str:
+        """What it was told to do, in one line."""
+        return told(self._link)
+
+    def counts(self) -> dict[str, int]:
+        """The kernel's, of the ground's end of the cable; empty without one."""
+        folder = Path("/sys/class/net") / getattr(self, "_cable", "none") / "statistics"
+        names = ("rx_packets", "rx_dropped", "tx_packets")
+        with contextlib.suppress(OSError, ValueError):
+            return {name: int((folder / name).read_text()) for name in names}
+        return {}
+
+    def outages(self) -> list[Outage]:
+        """When the cable was pulled, on this machine's wall clock."""
+        return list(self._outages)
+
+    def _open(self, queue_frames: int) -> Receiver:
+        host = f"{self._address}1"
+        keys = load_keys(self._ground)
+        self._receiver = Receiver(0, host, queue_frames=queue_frames, srtp_keys=keys)
+        return self._receiver
+
+    def _listen(self) -> TelemetryListener:
+        return TelemetryListener([f"tls/{self._address}1:0"], certificates=self._ground)
+
+    @contextlib.contextmanager
+    def _fly(self, config: dict[str, Any], folder: Path) -> Iterator[_Firmware]:
+        config = {
+            **config,
+            "link": {**config["link"], "host": f"{self._address}1"},
+            "telemetry": {**config["telemetry"], "certificates": str(self._payload)},
+        }
+        firmware = _Firmware(config, folder, ("nsenter", "-t", str(self._pid), "-n"))
+        try:
+            yield firmware
+        finally:
+            firmware.end()
+
+    def _pull(self, ended: threading.Event) -> None:
+        """Pulls the cable at the case's times from the first packet on."""
+        while self._receiver is None or self._receiver.counters.packets == 0:
+            if ended.wait(0.01):
+                return
+        first_s = time.monotonic()
+        for at_s, for_s in self._link.outages:
+            if ended.wait(max(0.0, first_s + at_s - time.monotonic())):
+                return
+            begin_ns = time.time_ns()
+            _ip("link", "set", self._cable, "down")
+            over = ended.wait(max(0.0, first_s + at_s + for_s - time.monotonic()))
+            _ip("link", "set", self._cable, "up")
+            self._outages.append(Outage(begin_ns, time.time_ns()))
+            if over:
+                return
+
+    def _inside(self, *words: str) -> None:
+        _run("nsenter", "-t", str(self._pid), "-n", *words)
+
+
+class _Holder:
+    """A process that is alone in a network namespace; a context manager."""
+
+    def __enter__(self) -> _Holder:
+        self._process = subprocess.Popen(
+            ["unshare", "-n", "sh", "-c", "echo ready; exec cat"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        assert self._process.stdout is not None
+        if self._process.stdout.readline() != b"ready\n":
+            self.__exit__()
+            raise NamespaceError("unshare -n: no network namespace")
+        self.pid = self._process.pid
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+class _Firmware:
+    """`python -m pi_firmware` behind a prefix; `Running` of a stand."""
+
+    def __init__(self, config: dict[str, Any], folder: Path, prefix: tuple[str, ...]) -> None:
+        path, self._log = folder / "payload.toml", folder / "firmware.log"
+        path.write_bytes(tomli_w.dumps(config).encode())
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [*prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+
+    def check(self) -> None:
+        """Raises `NamespaceError` with the firmware's last line when it ended with an error."""
+        if status := self._process.poll():
+            lines = self._log.read_text(errors="replace").strip().splitlines()
+            said = lines[-1] if lines else "nothing"
+            raise NamespaceError(f"the firmware ended with status {status}: {said[:300]}")
+
+    def running(self) -> bool:
+        """Whether the process is alive."""
+        return self._process.poll() is None
+
+    def pid(self) -> int | None:
+        """Its id: nsenter becomes it."""
+        return self._process.pid
+
+    def end(self) -> None:
+        """Ends it in order, or else at once."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+
+def netem(link: Link) -> list[str] | str:
+    """The link's settings in netem's words (tc-netem(8)); why not, for what it does otherwise."""
+    if link.reorder:
+        return "netem reorders by a delay and not by packets; kind 'proxy' does"
+    if link.loss and link.burst_start:
+        return "netem has either 'loss' or bursts, not both; kind 'proxy' has"
+    words: list[str] = []
+    if link.delay_s or link.jitter_s:
+        half_s = link.jitter_s / 2  # netem's jitter goes both ways
+        words += ["delay", f"{1e3 * (link.delay_s + half_s):g}ms", f"{1e3 * half_s:g}ms"]
+    if link.loss:
+        words += ["loss", "random", f"{100 * link.loss:g}%"]
+    if link.burst_start:
+        shares = (link.burst_start, link.burst_end, link.burst_loss, 0.0)
+        words += ["loss", "gemodel", *(f"{100 * share:g}%" for share in shares)]
+    if link.duplicate:
+        words += ["duplicate", f"{100 * link.duplicate:g}%"]
+    if link.rate_kbps:
+        queue = max(1, round(1e3 * link.rate_kbps * link.queue_s / 8 / _PACKET_BYTES))
+        words += ["rate", f"{link.rate_kbps:g}kbit", "limit", str(queue)]
+    return [*words, "seed", str(link.seed)] if words else []
+
+
+def _keys(folder: Path) -> tuple[Path, Path]:
+    """Throw-away certificate folders of ground and payload."""
+    authority = Authority.create(folder)
+    ground = authority.add("ground", "main")
+    payload = authority.add("payload", PAYLOAD_ID)
+    return ground, payload
+
+
+def _ip(*words: str) -> None:
+    _run("ip", *words)
+
+
+def _run(*words: str) -> None:
+    done = subprocess.run(
+        words, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=_LIMIT_S,
+        check=False,
+    )  # fmt: skip
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no word"])[-1]
+        raise NamespaceError(f"{' '.join(words[:4])}: {said}")
+
+
+def _tried(*words: str) -> bool:
+    """Whether a command fails."""
+    return bool(subprocess.run(words, capture_output=True, check=False).returncode)
