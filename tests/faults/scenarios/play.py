@@ -15,7 +15,7 @@ from scenarios.burden import Burden
 from scenarios.camera import Cameras
 from scenarios.judge import TRACKING, Verdict, judge
 from scenarios.step import Scenario, as_json
-from scenarios.world import NAME, World, tick
+from scenarios.world import NAME, RATE_HZ, World, tick
 
 RECOVERED_S, STARTED_S = 10.0, 25.0
 """Bounds for all to be back after the last fault, without and with a process that starts anew.
@@ -35,7 +35,12 @@ class Back:
 
 
 def play(
-    folder: Path, cameras: Cameras, scenarios: Sequence[Scenario], *, seed: int = 0
+    folder: Path,
+    cameras: Cameras,
+    scenarios: Sequence[Scenario],
+    *,
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
 ) -> list[Verdict]:
     """The scenarios in one flight: each has its own recovery, and all share the flight's account.
 
@@ -48,6 +53,7 @@ def play(
         disk_MB=max(one.disk_MB for one in scenarios),
         foxglove=any(one.foxglove for one in scenarios),
         seed=seed,
+        rate_hz=rate_hz,
     )
     try:
         with world:

@@ -31,7 +31,7 @@ from scenarios.matrix import MATRIX, named
 from scenarios.play import RECOVERED_S, STARTED_S, found, play
 from scenarios.step import Scenario, StepError, as_json, from_json
 from scenarios.walk import WALK_S, drawn, shrunk
-from scenarios.world import shims_there
+from scenarios.world import RATE_HZ, shims_there
 
 LONG_WALKS, LONG_S = 60, 120.0
 BAD_INPUT = 2
@@ -53,7 +53,7 @@ def main() -> int:
         print("left out: a disk of its own needs root and unshare(2)", flush=True)
         scenarios = [one for one in scenarios if not one.disk_MB]
     place = Path(tempfile.mkdtemp(prefix="scenarios-", dir=arguments.keep))
-    runner = Runner(place, arguments.seed)
+    runner = Runner(place, arguments.seed, arguments.rate_hz)
     flights = grouped(scenarios, arguments.together)
     stopped = False
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a flight ends all that it started
@@ -72,9 +72,9 @@ def main() -> int:
 class Runner:
     """Flies scenarios and prints what came of each."""
 
-    def __init__(self, place: Path, seed: int) -> None:
+    def __init__(self, place: Path, seed: int, rate_hz: float) -> None:
         self.verdicts: list[Verdict] = []
-        self._place, self._seed = place, seed
+        self._place, self._seed, self._rate_hz = place, seed, rate_hz
         self._cameras = Cameras(place)
 
     def fly(self, flight: Sequence[Scenario], name: str, *, shrink: bool) -> None:
@@ -98,14 +98,15 @@ class Runner:
             for step in scenario.steps:
                 print(f"      {step}", flush=True)
         began_s = time.monotonic()
-        verdicts = play(self._place / name, self._cameras, flight, seed=self._seed)
+        folder = self._place / name
+        verdicts = play(folder, self._cameras, flight, seed=self._seed, rate_hz=self._rate_hz)
         load = os.getloadavg()[0]
         for verdict in verdicts:
             verdict.figures |= {"flight_s": round(time.monotonic() - began_s, 1), "load": load}
         for line in found(verdicts):
             print(f"  BROKEN {line}", flush=True)
         if not all(verdict.holds for verdict in verdicts):
-            print(f"  kept: {self._place / name}", flush=True)
+            print(f"  kept: {folder}", flush=True)
         return verdicts
 
     def _shrink(self, scenario: Scenario, name: str) -> None:
@@ -149,6 +150,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--walks", type=int, default=15, help="of 30 s each")
     long = f"{LONG_WALKS} walks of {LONG_S:g} s"
     parser.add_argument("--long", action="store_true", help=long)
+    parser.add_argument("--rate-hz", type=float, default=RATE_HZ, help="the payload's, 2 to 30")
     parser.add_argument("--together", type=int, default=0, help="scenarios a flight (6; walks: 1)")
     parser.add_argument("--shrink", action="store_true", help="finds the fewest steps that fail")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where folders are kept")
@@ -161,6 +163,8 @@ def _arguments() -> argparse.Namespace:
         parser.error("again, and only again, takes a FILE")
     if arguments.keep is not None and not arguments.keep.is_dir():
         parser.error(f"--keep {arguments.keep}: no such folder")
+    if not 2 <= arguments.rate_hz <= 30:
+        parser.error("--rate-hz: 2 to 30")
     if not 0 <= arguments.together <= 100:
         parser.error("--together: 1 to 100")
     if arguments.together == 0:

@@ -59,6 +59,7 @@ class World:
     def __init__(
         self, folder: Path, cameras: Cameras, *, disk_MB: int = 0, foxglove: bool = False,
         seed: int = 0,
+        rate_hz: float = RATE_HZ,
     ) -> None:  # fmt: skip
         self.folder = folder
         self.cameras = cameras
@@ -77,6 +78,7 @@ class World:
         self.kept: dict[int, Any] = {}
         """What a step needs to mend itself, by its id()."""
         self.service_runs = 0
+        self._rate_hz = rate_hz
         self._draw = random.Random(seed)
         self._options: dict[int, dict[str, str]] = {}
         self._shimmed: dict[str, dict[int, int]] = {}
@@ -219,14 +221,14 @@ class World:
             options |= more
         camera = self.cameras.get(options.pop("camera"))
         ssrc = int(options.pop("ssrc"))
-        rate_hz = RATE_HZ / SPEED  # of the recording's own seconds
+        rate_hz = self._rate_hz / SPEED  # of the recording's own seconds
         flies = camera.uri.startswith("replay:")
         pace = f"&rate_hz={rate_hz:g}&speed={SPEED:g}" if flies else ""
         folder = self.folder / f"payload-{len(self.runs)}"
         settings = {
             "payload_id": NAME,
             "camera.uri": camera.uri + pace,
-            "camera.rate_hz": f"{RATE_HZ:g}",
+            "camera.rate_hz": f"{self._rate_hz:g}",
             "link.port": str(self.link.port),
             "link.ssrc": str(ssrc),
             "telemetry.connect": json.dumps([f"tcp/127.0.0.1:{self.wire.port}"]),
