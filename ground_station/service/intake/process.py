@@ -12,7 +12,7 @@ from typing import Any
 
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
-from ground_station.service import notes
+from ground_station.service import memory, notes
 from ground_station.service.intake import poses, questions
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
@@ -243,6 +243,7 @@ class Intake:
             elif was_alive and not payload.alive:
                 text = f"{payload.id} is gone"
                 self._event("intake", notes.WARNING, "payload-gone", text, payload.id)
+                memory.give_back()
             payload.follow(self.video.stream_of(payload.id))
             stream = payload.stream
             self._tell(payload.id, "stream-problem", stream.problem if stream else "")
