@@ -23,7 +23,7 @@ RECOVERED_S, STARTED_S = 10.0, 25.0
 Of a machine without other work; where there is some they are stretched by its burden.
 """
 _STILL_S, _LOOK_S = 1.0, 0.5
-_PAYLOAD_FRESH_S = 2.0
+_PAYLOAD_FRESH_S, _NOISE_S = 5.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -174,8 +174,8 @@ def _lacks(world: World, since_s: float) -> str:
 
 
 def _talks(health: dict[str, object] | None, world: World) -> bool:
-    """Whether the payload's newest process is the one that was heard of last."""
+    """Whether what was heard last is of the payload's newest process, and not of one before it."""
     uptime_s = health.get("uptime_s") if health else None
     if not isinstance(uptime_s, float | int):
         return False
-    return abs(time.monotonic() - world.run.began_s - uptime_s) < 10.0
+    return time.monotonic() - uptime_s > world.run.began_s - _NOISE_S
