@@ -12,13 +12,12 @@ Status 1: an axis was not measured to its end.
 
 from __future__ import annotations
 
-import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from limits_axes import AXES, Axis, Conditions, chosen
 from limits_search import Found, search
@@ -26,6 +25,7 @@ from limits_stand import Flight, Measured, TrialError, measure
 from limits_store import Store, read
 from limits_table import QUIET_CORES, accept, render
 from limits_throttle import method
+from soaking.arguments import Parser
 
 from ground_station.errors import GroundStationError
 from ground_station.files import write_text
@@ -36,14 +36,6 @@ WHOLE_S, QUICK_S = 32.0, 16.0
 BUSY_LOAD = 0.5
 
 Measure = Callable[[Flight, Conditions, int], Measured]
-
-
-class Parser(argparse.ArgumentParser):
-    """Refuses in one line, with status 2."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message}", file=sys.stderr)
-        sys.exit(2)
 
 
 def parser() -> Parser:
