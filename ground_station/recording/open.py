@@ -60,4 +60,4 @@ def parse_range(text: str) -> FrameRange:
         step = int(match[3] or 1)
         if step >= 1 and (stop is None or start < stop):
             return FrameRange(start, stop, step)
-    raise InputError(f"the range {text!r} is not A:B or A:B:S with 0 <= A < B and S >= 1")
+    raise InputError(f"the range {text!r:.60} is not A:B or A:B:S with 0 <= A < B and S >= 1")

@@ -314,7 +314,7 @@ def _value(value: Any, kind: Any, what: str) -> Any:
         if not isinstance(value, dict):
             raise TelemetryError(f"{what} must be an object, not {str(value)[:60]!r}")
         item = typing.get_args(kind)[1]
-        return {str(k): _value(v, item, f"{what}.{k}") for k, v in value.items()}
+        return {str(k): _value(v, item, f"{what}[{k!r:.40}]") for k, v in value.items()}
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**1000 else math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

@@ -70,7 +70,8 @@ def test_fields_that_an_older_writer_did_not_send_get_their_default() -> None:
         (messages.Gate, changed(GATE, sequence=True), "'sequence' must be int"),
         (messages.Gate, changed(GATE, passed=1), "'passed' must be bool"),
         (messages.Event, changed(EVENT, values=[1]), "'values' must be an object"),
-        (messages.Event, changed(EVENT, values={"a": "b"}), "'values'.a must be int"),
+        (messages.Event, changed(EVENT, values={"a": "b"}), "'values'['a'] must be int"),
+        (messages.Event, changed(EVENT, values={"a\n" * 99: "b"}), r"'values'['a\na\na"),
     ],
 )
 def test_a_wrong_message_is_refused_by_name(

@@ -142,6 +142,12 @@ def test_an_impossible_rate_is_refused(folder: Path, rate_hz: float) -> None:
         open_input(folder, rate_hz=rate_hz)
 
 
+@pytest.mark.parametrize("text", ["", "5", "5:3", "1:2:0", "-1:2", "²:3", "1" * 30_000 + ":", "\n"])
+def test_a_range_that_is_none_is_refused_in_one_short_line(text: str) -> None:
+    with pytest.raises(InputError, match=r"^the range [^\n]{1,150}$"):
+        parse_range(text)
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60), st.integers(1, 9), st.integers(0, 80))
 def test_a_range_takes_what_a_slice_takes(start: int, length: int, step: int, n: int) -> None:
