@@ -137,6 +137,15 @@ def test_a_pose_that_is_not_finite_is_no_pose_and_fails() -> None:
     assert rows["position_rmse_m_max"].holds is True
 
 
+@pytest.mark.parametrize("place", [1e308, np.inf, 1e9])
+def test_a_pose_that_is_nowhere_is_no_pose(place: float) -> None:
+    wTc = stand.true_pose(5)
+    wTc[0, 3] = place
+    run = stand.outcome([stand.row(k, wTc=wTc) if k == 5 else stand.row(k) for k in range(60)])
+    rows = rows_of(run, position_rmse_m_max=1.0)
+    assert rows["poses not finite"].value == 1 and rows["poses not finite"].holds is False
+
+
 def test_latency_is_not_measured_by_a_clock_that_never_answered() -> None:
     run = stand.outcome([stand.row(k, captured_ns=frames.UNKNOWN) for k in range(60)])
     row = rows_of(run, latency_p50_ms_max=1e9)["latency_p50_ms_max"]
@@ -217,6 +226,7 @@ def test_counts_that_never_came_do_not_hold() -> None:
         ({"health": None}, "health", "no health message came"),
         ({"health": {"time_ns": 1, "uptime_s": 2.0, "cpu": 1.5}}, "health", "cpu is 1.5"),
         ({"health": {"time_ns": 1, "uptime_s": 2.0, "odd": float("inf")}}, "health", "odd is inf"),
+        ({"battery": {"time_ns": 1, "voltage": 10**400}}, "battery", "allowed: 1 to 60"),
         ({"refused": 2}, "refused", ""),
     ],
 )

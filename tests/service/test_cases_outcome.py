@@ -162,6 +162,7 @@ def test_a_table_cut_anywhere_is_refused_or_shorter(tmp_path: Path) -> None:
         (b'{"sconds": 1}', "unknown key 'sconds'"),
         (b'{"schema": "blimp.outcome/2"}', "'schema' is 'blimp.outcome/2'"),
         (b'{"accounts": {"sent": 1.5}}', "'accounts.sent' must be a whole number"),
+        (b'{"accounts": {"sent": 1%s}}' % (b"0" * 400), "'accounts.sent' is a number of"),
         (b'{"outages": [{"begin_ns": -1}]}', "'begin_ns' is -1"),
         (b'{"outages": [3]}', "'outages'[0] must be"),
         (b'{"payload_side": {"memory_MB": "much"}}', "'memory_MB' must be a number"),
@@ -175,6 +176,17 @@ def test_a_result_that_is_none_is_refused_in_one_line(
     with pytest.raises(BlimpError) as error:
         read_outcome(tmp_path)
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_quaternion_that_is_none_is_no_pose(tmp_path: Path) -> None:
+    """As another's program, or a flipped bit, may have written it."""
+    frames.write_csv(tmp_path / "f.csv", frames.table([stand.row(k) for k in range(3)]))
+    lines = (tmp_path / "f.csv").read_text().splitlines()
+    cells = lines[2].split(",")
+    cells[11:15] = ["0.0"] * 4
+    (tmp_path / "f.csv").write_text("\n".join([*lines[:2], ",".join(cells), lines[3]]) + "\n")
+    read = frames.read_csv(tmp_path / "f.csv")
+    assert read.finite.tolist() == [True, False, True] and len(read.trajectory()) == 2
 
 
 def test_a_folder_without_its_last_file_is_no_outcome(tmp_path: Path) -> None:

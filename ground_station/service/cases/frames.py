@@ -29,6 +29,7 @@ _TIMES = ("sequence", "time_ns", "captured_ns", "arrival_ns", "done_ns")
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 COLUMNS = (*_TIMES, "state", "reason", "relocalized", *_POSE, "pose_sha256")
 _MOST_BYTES = 256 << 20
+_FARTHEST_M = 1e7
 _STATES = tuple(state.value for state in State)
 
 
@@ -65,9 +66,11 @@ class Frames:
 
     @property
     def finite(self) -> npt.NDArray[np.bool_]:
-        """(N,), which have a pose of finite numbers."""
-        numbers = np.hstack([self.position_m, self.quaternion_xyzw])
-        return np.asarray(self.localized & np.isfinite(numbers).all(axis=1))
+        """(N,), which have a pose that can be one: finite, on this Earth, of a unit quaternion."""
+        with np.errstate(over="ignore", invalid="ignore"):  # a comparison with NaN is False
+            near = (np.abs(self.position_m) <= _FARTHEST_M).all(axis=1)
+            unit = np.abs(np.linalg.norm(self.quaternion_xyzw, axis=1) - 1.0) <= 1e-3
+        return np.asarray(self.localized & near & unit)
 
     def called(self, state: str) -> npt.NDArray[np.bool_]:
         """(N,), which have this state."""

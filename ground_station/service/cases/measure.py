@@ -182,6 +182,8 @@ def _resources(outcome: Outcome) -> dict[str, Figure]:
 
 def _battery(outcome: Outcome) -> Figure:
     volt = (outcome.run.battery or {}).get("voltage")
-    if isinstance(volt, int | float) and not isinstance(volt, bool):
-        return Figure(float(volt), "its last message")
-    return Figure(None, "no battery message came")
+    if volt is None:
+        return Figure(None, "no battery message came")
+    if isinstance(volt, bool) or not isinstance(volt, int | float) or not abs(volt) < 1e6:
+        return Figure(None, f"the voltage is {str(volt)[:24]!r}")
+    return Figure(float(volt), "its last message")

@@ -12,6 +12,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import yaml
@@ -33,18 +34,23 @@ FLOORPLAN, PICTURE = "floorplan.yaml", "floorplan.png"
 _MOST_BYTES = 16 << 20
 
 
+def _count(doc: str) -> Any:
+    """A number of frames; one that is reckoned may come out negative, and is then told."""
+    return key(0, doc, low=-(2**53), high=2**53)
+
+
 @dataclass(frozen=True)
 class Accounts:
     """Frames by what became of them, as `LiveResult.accounts` names them."""
 
-    captured: int = key(0, "taken by the camera")
-    gated: int = key(0, "held back by the gate")
-    discarded: int = key(0, "passed the gate and never left the encoder")
-    sent: int = key(0, "left the payload")
-    received: int = key(0, "decoded at the ground")
-    lost: int = key(0, "sent and not received")
-    dropped: int = key(0, "received and overtaken by newer ones")
-    localized: int = key(0, "with a pose")
+    captured: int = _count("taken by the camera")
+    gated: int = _count("held back by the gate")
+    discarded: int = _count("passed the gate and never left the encoder")
+    sent: int = _count("left the payload")
+    received: int = _count("decoded at the ground")
+    lost: int = _count("sent and not received")
+    dropped: int = _count("received and overtaken by newer ones")
+    localized: int = _count("with a pose")
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class Run:
     outages: list[dict] = key([], "each an `Outage`")
     battery: dict | None = key(None, "the last message")
     health: dict | None = key(None, "the last message")
-    refused: int | None = key(None, "messages that were not as agreed", low=0)
+    refused: int | None = key(None, "messages that were not as agreed", low=0, high=2**53)
     payload_side: dict = key({}, "a `Side`")
     ground_side: dict = key({}, "a `Side`")
     versions: dict = key({}, "of programs")

@@ -57,5 +57,5 @@ def trouble(kind: str, message: dict[str, Any] | None, ranges: dict[str, Range])
         if isinstance(value, bool) or not isinstance(value, int | float):
             return f"{name} is {str(value)[:40]!r}, not a number"
         if not low <= value <= high:
-            return f"{name} is {value:g}; allowed: {low:g} to {high:g}"
+            return f"{name} is {str(value)[:24]}; allowed: {low:g} to {high:g}"
     return ""
