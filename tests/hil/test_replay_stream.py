@@ -16,6 +16,7 @@ from ground_station.localization.settings import load_preset
 from ground_station.mapping import store
 from ground_station.recording.flight import trajectory_of
 from ground_station.service import flight_report
+from ground_station.service.cases.outcome import read_outcome
 from ground_station.service.replay import ReplayResult, replay, settings_for
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
@@ -110,6 +111,13 @@ def test_the_command_writes_results_and_report(tmp_path: Path) -> None:
     assert results["stage_p99_ms"]["features"] >= results["stage_ms"]["features"] > 0
     page = (tmp_path / "report.html").read_text()
     assert "simulated" in page.lower() and "<script" not in page
+    outcome = read_outcome(tmp_path)
+    assert len(outcome.frames) + results["frames"]["dropped"] == results["frames"]["received"]
+    assert outcome.run.health is not None and outcome.run.battery is not None
+    assert outcome.truth is not None and outcome.floorplan is not None
+    for side in (outcome.side("payload"), outcome.side("ground")):
+        assert side.memory_MB is not None and side.memory_MB > 10
+        assert side.cpu is not None and side.cpu > 0
 
 
 def test_a_recording_without_truth_needs_a_first_pose(tmp_path: Path) -> None:
