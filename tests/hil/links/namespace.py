@@ -35,6 +35,7 @@ _TOOLS = ("ip", "tc", "unshare", "nsenter")
 _LIMIT_S = 30.0
 _PACKET_BYTES = 1400
 _END_S = 10.0
+_LOADED_S = 240.0
 
 
 class NamespaceError(GroundStationError):
@@ -143,6 +144,7 @@ class NamespaceLink:
         }
         firmware = _Firmware(config, folder, ("nsenter", "-t", str(self._pid), "-n"))
         try:
+            firmware.wait_loaded()
             yield firmware
         finally:
             firmware.end()
@@ -199,6 +201,15 @@ class _Firmware:
                 [*prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
             )  # fmt: skip
+
+    def wait_loaded(self) -> None:
+        """Waits for its first words; raises `NamespaceError` when it fails or takes too long."""
+        until_s = time.monotonic() + _LOADED_S
+        while not self._log.read_bytes().startswith(b"payload "):
+            self.check()
+            if not self.running() or time.monotonic() > until_s:
+                raise NamespaceError(f"the firmware did not start within {_LOADED_S:g} s")
+            time.sleep(0.05)
 
     def check(self) -> None:
         """Raises `NamespaceError` with the firmware's last line when it ended with an error."""
