@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
-MOST = 8.0
+MOST = 5.0
 """No bound is stretched farther."""
 
 

@@ -91,6 +91,7 @@ def _begin(world: World, verdict: Verdict) -> bool:
     back = recovery(world, began_s, STARTED_S)
     if back.took_s is None:
         lacks = _lacks(world, began_s)
+        verdict.figures |= {"burden": round(back.factor, 2)}
         verdict.broken["recovery"].append(f"never tracked from the start on: {lacks}")
         return False
     world.say(f"tracked {back.took_s:.1f} s after the start, burden {back.factor:.1f}")
