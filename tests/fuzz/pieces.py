@@ -123,7 +123,8 @@ def odd(picker: Picker, depth: int = 0) -> Any:
         names = [picker.bytes(3).decode("latin-1") for _ in range(picker.number(1) % 8)]
         return {name: odd(picker, depth + 1) for name in names}
     value: Any = []
-    for _ in range(picker.number(2) % 3000):  # as deep as a parser may go
+    levels = picker.number(2) % 3000  # as deep as a parser may go, once in a value
+    for _ in range(0 if depth else levels):
         value = [value]
     return value
 
