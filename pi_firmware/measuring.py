@@ -45,8 +45,11 @@ def description(camera: CameraSettings) -> str:
     )
 
 
-def attach(pipeline: Any, camera: CameraSettings, measured: Measured) -> None:
-    """Has `measured` called with each frame's scaled luma (H, W) and its running time, ns."""
+def attach(pipeline: Any, camera: CameraSettings, measured: Measured) -> Callable[[], None]:
+    """Has `measured` called with each frame's scaled luma (H, W) and its running time, ns.
+
+    What it gives ends that, and lets go of `measured`.
+    """
     gst = gstreamer.load()
     width_px, height_px = low_resolution_px(camera)
     size = width_px * height_px
@@ -58,7 +61,8 @@ def attach(pipeline: Any, camera: CameraSettings, measured: Measured) -> None:
         return gst.PadProbeReturn.OK
 
     pad = pipeline.get_by_name("luma").get_static_pad("sink")
-    pad.add_probe(gst.PadProbeType.BUFFER, on_luma)
+    number = pad.add_probe(gst.PadProbeType.BUFFER, on_luma)
+    return lambda: pad.remove_probe(number)
 
 
 def running_ns(gst: Any, pad: Any, buffer: Any) -> int:

@@ -98,6 +98,9 @@ class Media:
         self._last_idr_ns = 0
         self._last_passed_ns: int | None = None
         self._stopped = False
+        self._attached: list[Callable[[], None]] = []
+        """Takes off each callback that the pipeline holds: with one left, neither it nor its
+        descriptors would ever be freed."""
         self._pipeline = self._build()
 
     @property
@@ -134,7 +137,11 @@ class Media:
         self._stopped = True  # what hangs may come back to life, and must count no more
         self.counters.discarded += len(self._in_encoder)
         self._in_encoder.clear()
-        return not stopping.is_alive()
+        if stopping.is_alive():
+            return False
+        while self._attached:
+            self._attached.pop()()
+        return True
 
     def set_bitrate(self, kbps: int) -> int:
         """Asks the encoder for this bit rate, within the configured bounds; returns the one set."""
@@ -169,9 +176,15 @@ class Media:
         )
         element = pipeline.get_by_name("encoder")
         self._encoder = encoder.Encoder(element, settings.encoder, source.rate_hz)
-        measuring.attach(pipeline, settings.camera, self._on_luma)
-        element.get_static_pad("sink").add_probe(self._gst.PadProbeType.BUFFER, self._on_frame)
-        pipeline.get_by_name("encoded").connect("new-sample", self._on_encoded)
+        luma = measuring.attach(pipeline, settings.camera, self._on_luma)
+        pad, sink = element.get_static_pad("sink"), pipeline.get_by_name("encoded")
+        probe = pad.add_probe(self._gst.PadProbeType.BUFFER, self._on_frame)
+        handler = sink.connect("new-sample", self._on_encoded)
+        self._attached += [
+            luma,
+            lambda: pad.remove_probe(probe),
+            lambda: sink.disconnect(handler),
+        ]
         source.attach(pipeline)
         return pipeline
 

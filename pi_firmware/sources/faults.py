@@ -52,7 +52,7 @@ class Faults:
         hangs_s, delivers_s = self._ahead(self._hangs)
         if gone_s == hangs_s == math.inf:
             return
-        element = pipeline.get_by_name("source")
+        source = pipeline.get_by_name("source").get_static_pad("src")
         result = gstreamer.load().PadProbeReturn
         kind = gstreamer.load().PadProbeType.BUFFER
         is_gone = False
@@ -62,11 +62,12 @@ class Faults:
             elapsed_s = time.monotonic() - self._first_s
             if not is_gone and elapsed_s >= gone_s:
                 is_gone = True
-                post_error(element, GONE)
+                # Not an element of this closure: it and the pad would keep each other.
+                post_error(pad.get_parent_element(), GONE)
             hangs = hangs_s <= elapsed_s < delivers_s
             return result.DROP if is_gone or hangs else result.OK
 
-        element.get_static_pad("src").add_probe(kind, on_frame)
+        source.add_probe(kind, on_frame)
 
     def frames(self, duration_s: float, rate_hz: float) -> int | None:
         """How many frames are left of so many seconds since the first opening; None: no end."""

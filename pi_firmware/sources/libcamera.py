@@ -94,6 +94,8 @@ class LibcameraSource(LiveSource):
         self._uri = uri
         self._controls = controls(camera, mode)
         self._element: Any = None
+        self._pad: Any = None
+        self._probe = 0
         self.dmabuf = True
 
     def attach(self, pipeline: Any) -> None:
@@ -111,7 +113,8 @@ class LibcameraSource(LiveSource):
         if self._controls:
             self._verify_taken(gst)
         kind = gst.PadProbeType.EVENT_DOWNSTREAM
-        self._element.get_static_pad("src").add_probe(kind, self._on_event)
+        self._pad = self._element.get_static_pad("src")
+        self._probe = self._pad.add_probe(kind, self._on_event)
 
     def told(self) -> tuple[float | None, float | None]:
         """What the camera's metadata says; None for both where it says nothing.
@@ -135,6 +138,9 @@ class LibcameraSource(LiveSource):
         return message
 
     def close(self) -> None:
+        if self._pad is not None:  # else the pipeline and this source would keep each other
+            self._pad.remove_probe(self._probe)
+            self._pad = None
         if self._element is not None:
             self._element.set_state(gstreamer.load().State.NULL)
         super().close()
