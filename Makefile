@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service install-service \
+.PHONY: help setup demo serve test check bench budget soak soak-service limits install-service \
   uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
@@ -69,9 +69,13 @@ bench: setup  ## Measure what each step of localizer and payload costs, in ratio
 budget: setup  ## Reckon the default build: table and plots in out/budget; status 1 without margin
 	@.venv/bin/python -m hw budget --out out/budget
 
-soak: setup  ## Fly the firmware 30 minutes over a lossy link: memory, clock, every frame's account
+soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, clock, each frame told
 	@mkdir -p out
-	@.venv/bin/python tests/faults/soak.py --minutes 30 --loss 0.02 --out out/soak.json
+	@.venv/bin/python tests/faults/soak.py --hours "$(or $(HOURS),0.5)" --loss 0.02 --out out/soak.json
+
+limits: setup  ## Search what loss, delay, bit rate, CPU and payloads the system bears: ONLY=loss,rate
+	@mkdir -p out
+	@.venv/bin/python tests/hil/limits.py --out out/limits.json $(if $(ONLY),--only "$(ONLY)") $(OPTIONS)
 
 sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed seeds (about 10 minutes)
 	@$(BLIMP) simulate --sample maps/atrium
@@ -81,9 +85,9 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
 	@sh tests/pi_firmware/virtual_camera/setup.sh
 
-soak-service: setup  ## The same for the whole service: an hour with a payload that comes and goes
+soak-service: setup  ## The same for the whole service, HOURS=1, with a payload that comes and goes
 	@mkdir -p out
-	@.venv/bin/python tests/service/soak.py --minutes 60 --out out/soak-service.json
+	@.venv/bin/python tests/service/soak.py --hours "$(or $(HOURS),1)" --out out/soak-service.json
 
 lock:  ## Resolve requirements.lock anew from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv
