@@ -2,8 +2,8 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service limits install-service \
-  uninstall-service image flash update hil-image lock sample virtual-camera
+.PHONY: help setup demo serve test check bench budget soak soak-service limits fuzz \
+  install-service uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -72,6 +72,9 @@ budget: setup  ## Reckon the default build: table and plots in out/budget; statu
 soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, clock, each frame told
 	@mkdir -p out
 	@.venv/bin/python tests/faults/soak.py --hours "$(or $(HOURS),0.5)" --loss 0.02 --out out/soak.json
+
+fuzz: setup  ## Fuzz what reads from outside, SECONDS=120 a reader: READERS="rtp maps"
+	@.venv/bin/python tests/fuzz/run.py $(READERS) --seconds "$(or $(SECONDS),120)"
 
 limits: setup  ## Search what loss, delay, bit rate, CPU and payloads the system bears: ONLY=loss,rate
 	@mkdir -p out

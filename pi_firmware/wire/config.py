@@ -74,7 +74,7 @@ def _is_text(path: list[str], kind: Any) -> bool:
 
 def _toml_value(text: str, override: str) -> Any:
     try:
-        return _parsed(f"value = {text}")["value"]
+        return parse(f"value = {text}")["value"]
     except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
         raise ConfigError(f"--set {_shown(override)}: {_shown(text)} is not a TOML value") from None
 
@@ -106,15 +106,17 @@ def read(path: str | Path) -> dict[str, Any]:
             data = file.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
             raise ConfigError(f"{path}: more than {_MOST_BYTES} bytes, which no configuration has")
-        return _parsed(data.decode())
+        return parse(data.decode())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError, too
         raise ConfigError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
 
 
-def _parsed(text: str) -> dict[str, Any]:
-    """A TOML document; raises `ValueError` or `RecursionError`."""
+def parse(text: str) -> dict[str, Any]:
+    """A TOML document of bounded size and depth; raises `ValueError` or `RecursionError`."""
+    if len(text) > _MOST_BYTES:
+        raise ValueError(f"more than {_MOST_BYTES} characters")
     if _TOO_DEEP.search(text):
         raise ValueError(f"a key has more than {_DEEPEST} parts")
     return tomllib.loads(text)

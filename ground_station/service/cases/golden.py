@@ -6,7 +6,6 @@ begin with `#: ` and are TOML together.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -114,7 +113,7 @@ def read_golden(path: str | Path) -> Golden:
     lines = path.read_text(encoding="utf-8").splitlines()
     terms = "\n".join(line[len(MARK) :] for line in lines if line.startswith(MARK.rstrip()))
     try:
-        document = tomllib.loads(terms)
+        document = config.parse(terms)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its terms are not valid TOML: {error}") from None
     if "accepted_by" not in document:
