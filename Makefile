@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service limits fuzz \
+.PHONY: help setup demo serve test check bench budget soak soak-service limits faults fuzz \
   install-service uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
@@ -72,6 +72,11 @@ budget: setup  ## Reckon the default build: table and plots in out/budget; statu
 soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, clock, each frame told
 	@mkdir -p out
 	@.venv/bin/python tests/faults/soak.py --hours "$(or $(HOURS),0.5)" --loss 0.02 --out out/soak.json
+
+faults: setup  ## Faults across payload and ground: the matrix and 15 random walks (OPTIONS=--long)
+	@mkdir -p out/faults
+	@.venv/bin/python tests/faults/scenarios/run.py matrix --keep out/faults --out out/faults/matrix.json
+	@.venv/bin/python tests/faults/scenarios/run.py walks --keep out/faults --out out/faults/walks.json $(OPTIONS)
 
 fuzz: setup  ## Fuzz what reads from outside, SECONDS=120 a reader: READERS="rtp maps"
 	@.venv/bin/python tests/fuzz/run.py $(READERS) --seconds "$(or $(SECONDS),120)"
