@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget soak soak-service limits faults fuzz \
+.PHONY: help setup demo serve test check bench budget hil soak soak-service limits faults fuzz \
   install-service uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
@@ -60,6 +60,11 @@ check: setup  ## Lint, formatting and types
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
+
+hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="loss outage"
+	@if [ "$(PAYLOAD)" = image ]; then \
+	  sh deploy/packages.sh deploy/image/apt-packages.txt && sh deploy/emulator/tools.sh; fi
+	@.venv/bin/python tests/hil/suite.py $(CASES) --payload "$(or $(PAYLOAD),process)" $(OPTIONS)
 
 bench: setup  ## Measure what each step of localizer and payload costs, in ratios of one run
 	@mkdir -p out

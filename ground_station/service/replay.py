@@ -24,8 +24,6 @@ from ground_station.service.stand import LOOPBACK, Stand
 from pi_firmware.wire import config
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
 
-PAYLOAD_ID = "replay"
-_START_TIMEOUT_S = 30.0
 _AHEAD = 4
 """Frames of a stepped flight that are on their way at a time: payload and localizer overlap."""
 
@@ -149,18 +147,19 @@ def replay(
         stand.telemetry() as telemetry,
         stand.link(receiver.port) as port,
         stand.payload(
-            _payload_config(settings, camera, port, telemetry.endpoints), Path(folder)
+            _payload_config(settings, camera, port, telemetry.endpoints, stand.payload_id),
+            Path(folder),
         ) as firmware,
         Progress("live, frames", expected) as progress,
     ):
         result = live.run(
             receiver,
             telemetry,
-            PAYLOAD_ID,
+            stand.payload_id,
             localizer,
             check=firmware.check,
             running=firmware.running,
-            start_timeout_s=_START_TIMEOUT_S,
+            start_timeout_s=stand.start_timeout_s,
             on_start=set_start,
             keep_picture=lambda frame: frame.sequence % every == every // 2,
             on_frame=lambda frame: progress.step(),
@@ -198,7 +197,11 @@ def _expected_frames(reader: RecordingReader, settings: ReplaySettings) -> int:
 
 
 def _payload_config(
-    settings: ReplaySettings, camera: Camera, port: int, endpoints: tuple[str, ...]
+    settings: ReplaySettings,
+    camera: Camera,
+    port: int,
+    endpoints: tuple[str, ...],
+    payload_id: str,
 ) -> dict[str, Any]:
     options = [f"rate_hz={settings.rate_hz:g}"]
     if settings.start_s:
@@ -214,7 +217,7 @@ def _payload_config(
     if settings.gate_min_entropy_bits is not None:
         gate["min_entropy_bits"] = settings.gate_min_entropy_bits
     document: dict[str, Any] = {
-        "payload_id": PAYLOAD_ID,
+        "payload_id": payload_id,
         "camera": {
             "uri": f"replay:{path}?{'&'.join(options)}",
             "width_px": camera.width_px,

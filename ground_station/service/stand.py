@@ -44,6 +44,10 @@ class Stand:
     telemetry: Callable[[], TelemetryListener]
     link: Callable[[int], AbstractContextManager[int]]
     payload: Callable[[dict[str, Any], Path], AbstractContextManager[Running]]
+    payload_id: str = "replay"
+    """The payload's name in telemetry; a card's certificate has one of its own."""
+    start_timeout_s: float = 30.0
+    """From the started firmware to its first frame; more where the processor is emulated."""
 
 
 LOOPBACK = Stand(

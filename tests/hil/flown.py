@@ -20,11 +20,11 @@ from ground_station.service.cases.case import LOOPBACK, NAMESPACE, Case
 from ground_station.service.cases.judge import Judged, judged
 from ground_station.service.cases.observed import Observed
 from ground_station.service.cases.outcome import Outcome, write_outcome
+from ground_station.service.cases.source import check_case
 from ground_station.service.cases.taken import outcome_of
 from ground_station.service.replay import replay, settings_for
 from ground_station.service.stand import Running, Stand
 from pi_firmware.wire.errors import BlimpError
-from pi_firmware.wire.recording import RecordingReader
 
 AGAIN = "again"
 """A case's second run, below its folder."""
@@ -79,6 +79,7 @@ def _unfit(case: Case, payload: Payload) -> str:
 
 
 def _flown(case: Case, payload: Payload, folder: Path) -> Outcome:
+    source = check_case(case)
     flown = case.flown(payload.name)
     recording = payload.recording(case.recording_path)
     settings = settings_for(
@@ -113,7 +114,7 @@ def _flown(case: Case, payload: Payload, folder: Path) -> Outcome:
             refused=observed.refused,
             payload_side=observed.payload_side,
             ground_side=observed.ground_side,
-            notes=[payload.describe(), f"injected: {link.injected()}", *_cut(recording)],
+            notes=[payload.describe(), f"injected: {link.injected()}", *source.notes],
         )
     write_outcome(folder, outcome)
     return outcome
@@ -129,10 +130,8 @@ def _link(case: Case, payload: Payload, stack: contextlib.ExitStack) -> Link:
 
 def _stand(payload: Payload, settings: tuple[str, ...], link: Link, folder: Path) -> Stand:
     made = link.stand() if isinstance(link, NamespaceLink) else payload.stand(settings, link)
-    changes: dict[str, Any] = {"payload": _logged(made.payload, folder / _LOG)}
-    if any(field.name == "start_timeout_s" for field in dataclasses.fields(Stand)):
-        changes["start_timeout_s"] = _START_S
-    return dataclasses.replace(made, **changes)
+    flying = _logged(made.payload, folder / _LOG)
+    return dataclasses.replace(made, payload=flying, start_timeout_s=_START_S)
 
 
 def _logged(fly: Callable[..., Any], log: Path) -> Callable[..., Any]:
@@ -149,12 +148,3 @@ def _logged(fly: Callable[..., Any], log: Path) -> Callable[..., Any]:
                 shutil.copyfile(folder / _LOG, log)
 
     return flying
-
-
-def _cut(recording: Path) -> list[str]:
-    """A note when the recording ends in the middle."""
-    reader = RecordingReader(recording)
-    frames = sum(1 for _ in reader.video())
-    if not reader.cut:
-        return []
-    return [f"{recording.name} is cut ({reader.cut_reason}); {frames} frames of it are whole"]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.service.cases.resources import Side, Watch
-from ground_station.service.replay import PAYLOAD_ID
 from ground_station.service.stand import Running, Stand
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import messages
@@ -54,7 +53,7 @@ class Observed:
         return self._ground.side()
 
     def _state(self) -> PayloadState | None:
-        return None if self._telemetry is None else self._telemetry.state(PAYLOAD_ID)
+        return None if self._telemetry is None else self._telemetry.state(self._made.payload_id)
 
     def _listen(self) -> TelemetryListener:
         self._telemetry = self._made.telemetry()

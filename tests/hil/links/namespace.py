@@ -25,8 +25,7 @@ from ground_station.errors import GroundStationError
 from ground_station.keys.authority import Authority
 from ground_station.service.cases.case import Link
 from ground_station.service.cases.outcome import Outage
-from ground_station.service.replay import PAYLOAD_ID
-from ground_station.service.stand import Stand
+from ground_station.service.stand import LOOPBACK, Stand
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
@@ -264,7 +263,7 @@ def _keys(folder: Path) -> tuple[Path, Path]:
     """Throw-away certificate folders of ground and payload."""
     authority = Authority.create(folder)
     ground = authority.add("ground", "main")
-    payload = authority.add("payload", PAYLOAD_ID)
+    payload = authority.add("payload", LOOPBACK.payload_id)
     return ground, payload
 
 
