@@ -25,7 +25,7 @@ def test_every_direct_dependency_is_locked() -> None:
     wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
     locked = {name.lower() for name in re.findall(r"^([A-Za-z0-9._-]+)==", LOCK, re.M)}
     for requirement in wanted:
-        name = re.split(r"[<>=!\[ ]", requirement)[0].lower()
+        name = re.split(r"[<>=!\[ ;]", requirement)[0].lower()
         assert name in locked, f"{requirement} is not in requirements.lock: run `make lock`"
 
 
