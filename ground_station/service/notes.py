@@ -177,7 +177,8 @@ def decode(kind: type[N], data: bytes) -> N:
             raise ValueError(f"it nests deeper than {_DEEPEST}")
         return kind(**document)
     except (ValueError, TypeError, RecursionError) as error:
-        raise NoteError(f"{kind.__name__}: {str(error)[:120]}") from None
+        text = "".join(c if c.isprintable() else "?" for c in str(error)[:120])
+        raise NoteError(f"{kind.__name__}: {text}") from None
 
 
 def _depth(value: Any) -> int:

@@ -331,7 +331,7 @@ class RecordingReader:
                 size = file.seek(0, io.SEEK_END)
                 file.seek(0)
                 return SeekingReader(file, record_size_limit=size).get_summary()
-            except (*PARSE_ERRORS, OSError):
+            except (*PARSE_ERRORS, OSError, MemoryError):  # a text that claims gigabytes
                 return None
 
     def topics(self) -> dict[str, int]:
@@ -346,7 +346,9 @@ class RecordingReader:
         for _, record in self.messages({topic}):
             message = self._parse(CompressedVideo, record)
             if message.format != "h264":
-                raise RecordingError(f"{self.path}: video is '{message.format}'; only h264 is read")
+                raise RecordingError(
+                    f"{self.path}: video is {message.format[:40]!r}; only h264 is read"
+                )
             yield VideoSample(message.timestamp.ToNanoseconds(), message.data)
 
     def calibration(self, topic: str = CALIBRATION_TOPIC) -> CameraCalibration | None:

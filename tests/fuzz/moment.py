@@ -25,7 +25,8 @@ import pieces
 from table import READERS
 
 _AT_A_TIME = 2
-_RUNS, _SECONDS = 1000, 1
+_RUNS = 150
+"""As many on every machine: with the seed, the same inputs each time."""
 _STUCK_S = 300
 _REGRESSIONS = child.HERE / "regressions"
 
@@ -52,7 +53,7 @@ def _fuzz(name: str, module: ModuleType) -> None:
         (corpus / f"{number:03d}").write_bytes(data)
     pieces.STRETCH_BYTES = child.STRETCH_BYTES
     most = next(reader.most_bytes for reader in READERS if reader.name == name)
-    options = (f"-runs={_RUNS}", f"-max_total_time={_SECONDS}", f"-max_len={most}", "-seed=8")
+    options = (f"-runs={_RUNS}", f"-max_len={most}", "-seed=8")
     command = [name, *options, f"-artifact_prefix={corpus}/finding-", str(corpus)]
     atheris.Setup(command, child.guarded(module.fuzz))
     atheris.Fuzz()

@@ -20,7 +20,12 @@ def moment(action: str, folder: Path) -> None:
         capture_output=True,
         text=True,
         cwd=fuzzing.ROOT,
-        env={**os.environ, "TMPDIR": str(folder), "OPENBLAS_NUM_THREADS": "1"},
+        env={
+            **os.environ,
+            "TMPDIR": str(folder),
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONHASHSEED": "0",
+        },
         timeout=_LIMIT_S,
         check=False,
     )

@@ -86,7 +86,7 @@ def test_a_cut_recording_is_flown_to_its_last_whole_chunk_and_said_to_be_cut(
     case = write(tmp_path, "cut", "lost_max = 0.0", recording=cut)
     done = hil(case, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "cut.mcap is cut (" in done.stdout
+    assert "cut.mcap was cut (" in done.stdout
     told = json.loads((tmp_path / "out/suite.json").read_text())
     captured = told["cases"][0]["outcome"]["accounts"]["captured"]
     times = [sample.time_ns for sample in RecordingReader(cut).video()]

@@ -289,7 +289,8 @@ def test_an_intake_that_dies_comes_back_to_the_same_streams(tracked: Flying) -> 
         assert viewer.connections == 1
     pose_s = video_s + seconds(lambda: service.tracking(NAME))
     print(f"\nintake: back in {back_s:.1f} s, video in {video_s:.1f} s, pose in {pose_s:.1f} s")
-    assert service.payload(NAME)["payload"]["ssrc"] == ssrc
+    # The note that tells the stream may come after the first pictures.
+    assert eventually(lambda: service.payload(NAME)["payload"]["ssrc"]) == ssrc
     only_this_one_fell(service, before, "intake")
 
 

@@ -6,6 +6,8 @@ import errno
 import io
 import json
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zlib
 from collections.abc import Callable
@@ -485,3 +487,21 @@ def test_long_recordings_are_written_and_read_in_constant_memory(tmp_path: Path)
     finally:
         tracemalloc.stop()
     assert path.stat().st_size > 30_000_000 and peak < 6_000_000
+
+
+def test_a_length_that_claims_gigabytes_is_no_index(flight: Path) -> None:
+    damaged = bytearray(flight.read_bytes())
+    at = 8 + 9  # magic; the header's opcode and length: its profile's length is next
+    damaged[at : at + 4] = struct.pack("<I", 2**32 - 16)
+    damaged[-28:-20] = struct.pack("<Q", 8)  # the footer's summary_start: at the header
+    code = (
+        "import resource, sys\n"
+        "from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))\n"
+        "print(RecordingReader(sys.argv[1]).message_count(VIDEO_TOPIC))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, scratch(flight, bytes(damaged))],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "None\n"), done.stderr

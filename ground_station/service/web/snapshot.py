@@ -256,8 +256,7 @@ class Snapshot:
                 },
                 "processes": [
                     {
-                        **notes.as_document(item.note),
-                        "restarts": item.restarts,
+                        **notes.as_document(dataclasses.replace(item.note, restarts=item.restarts)),
                         "age_s": _age_s(now_ns, item.came_ns),
                         "restarted_s": _age_s(now_ns, item.restarted_ns),
                     }
