@@ -331,7 +331,7 @@ class RecordingReader:
                 size = file.seek(0, io.SEEK_END)
                 file.seek(0)
                 return SeekingReader(file, record_size_limit=size).get_summary()
-            except (*PARSE_ERRORS, OSError, MemoryError):  # a text that claims gigabytes
+            except (*PARSE_ERRORS, OSError):
                 return None
 
     def topics(self) -> dict[str, int]:

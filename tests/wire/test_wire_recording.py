@@ -494,6 +494,7 @@ def test_a_length_that_claims_gigabytes_is_no_index(flight: Path) -> None:
     at = 8 + 9  # magic; the header's opcode and length: its profile's length is next
     damaged[at : at + 4] = struct.pack("<I", 2**32 - 16)
     damaged[-28:-20] = struct.pack("<Q", 8)  # the footer's summary_start: at the header
+    damaged[-12:-8] = bytes(4)  # and no checksum of it
     code = (
         "import resource, sys\n"
         "from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader\n"
