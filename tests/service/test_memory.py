@@ -2,8 +2,15 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from intake_stand import free_udp_port
+
+from ground_station.service import memory
+from ground_station.service.intake.process import Intake
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire.config import from_mapping
 
 HOLES = """
 from pathlib import Path
@@ -31,3 +38,26 @@ def test_holes_in_the_heap_are_given_back() -> None:
     pages = 2000 * 50_000 // 4096
     assert full - holes < 0.1 * pages  # they are held, or there is nothing to give back
     assert holes - after > 0.9 * pages
+
+
+def test_the_intake_gives_back_what_a_payload_left_when_it_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[str] = []
+    monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
+    said: list[str] = []
+    document = {
+        "video": {"port": free_udp_port()},
+        "telemetry": {"listen": ["tcp/127.0.0.1:0"]},
+        "recording": {"folder": str(tmp_path), "min_free_MB": 0},
+    }
+    settings = from_mapping(document, StationSettings)
+    with Intake(settings, lambda _, who, note: said.append(getattr(note, "name", ""))) as intake:
+        payload = intake._roster.take_up("blimp-1")
+        assert payload is not None
+        intake._follow()
+        assert given == []  # nobody was here
+        payload.alive = True  # as it was until now; nothing of it comes any more
+        intake._follow()
+        intake._follow()
+    assert "payload-gone" in said and given == ["back"]

@@ -26,3 +26,9 @@ def test_a_note_of_many_lists_and_few_levels_is_taken() -> None:
     note = notes.decode(PayloadNote, text)
     assert notes.decode(PayloadNote, notes.encode(note)) == note
     assert notes.as_document(note)["battery"] == {"a": [[1, {"b": [2]}]] * 100}
+
+
+def test_a_refusal_is_one_line_whatever_the_note_holds() -> None:
+    with pytest.raises(notes.NoteError) as refused:
+        notes.decode(notes.ProcessNote, b'{"\\u000c\\n\\u0000": 1}')
+    assert str(refused.value).isprintable()
