@@ -20,6 +20,7 @@ from types import FrameType, ModuleType
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parents[1])]  # of the checkout, `deploy` is not installed
+sys.path.append(str(HERE.parent / "mapping"))  # small models that its tests have, too
 import pieces  # noqa: E402
 
 MEMORY_BYTES = 1 << 30

@@ -6,11 +6,10 @@ import shutil
 import struct
 from pathlib import Path
 
-import numpy as np
 import pytest
+import two_images
 
 from ground_station.errors import MapError
-from ground_station.geometry.camera import Camera
 from ground_station.mapping import colmap, colmap_files
 
 FILES = ("cameras.bin", "rigs.bin", "images.bin", "frames.bin", "points3D.bin")
@@ -19,23 +18,7 @@ FILES = ("cameras.bin", "rigs.bin", "images.bin", "frames.bin", "points3D.bin")
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> Path:
     """Two images that see one point."""
-    wTc = np.tile(np.eye(4), (2, 1, 1))
-    wTc[1, 0, 3] = 1.0
-    model = colmap.Model(
-        names=["a.png", "b.png"],
-        image_id=np.array([1, 2]),
-        wTc=wTc,
-        point_id=np.array([5]),
-        position=np.array([[0.5, 0.0, 3.0]]),
-        image=np.array([0, 1]),
-        feature=np.array([0, 0]),
-        point=np.array([0, 0]),
-        pixel_px=np.array([[395.0, 241.0], [229.0, 241.0]]),
-        pinhole=np.array([501.58, 505.57, 312.51, 241.21]),
-    )
-    folder = tmp_path_factory.mktemp("model") / "sparse"
-    colmap.write(colmap.from_arrays(model, Camera()), folder)
-    return folder
+    return two_images.write(tmp_path_factory.mktemp("model") / "sparse")
 
 
 @pytest.fixture

@@ -5,11 +5,10 @@ from __future__ import annotations
 import functools
 import shutil
 
-import numpy as np
+import two_images
 from pieces import Picker, blocks, refusing, scratch
 
 from ground_station.errors import MapError
-from ground_station.geometry.camera import Camera
 from ground_station.mapping import colmap
 
 _FOLDER = scratch("colmap") / "sparse"
@@ -18,22 +17,8 @@ _SPARE = scratch("colmap-seed")
 
 @functools.cache
 def _files() -> dict[str, bytes]:
-    """A small model as it is written: two images that see one point."""
-    wTc = np.tile(np.eye(4), (2, 1, 1))
-    wTc[1, 0, 3] = 1.0
-    model = colmap.Model(
-        names=["a.png", "b.png"],
-        image_id=np.array([1, 2]),
-        wTc=wTc,
-        point_id=np.array([5]),
-        position=np.array([[0.5, 0.0, 3.0]]),
-        image=np.array([0, 1]),
-        feature=np.array([0, 0]),
-        point=np.array([0, 0]),
-        pixel_px=np.array([[395.0, 241.0], [229.0, 241.0]]),
-        pinhole=np.array([501.58, 505.57, 312.51, 241.21]),
-    )
-    colmap.write(colmap.from_arrays(model, Camera()), _SPARE)
+    """A small model as it is written."""
+    two_images.write(_SPARE)
     return {path.name: path.read_bytes() for path in sorted(_SPARE.iterdir())}
 
 

@@ -1,0 +1,30 @@
+"""The smallest model of COLMAP's that is one: two images that see one point."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ground_station.geometry.camera import Camera
+from ground_station.mapping import colmap
+
+
+def write(folder: Path) -> Path:
+    """Its binary files in a new folder; gives the folder."""
+    wTc = np.tile(np.eye(4), (2, 1, 1))
+    wTc[1, 0, 3] = 1.0
+    model = colmap.Model(
+        names=["a.png", "b.png"],
+        image_id=np.array([1, 2]),
+        wTc=wTc,
+        point_id=np.array([5]),
+        position=np.array([[0.5, 0.0, 3.0]]),
+        image=np.array([0, 1]),
+        feature=np.array([0, 0]),
+        point=np.array([0, 0]),
+        pixel_px=np.array([[395.0, 241.0], [229.0, 241.0]]),
+        pinhole=np.array([501.58, 505.57, 312.51, 241.21]),
+    )
+    colmap.write(colmap.from_arrays(model, Camera()), folder)
+    return folder
