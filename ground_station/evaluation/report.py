@@ -5,14 +5,12 @@ The caller fills a `ReportData` with plain things; whatever is left out is left 
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 import numpy.typing as npt
 
@@ -20,14 +18,14 @@ from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
 from ground_station.evaluation.floorplan import load_floorplan
+from ground_station.evaluation.pages import TEMPLATES, Shown, data_uri, shown, write_page
 from ground_station.evaluation.text import columns
-from ground_station.files import write_text
 from ground_station.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
-_TEMPLATES = Path(__file__).parent / "templates"
+_TEMPLATE = TEMPLATES / "report.html"
 
 _FRAME_MEANINGS = {
     "captured": "taken by the camera",
@@ -135,15 +133,10 @@ def write_report(path: str | Path, data: ReportData) -> None:
     Raises `InputError` for a floor plan that cannot be read, `GroundStationError` for a page that
     cannot be written.
     """
-    path = Path(path)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("report.html").render(
+    write_page(
+        path,
+        _TEMPLATE,
+        title=data.title,
         data=data,
         frame_rows=_frame_rows(data.frames),
         bound_rows=_bound_rows(data.bounds),
@@ -154,7 +147,6 @@ def write_report(path: str | Path, data: ReportData) -> None:
         settings=_flat(data.settings),
         legend=_LEGEND,
     )
-    write_text(path, page)
 
 
 def summary_table(data: ReportData) -> str:
@@ -264,13 +256,11 @@ def _time_rows(data: ReportData) -> list[tuple[str, str, str]]:
     return [(name, f"{t['p50']:.1f}", f"{t['p99']:.1f}") for name, t in stages.items()]
 
 
-def _figures(data: ReportData) -> list[tuple[str, str, str, str]]:
-    """Heading, light picture, dark picture, words for those who do not see it."""
-    figures: list[tuple[str, str, str, str]] = []
+def _figures(data: ReportData) -> list[Shown]:
+    figures: list[Shown] = []
 
     def add(heading: str, words: str, draw: Any) -> None:
-        light, dark = (_data_uri("png", plots.png(draw(d))) for d in (plots.LIGHT, plots.DARK))
-        figures.append((heading, light, dark, words))
+        figures.append(shown(heading, words, draw))
 
     if data.estimate is not None or data.truth is not None:
         plan = load_floorplan(data.floorplan) if data.floorplan is not None else None
@@ -323,8 +313,4 @@ def _jpeg(image: Image) -> str:
     ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     if not ok:
         raise GroundStationError("report: a match picture cannot be encoded")
-    return _data_uri("jpeg", data.tobytes())
-
-
-def _data_uri(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    return data_uri("jpeg", data.tobytes())

@@ -6,7 +6,6 @@ import base64
 import re
 import subprocess
 import sys
-from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from parsed_page import Page
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.evaluation import plots
@@ -85,22 +85,6 @@ def full_data(floorplan: Path) -> ReportData:
         seeds={"simulator": 42},
         notes=["flight.mcap: cut; 1500 frames read"],
     )  # fmt: skip
-
-
-class Page(HTMLParser):
-    """Collects tags with their attributes, and the text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.words += data + " "
 
 
 def written(path: Path, data: ReportData) -> Page:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 import web_station as station
 
 from ground_station.service.web.app import build
+
+sys.path.append(str(Path(__file__).parents[1] / "evaluation"))  # for parsed_page
 
 HERE = "http://127.0.0.1:8080"
 _NAMES = ("chromium", "chromium-browser", "google-chrome")

@@ -6,7 +6,6 @@ import base64
 import dataclasses
 import re
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from parsed_page import Page
 
 from ground_station.evaluation import plots
 from ground_station.evaluation.floorplan import FloorPlan
@@ -26,22 +26,6 @@ from ground_station.service.cases.limits import Limits
 from ground_station.service.cases.truth import Reference
 
 HOSTILE = "<script>alert(1)</script>'\" onload=x \x07\u202eevil\udcff"
-
-
-class Page(HTMLParser):
-    """Collects tags with their attributes, and the text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.words += data + " "
 
 
 @pytest.fixture(scope="module")

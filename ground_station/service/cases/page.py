@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
-import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 
-from ground_station.evaluation import plots
-from ground_station.evaluation.plots import Dress
-from ground_station.files import write_text
+from ground_station.evaluation.pages import Shown, shown, write_page
 from ground_station.service.cases import measure, pictures
 from ground_station.service.cases.compare import Comparison, Line
 from ground_station.service.cases.frames import UNKNOWN
@@ -22,16 +17,6 @@ from ground_station.service.cases.outcome import Outcome
 from ground_station.service.cases.pictures import Series, Strip
 
 _TEMPLATES = Path(__file__).parent / "templates"
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A picture in two dresses as data URIs, and words for those who do not see it."""
-
-    heading: str
-    light: str
-    dark: str
-    words: str
 
 
 def write_comparison(path: str | Path, comparison: Comparison, a: str, b: str) -> None:
@@ -94,30 +79,7 @@ def cells(line: Line) -> tuple[str, str, str, str]:
 
 
 def _write(path: str | Path, template: str, **values: object) -> None:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_printable,
-    )
-    write_text(path, environment.get_template(template).render(**values))
-
-
-def _printable(value: object) -> object:
-    """Names come from files: what cannot be printed, or turns the text around, is shown as `?`."""
-    if type(value) is not str or value.isprintable():
-        return value
-    return "".join(c if c.isprintable() else "?" for c in value)
-
-
-def _shown(heading: str, words: str, draw: Callable[[Dress], Figure]) -> Shown:
-    light, dark = (
-        "data:image/png;base64," + base64.b64encode(plots.png(draw(dress))).decode("ascii")
-        for dress in (plots.LIGHT, plots.DARK)
-    )
-    return Shown(heading, light, dark, words)
+    write_page(path, _TEMPLATES / template, **values)
 
 
 def _of_comparison(c: Comparison) -> list[Shown]:
@@ -132,7 +94,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
         first = _place(c)
         plan = c.b.floorplan or c.a.floorplan
         found.append(
-            _shown(
+            shown(
                 "Where the poses of B are off those of A",
                 "B's path from above, coloured by its distance from A's pose of the same frame",
                 lambda dress: pictures.path(
@@ -161,7 +123,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
             Strip(name, (f.time_ns - start_ns) / 1e9, f.state) for name, f in (("A", a), ("B", b))
         ]
         found.append(
-            _shown(
+            shown(
                 "Over time",
                 "Errors of both runs, their difference and their states over time",
                 lambda dress: pictures.over_time(panels, strips, dress=dress),
@@ -174,7 +136,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
         )
     sets.append(("capture to pose, ms", [("A", a.latency_ms), ("B", b.latency_ms)]))
     found.append(
-        _shown(
+        shown(
             "How often",
             "The share of frames up to an error, and up to a latency, of both runs",
             lambda dress: pictures.distributions(sets, dress),
@@ -226,7 +188,7 @@ def _of_case(case: Judged) -> list[Shown]:
     shown_off = off if case.reference is not None else np.zeros(len(frames))
     under = [] if outcome.truth is None else [("truth", outcome.truth)]
     return [
-        _shown(
+        shown(
             "Path",
             "The path from above, coloured by its error",
             lambda dress: pictures.path(
@@ -238,7 +200,7 @@ def _of_case(case: Judged) -> list[Shown]:
                 dress=dress,
             ),
         ),
-        _shown(
+        shown(
             "Over time",
             "Error, latency and state over time; what was out is shaded",
             lambda dress: pictures.over_time(
