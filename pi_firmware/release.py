@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pi_firmware import __version__
+from pi_firmware.wire.text import printable
 
 ENVIRONMENT = "BLIMP_RELEASE"
 _LONGEST = 300
@@ -51,4 +52,4 @@ def of_environment(environment: Mapping[str, str] = os.environ) -> Release:
 def _clean(text: object) -> str:
     if not isinstance(text, str):
         raise ValueError("not text")
-    return "".join(c if c.isprintable() else "?" for c in text[:_LONGEST])
+    return printable(text, _LONGEST)

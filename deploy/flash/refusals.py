@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from deploy.errors import DeployError
+from deploy.errors import DeployError, printable
 from deploy.flash.disks import Disk, Machine
 
 
@@ -80,7 +80,7 @@ def describe(path: Path, disk: Disk | None, size: int) -> str:
             for part in disk.partitions
         ),
     ]
-    return "\n".join(map(_printable, lines)) + ("" if disk.partitions else "\n  no partitions")
+    return "\n".join(map(printable, lines)) + ("" if disk.partitions else "\n  no partitions")
 
 
 def shown_size(size: int) -> str:
@@ -91,8 +91,3 @@ def shown_size(size: int) -> str:
             break
         value, unit = value / 1000, larger
     return f"{value:.0f} {unit}" if value >= 100 or unit == "B" else f"{value:.1f} {unit}"
-
-
-def _printable(line: str) -> str:
-    """A disk's own text comes from its maker, or from whoever made the stick."""
-    return "".join(character if character.isprintable() else "?" for character in line)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from deploy.errors import DeployError
+from deploy.errors import DeployError, printable
 from deploy.provisioning import GroundStation, Provisioning, Wifi
 from deploy.provisioning.model import OPEN, WPA2
 from deploy.provisioning.text import parse_wifi
@@ -147,9 +147,10 @@ def _ask(ssid: str) -> str:
     """Asks without echo, twice: nobody sees what they typed."""
     if not sys.stdin.isatty():
         raise DeployError("no password: give --wifi-password-file, or run it on a terminal")
-    shown = "".join(character if character.isprintable() else "?" for character in ssid)
     try:
-        first = getpass.getpass(f"Password of the network '{shown}' (empty: the card's): ")
+        first = getpass.getpass(
+            f"Password of the network '{printable(ssid)}' (empty: the card's): "
+        )
         again = getpass.getpass("Once more: ") if first else ""
     except EOFError:
         raise DeployError("no password was given") from None

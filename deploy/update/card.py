@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy.board.releases.choose import HEALTHY
-from deploy.errors import DeployError
+from deploy.errors import DeployError, printable
 from deploy.run import need
 from deploy.update import bundle as bundles
 from deploy.update.bundle import Bundle
@@ -190,7 +190,7 @@ class Card:
             forget = f"; flashed anew without its keys? ssh-keygen -R {self.name} -f {self.known}"
             why = "it has another host key than this payload's"
             return f"{self.host}: {why}{'' if self._pinned else forget}"
-        last = "".join(c if c.isprintable() else "?" for c in lines[-1])[:300] if lines else ""
+        last = printable(lines[-1])[:300] if lines else ""
         if last.startswith("releases: "):
             return f"{self.name} refuses: {last.removeprefix('releases: ')}"
         return f"{self.host}: {last or f'ssh ended with status {status}'}"

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from ground_station.evaluation import plots
 from ground_station.evaluation.plots import Dress
 from ground_station.files import write_text
+from pi_firmware.wire.text import printable
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -60,6 +61,4 @@ def write_page(path: str | Path, template: Path, **values: object) -> None:
 
 
 def _printable(value: object) -> object:
-    if type(value) is not str or value.isprintable():
-        return value
-    return "".join(c if c.isprintable() else "?" for c in value)
+    return printable(value) if type(value) is str else value

@@ -16,6 +16,7 @@ from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.observations import FlightObservations, landmarks_sha256
 from ground_station.mapping.store import Map
+from pi_firmware.wire.text import printable
 
 
 def trajectory(estimates: Sequence[PoseEstimate]) -> Trajectory:
@@ -45,7 +46,7 @@ def flight_observations(
     pixel_px = [seen.pixel_px[seen.inlier] for _, _, seen in told]
     ids = map_.landmarks.id[np.concatenate([*landmark, np.empty(0, np.intp)])]
     return FlightObservations(
-        name="".join(c if c.isprintable() else "_" for c in name)[:100] or "flight",
+        name=printable(name, 100, "_") or "flight",
         map=map_.info.name,
         landmarks_sha256=landmarks_sha256(map_.landmarks),
         camera=camera,

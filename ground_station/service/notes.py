@@ -177,8 +177,7 @@ def decode(kind: type[N], data: bytes) -> N:
             raise ValueError(f"it nests deeper than {_DEEPEST}")
         return kind(**document)
     except (ValueError, TypeError, RecursionError) as error:
-        text = "".join(c if c.isprintable() else "?" for c in str(error)[:120])
-        raise NoteError(f"{kind.__name__}: {text}") from None
+        raise NoteError(f"{kind.__name__}: {str(error)[:120]}") from None
 
 
 def _depth(value: Any) -> int:

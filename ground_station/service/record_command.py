@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pi_firmware.wire.text import printable
+
 if TYPE_CHECKING:
     from ground_station.service.notes import Note
 
@@ -89,7 +91,6 @@ class _Report:
 
         if isinstance(note, EventNote):
             who = "" if payload_id == STATION else f"{payload_id}: "
-            text = "".join(c if c.isprintable() else " " for c in note.text)[:300]
-            print(f"{who}{note.name}: {text}", flush=True)
+            print(f"{who}{note.name}: {printable(note.text, 300, ' ')}", flush=True)
         elif isinstance(note, PayloadNote) and note.stream.get("packets"):
             self.frames[payload_id] = note.frames

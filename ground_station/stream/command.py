@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from ground_station.stream.commands import NAMES
+from pi_firmware.wire.text import printable
 
 _EPILOG = """\
 examples:
@@ -86,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
         answer = ask(session, args.payload, args.name, numbers, args.timeout_s)
     finally:
         session.close()
-    said = "done" if answer.done else f"refused: {_line(answer.reason)}"
-    values = ", ".join(f"{_line(key)} {value:g}" for key, value in answer.values.items())
+    said = "done" if answer.done else f"refused: {_said(answer.reason)}"
+    values = ", ".join(f"{_said(key)} {value:g}" for key, value in answer.values.items())
     print(f"{args.payload}: {args.name}: {said}" + (f" ({values})" if values else ""))
     if args.json:
         document = {
@@ -122,6 +123,6 @@ def _numbers(arguments: list[str]) -> dict[str, float]:
     return numbers
 
 
-def _line(text: str) -> str:
+def _said(text: str) -> str:
     """What a payload says, without what would steer a terminal."""
-    return "".join(c if c.isprintable() else " " for c in text)[:300]
+    return printable(text, 300, " ")

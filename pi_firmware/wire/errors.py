@@ -1,14 +1,23 @@
 """The exception family: every error a person can cause is a `BlimpError` with a one-line text."""
 
+from pi_firmware.wire.text import printable
+
+_LONGEST = 2000
+
 
 class BlimpError(Exception):
     """Base of all errors of the payload and of what both sides share.
 
-    The text is one line that names the value and the limit; programs print it on standard error
-    and exit with status 2, or 3 where `restart` says that only a new process can mend it.
+    The text is one line that names the value and the limit, whatever it was made from; programs
+    print it on standard error and exit with status 2, or 3 where `restart` says that only a new
+    process can mend it.
     """
 
     restart = False
+
+    def __init__(self, text: str = "") -> None:
+        # What it names may come from a file or from the air: it cannot steer the terminal.
+        super().__init__(printable(text, _LONGEST))
 
 
 class ConfigError(BlimpError):

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pi_firmware.wire.text import printable
+
 if TYPE_CHECKING:
     from ground_station.service.cases.compare import Allowed, Comparison, Line
 
@@ -231,7 +233,7 @@ def text(result: Comparison) -> str:
     ]  # fmt: skip
     head = ["", "A", "B", "", "worse by", "allowed", ""]
     lines += columns([head, *(row(line) for line in result.lines[:_SHOWN])])
-    return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def document(result: Comparison, a: str, b: str) -> dict[str, Any]:

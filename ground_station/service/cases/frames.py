@@ -19,6 +19,7 @@ from ground_station.files import write_text
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
+from pi_firmware.wire.text import printable
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -145,7 +146,7 @@ def write_csv(path: str | Path, frames: Frames) -> None:
     numbers = np.hstack([frames.position_m, frames.quaternion_xyzw]).tolist()
     for k in range(len(frames)):
         pose = numbers[k] if frames.digest[k] else [""] * len(_POSE)
-        told = (frames.state[k], _line(frames.reason[k]), int(frames.relocalized[k]))
+        told = (frames.state[k], printable(frames.reason[k], 200, " "), int(frames.relocalized[k]))
         writer.writerow([*times[k], *told, *pose, frames.digest[k]])
     write_text(path, out.getvalue())
 
@@ -217,8 +218,3 @@ def _parsed(row: list[str]) -> tuple[list[int], tuple[str, str, bool, str], list
     if len(code) != 32 or not set(code) <= set("0123456789abcdef"):
         raise ValueError(f"pose_sha256 is {code[:40]!r}; allowed: 32 hexadecimal digits")
     return times, (state, reason, relocalized == "1", code), [float(text) for text in pose]
-
-
-def _line(text: str) -> str:
-    """A reason as it may stand in a table: one line."""
-    return "".join(c if c.isprintable() else " " for c in text)[:200]

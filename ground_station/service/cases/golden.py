@@ -18,6 +18,7 @@ from ground_station.geometry.trajectory import Trajectory, read_tum, tum_line
 from ground_station.service.cases.outcome import Outcome
 from pi_firmware.wire import config
 from pi_firmware.wire.config import key
+from pi_firmware.wire.text import printable
 
 MARK = "#: "
 MISSING = 0.05
@@ -25,6 +26,7 @@ MISSING = 0.05
 
 
 _OF_RUN = ("case", "recording", "map", "map_sha256", "preset", "payload")
+_LONGEST = 200
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,11 @@ def accept(
         "tolerance_m": tolerance_m,
         "tolerance_deg": tolerance_deg,
         "missing_max": missing_max,
-        **{name: _line(getattr(run, name)) for name in _OF_RUN},
+        **{name: printable(getattr(run, name), _LONGEST) for name in _OF_RUN},
         "stepped": run.stepped,
-        "versions": {_line(k): _line(str(v)) for k, v in run.versions.items()},
+        "versions": {
+            printable(k, _LONGEST): printable(str(v), _LONGEST) for k, v in run.versions.items()
+        },
     }
     return Golden(config.from_mapping(values, Accepted, where="--accept"), poses)
 
@@ -122,8 +126,3 @@ def read_golden(path: str | Path) -> Golden:
         if name not in document:
             raise InputError(f"{path}: the key '{name}' is missing")
     return Golden(config.from_mapping(document, Accepted, where=str(path)), poses)
-
-
-def _line(text: str) -> str:
-    """A name as it may stand in a comment: one line."""
-    return "".join(c if c.isprintable() else "?" for c in text)[:200]

@@ -27,6 +27,7 @@ from ground_station.service.cases.truth import Reference
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
+from pi_firmware.wire.text import printable
 
 GOLDEN_SUFFIX = ".golden.txt"
 _BRIEF = ("bounds.image", "bounds.ssh")
@@ -140,7 +141,7 @@ def _keys(
     if flown.get("init", "none") not in ("none", "truth"):
         flown["init"] = _relative(Path(flown["init"]), asked.out)
     document = {
-        "title": _line(f"{asked.recording.stem} in {map_.info.name}"),
+        "title": printable(f"{asked.recording.stem} in {map_.info.name}", 200),
         "recording": _relative(recording, asked.out),
         "map": _relative(asked.map, asked.out),
         "payload": {"settings": asked.settings},
@@ -220,7 +221,3 @@ def _remarks(source: Source) -> dict[str, str]:
 
 def _relative(path: Path, case: Path) -> str:
     return Path(os.path.relpath(path.resolve(), case.resolve().parent)).as_posix()
-
-
-def _line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)[:200]

@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+from pi_firmware.wire.text import printable
+
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
 _COLOURS = {OK: "32", WARNING: "33", PROBLEM: "1;31"}
 _NARROWEST, _WIDEST = 60, 120
@@ -102,7 +104,7 @@ def text(findings: Sequence[Finding], *, colour: bool, width: int | None = None)
 
 def _wrapped(said: str, width: int) -> list[str]:
     """Lines of a width; a path or a command's word is never broken."""
-    clean = "".join(c if c.isprintable() else "?" for c in said)
+    clean = printable(said)
     return textwrap.wrap(clean, max(width, 20), break_long_words=False, break_on_hyphens=False) or [
         ""
     ]
