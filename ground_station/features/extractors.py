@@ -1,26 +1,57 @@
-"""The extractors by name."""
+"""The extractors by name: methods, and the models of the catalogue."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+from ground_station.features import catalogue
 from ground_station.features.extractor import Extractor, FeatureError
+from ground_station.features.orb import Orb
 from ground_station.features.rootsift import RootSift
+from ground_station.features.settings import LearnedSettings
 
-_EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": RootSift}
+_EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": RootSift, "orb": Orb}
+_DEFAULT = LearnedSettings()
 
 
-def create(name: str, max_features: int = 1500) -> Extractor:
+def create(
+    name: str,
+    max_features: int = 1500,
+    *,
+    learned: LearnedSettings = _DEFAULT,
+    threads: int = 1,
+) -> Extractor:
     """The extractor of that name, keeping at most `max_features` key points an image.
 
-    Raises `FeatureError` naming those there are.
+    A name that is no method's is a model's; `learned` and `threads` (0: all cores but the
+    tracker's) say how its network runs, which is warm when this returns. Raises `FeatureError`
+    naming those there are, and as `catalogue.find` and `Network` do.
     """
-    if name not in _EXTRACTORS:
+    if name in _EXTRACTORS:
+        return _EXTRACTORS[name](max_features)
+    if name not in catalogue.names():
         known = ", ".join(names())
-        raise FeatureError(f"features: there is no extractor '{name}' (known: {known})")
-    return _EXTRACTORS[name](max_features)
+        raise FeatureError(f"features: there is no extractor '{name:.80}' (known: {known})")
+    # onnxruntime and onnx take half a second to import, which only models need.
+    from ground_station.features.cells import CellFeatures
+    from ground_station.features.inference import Network, threads_beside_tracker
+    from ground_station.features.pixels import PixelFeatures
+
+    model = catalogue.find(name)
+    network = Network(model, learned.provider, threads or threads_beside_tracker())
+    kind = CellFeatures if model.info.layout == "cells" else PixelFeatures
+    return kind(network, max_features, learned)
 
 
 def names() -> list[str]:
     """The names that `create` knows."""
-    return sorted(_EXTRACTORS)
+    return sorted({*_EXTRACTORS, *catalogue.names()})
+
+
+def check_free(name: str) -> None:
+    """Raises `FeatureError` unless a new model may have that name: well formed, and no method's."""
+    from ground_station.features.model import check_name
+
+    check_name(name)
+    if name in _EXTRACTORS or name == "map":
+        raise FeatureError(f"name is '{name}', which is a method's; give the model another")

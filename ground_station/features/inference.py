@@ -1,0 +1,92 @@
+"""A model's network, run by onnxruntime."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime
+
+from ground_station.features.extractor import FeatureError
+from ground_station.features.model import Model
+
+F32 = npt.NDArray[np.float32]
+
+_SUFFIX = "ExecutionProvider"
+_WARM_UP_PX = (480, 640)
+"""The first picture takes several times as long as the others: memory is found, kernels are
+prepared. The blimp's camera has this size; a picture of another is slow once more."""
+
+
+def providers() -> dict[str, str]:
+    """The execution providers of the onnxruntime that is installed, by the settings' names."""
+    return {
+        name.removesuffix(_SUFFIX).lower(): name for name in onnxruntime.get_available_providers()
+    }
+
+
+def threads_beside_tracker() -> int:
+    """All cores this process may use but one, which the tracker has; at least one, at most 4.
+
+    More than that many threads make no picture of our camera's size faster by much.
+    """
+    return min(4, max(1, len(os.sched_getaffinity(0)) - 1))
+
+
+class Network:
+    """One session; safe to be called from several threads. Warm when it is made.
+
+    Raises `FeatureError` with one line where the provider is missing or cannot run here, or where
+    onnxruntime refuses the graph or what it needs of memory.
+    """
+
+    def __init__(self, model: Model, provider: str = "cpu", threads: int = 1) -> None:
+        self.model, self.provider = model, provider
+        known = providers()
+        if provider not in known:
+            raise FeatureError(
+                f"features: onnxruntime has no execution provider '{provider:.40}' here "
+                f"(there are: {', '.join(sorted(known))})"
+            )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what is wrong comes as an exception; its log is noise
+        # Threads that wait for work in a loop take the tracker's core.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # Values next to nought are reckoned a hundred times as slowly as others.
+        options.add_session_config_entry("session.set_denormal_as_zero", "1")
+        wanted = [known[provider]]
+        if provider != "cpu":
+            wanted.append("CPU" + _SUFFIX)
+        try:
+            self._session = onnxruntime.InferenceSession(model.data, options, providers=wanted)
+        except Exception as error:  # onnxruntime's have no common base but this
+            raise FeatureError(f"{model.path}: onnxruntime refuses it: {_line(error)}") from None
+        if self._session.get_providers()[0] != known[provider]:
+            # onnxruntime falls back without a word, and a tracker would be as slow as without it.
+            raise FeatureError(
+                f"features: the execution provider '{provider}' is installed but cannot run here"
+            )
+        self._outputs = [output.name for output in self._session.get_outputs()]
+        self._channels = 1 if model.info.layout == "cells" else 3
+        rows, columns = (-(-side // model.info.multiple) * model.info.multiple
+                         for side in _WARM_UP_PX)  # fmt: skip
+        self.run(np.zeros((1, self._channels, rows, columns), np.float32))
+
+    def run(self, image: F32) -> dict[str, F32]:
+        """The outputs by name for pictures (N, channels, H, W), H and W of the right multiple."""
+        try:
+            values: list[Any] = self._session.run(self._outputs, {"image": image})
+        except Exception as error:  # as above; too little memory, for one
+            raise FeatureError(f"{self.model.path}: onnxruntime failed: {_line(error)}") from None
+        return {
+            name: np.asarray(value, np.float32)
+            for name, value in zip(self._outputs, values, strict=True)
+        }
+
+
+def _line(error: Exception) -> str:
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]

@@ -1,0 +1,55 @@
+"""ORB: oriented FAST corners and rotated BRIEF. Rublee et al., ICCV 2011."""
+
+from __future__ import annotations
+
+import hashlib
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.extractor import Features, check_image
+
+_SCALE, _LEVELS = 1.2, 8
+_BITS = 256
+
+
+class Orb:
+    """OpenCV's ORB with 256 bits as unit vectors; dimension 256.
+
+    A bit becomes +1/16 or -1/16, so each vector has unit length and the squared L2 distance of two
+    is h / 64, where h is the number of bits in which they differ: the order by L2 is the order by
+    Hamming distance, a ratio of L2 distances is the root of the ratio of Hamming distances, and
+    a limit of 0.7 in L2 means 31 bits.
+    """
+
+    name = "orb"
+    dimension = _BITS
+
+    def __init__(self, max_features: int = 1500) -> None:
+        self.max_features = max_features
+        self.sha256 = hashlib.sha256(b"orb/1 opencv-orb 256 bits 1.2 8 levels").hexdigest()
+        self._orb = cv2.ORB.create(nfeatures=max_features, scaleFactor=_SCALE, nlevels=_LEVELS)
+
+    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+        """Features of a grey image (H, W) uint8, strongest first."""
+        check_image(image)
+        keypoints, bits = self._orb.detectAndCompute(image, None)
+        if not keypoints or bits is None:
+            empty = np.empty((0, 2), np.float32)
+            return Features(empty, np.empty(0, np.float32), np.empty((0, _BITS), np.float32))
+        # OpenCV multiplies a level's pixel by its scale, which holds for pixels' corners: the
+        # centre of the first one lies half a coarse pixel from the corner, less half a fine one.
+        scale = _SCALE ** np.array([keypoint.octave for keypoint in keypoints])
+        positions = np.asarray(cv2.KeyPoint.convert(keypoints)) + (scale[:, None] - 1) / 2
+        scores = np.array([keypoint.response for keypoint in keypoints], np.float32)
+        order = np.argsort(-scores, kind="stable")[: self.max_features]
+        return Features(
+            positions[order].astype(np.float32), scores[order], unit_of_bits(np.asarray(bits, np.uint8)[order])
+        )
+
+
+def unit_of_bits(bits: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Binary descriptors (N, B / 8) as unit vectors (N, B) of the two values ±1/√B."""
+    signs = np.unpackbits(bits, axis=1).astype(np.float32) * 2 - 1
+    return np.asarray(signs / np.sqrt(np.float32(signs.shape[1])), np.float32)

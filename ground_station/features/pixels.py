@@ -1,0 +1,74 @@
+"""Features of a network of layout `pixels`: ALIKE's."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features import detection, sampling
+from ground_station.features.extractor import Features, check_image
+from ground_station.features.inference import Network
+from ground_station.features.padding import padded
+from ground_station.features.settings import LearnedSettings
+
+NMS_PX = 2
+THRESHOLD = 0.2
+"""Those of the published program's demonstration."""
+
+_TEMPERATURE = 0.1
+"""Of the soft-argmax; the paper's."""
+
+
+class PixelFeatures:
+    """Zhao et al., "ALIKE: Accurate and Lightweight Keypoint Detection and Descriptor Extraction",
+    IEEE T-MM 2022: maxima of the score map, refined by a soft-argmax over the window of the
+    suppression (section III-B), descriptors interpolated there bilinearly.
+
+    The network takes colour; a grey picture is given to it three times.
+    """
+
+    def __init__(self, network: Network, max_features: int, settings: LearnedSettings) -> None:
+        info = network.model.info
+        self.name, self.dimension = info.name, info.dimension
+        self.sha256 = network.model.sha256
+        self.max_features = max_features
+        self.nms_px = settings.nms_px or info.nms_px or NMS_PX
+        self.threshold = settings.threshold or (
+            THRESHOLD if info.threshold is None else info.threshold
+        )
+        self._network, self._info = network, info
+        self._window_px = info.subpixel_px or NMS_PX
+
+    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+        """Features of a grey image (H, W) uint8, strongest first."""
+        check_image(image)
+        whole = padded(image, self._info.multiple).astype(np.float32) * np.float32(1 / 255)
+        colour = np.repeat(whole[None, None], 3, axis=1)
+        outputs = self._network.run(colour)
+        return self.of_outputs(outputs["scores"][0, 0], outputs["descriptors"][0], image.shape)
+
+    def of_outputs(
+        self,
+        scores: npt.NDArray[np.float32],
+        descriptors: npt.NDArray[np.float32],
+        shape: tuple[int, ...],
+    ) -> Features:
+        """Features of a picture of `shape` (H, W) from what the network said of the padded one.
+
+        `scores` (H', W'), 0..1; `descriptors` (D, H', W').
+        """
+        scores = scores[: shape[0], : shape[1]]
+        if not (known := np.isfinite(scores)).all():
+            scores = np.where(known, scores, np.float32(0))
+        rows, columns = detection.strongest(
+            scores,
+            radius_px=self.nms_px,
+            threshold=self.threshold,
+            border_px=max(self.nms_px, self._window_px),
+            most=self.max_features,
+        )
+        points = detection.refined(
+            scores, rows, columns, radius_px=self._window_px, temperature=_TEMPERATURE
+        )
+        vectors, good = sampling.unit(sampling.bilinear(descriptors, points))
+        return Features(points[good], scores[rows, columns][good], vectors[good])
