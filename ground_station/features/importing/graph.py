@@ -5,7 +5,7 @@ Operators and their meaning: ONNX, opset 17 (onnx.ai/onnx/operators).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from ground_station import files
 from ground_station.features.extractor import FeatureError
+from ground_station.features.model import ModelInfo
 
 OPSET = 17
 IR_VERSION = 8
@@ -159,8 +160,12 @@ class Graph:
         least = self.weight("least_length", np.array(1e-12, np.float32))
         return self.node("Div", [x, self.node("Max", [length, least])])
 
-    def save(self, path: str | Path, metadata: Mapping[str, str]) -> None:
-        """Writes the model with its properties; raises `FeatureError` where it does not fit."""
+    def save(self, path: str | Path, info: ModelInfo) -> None:
+        """Writes the model and what it is; raises `FeatureError` where it does not fit together."""
+        files.write_bytes(path, self.model(info))
+
+    def model(self, info: ModelInfo) -> bytes:
+        """The bytes of the model's file; raises as `save` does."""
         graph = helper.make_graph(
             self._nodes, self.name, self._inputs, self._outputs, list(self._weights.values())
         )
@@ -170,8 +175,7 @@ class Graph:
             ir_version=IR_VERSION,
             producer_name="blimp",
         )
-        helper.set_model_props(model, dict(sorted(metadata.items())))
-        write(model, path)
+        return serialized(model, info)
 
     def _next(self, operator: str) -> str:
         """The name that the next node of this operator gets."""
@@ -183,45 +187,17 @@ class Graph:
         return label
 
 
-def write(model: onnx.ModelProto, path: str | Path) -> None:
-    """Checks a model and writes its bytes, the same for the same model, beside and renamed."""
+def serialized(model: onnx.ModelProto, info: ModelInfo) -> bytes:
+    """A model with what it is, checked, the same bytes for the same model."""
+    del model.metadata_props[:]
+    helper.set_model_props(model, dict(sorted(info.metadata().items())))
     try:
         onnx.checker.check_model(model, full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise FeatureError(f"{path}: the network does not fit together: {reason}") from None
-    files.write_bytes(path, model.SerializeToString(deterministic=True))
-
-
-def metadata(
-    name: str,
-    layout: str,
-    dimension: int,
-    multiple: int,
-    licence: str,
-    source: str,
-    nms_px: float | None = None,
-    threshold: float | None = None,
-) -> dict[str, str]:
-    """The properties of a model file, as `ground_station.features.model` reads them.
-
-    `layout` is "cells" or "pixels"; height and width must be multiples of `multiple`; `source` is
-    one line; `nms_px` and `threshold` are the detector's, where the model has its own.
-    """
-    result = {
-        "blimp.schema": "blimp.features/1.0",
-        "blimp.name": name,
-        "blimp.layout": layout,
-        "blimp.dimension": str(dimension),
-        "blimp.multiple": str(multiple),
-        "blimp.licence": licence,
-        "blimp.source": source,
-    }
-    if nms_px is not None:
-        result["blimp.nms_px"] = repr(float(nms_px))
-    if threshold is not None:
-        result["blimp.threshold"] = repr(float(threshold))
-    return result
+        raise FeatureError(f"{info.name}: the network does not fit together: {reason}") from None
+    data: bytes = model.SerializeToString(deterministic=True)
+    return data
 
 
 def fold_batch_norm(

@@ -6,6 +6,7 @@ in which `superpoint_v1.pth` (2018) is. What they look like stands in torch/seri
 
 from __future__ import annotations
 
+import hashlib
 import io
 import struct
 import zipfile
@@ -75,7 +76,7 @@ def read(path: str | Path) -> Weights:
     if len(data) > MOST_BYTES:
         raise WeightsError(f"{path}: more than {MOST_BYTES >> 20} MB")
     try:
-        return Weights(path, tensors(data))
+        return Weights(path, tensors(data), hashlib.sha256(data).hexdigest())
     except (PickleError, RecursionError) as error:
         raise WeightsError(f"{path}: {error}") from None
 

@@ -26,6 +26,7 @@ class Weights:
 
     path: Path
     tensors: Mapping[str, npt.NDArray[Any]]
+    sha256: str = ""
 
     def has(self, name: str) -> bool:
         """Whether there is a tensor of that name."""
