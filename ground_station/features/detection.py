@@ -42,14 +42,15 @@ def strongest(
 
     Greedy non-maximum suppression, as SuperPoint's: of the points above `threshold`, the strongest
     is taken and all within `radius_px` of it, along rows and columns, are dropped, and so on; then
-    those nearer than `border_px` to the picture's edge go. Of equal ones the first in reading order
-    is taken. Scores must be finite.
+    those nearer than `border_px` to the picture's edge go. Of neighbours with the same score either
+    may be taken, always the same one. Scores must be finite.
 
     A point that is the only highest of its window is taken in any order, so most are found by
     one maximum filter; only what these do not cover is gone through point by point.
     """
-    width = scores.shape[1]
-    left = np.where(scores > threshold, scores, np.float32(0))
+    shape = scores.shape
+    flat = np.ascontiguousarray(scores).ravel()
+    left = _above(flat.reshape(shape), threshold)
     window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
     taken: list[Indices] = []
     inside = np.empty(0, np.float32)  # scores of those taken that lie off the border
@@ -63,47 +64,54 @@ def strongest(
         if not len(alone):
             break
         taken.append(alone)
-        only = np.zeros_like(marks)
-        only.flat[alone] = 1
+        only = np.zeros(shape, np.uint8)
+        only.ravel()[alone] = 1
         left[cv2.dilate(only, window) != 0] = 0
-        kept = alone[_off_border(alone, scores.shape, border_px)]
-        inside = np.concatenate([inside, scores.flat[kept]])
+        inside = np.concatenate([inside, flat[alone[_off_border(alone, shape, border_px)]]])
         if len(inside) >= most:
             # What is weaker than enough others cannot come back.
-            left[left < np.partition(inside, len(inside) - most)[len(inside) - most]] = 0
-        if np.count_nonzero(left) <= _FEW:
+            last = np.partition(inside, len(inside) - most)[len(inside) - most]
+            left[left < last] = 0
+        if np.count_nonzero(left > 0) <= _FEW:
             break
     found = np.concatenate([*taken, _one_by_one(left, radius_px, border_px, most)])
-    found = found[_off_border(found, scores.shape, border_px)]
+    found = found[_off_border(found, shape, border_px)]
     # By score, then in reading order, so that the same picture gives the same list.
-    order = np.lexsort((found, -scores.flat[found]))[:most]
-    rows, columns = np.divmod(found[order], width)
+    order = np.lexsort((found, -flat[found]))[:most]
+    rows, columns = np.divmod(found[order], shape[1])
     return rows, columns
+
+
+def _above(scores: F32, threshold: float) -> F32:
+    """The scores that are above the threshold, 0 in place of the others; a copy."""
+    _, left = cv2.threshold(scores, threshold, 0, cv2.THRESH_TOZERO)
+    return np.asarray(left, np.float32)
 
 
 def _one_by_one(scores: F32, radius_px: int, border_px: int, most: int) -> Indices:
     """Greedy suppression of the points above 0; stops after `most` that lie off the border."""
-    places = np.flatnonzero(scores)
-    places = places[np.argsort(-scores.flat[places], kind="stable")]
-    rows, columns = np.divmod(places, scores.shape[1])
-    off = _off_border(places, scores.shape, border_px)
-    # With a margin, so that no window begins before the array.
-    free = np.ones((scores.shape[0] + radius_px, scores.shape[1] + radius_px), bool)
-    found = []
+    flat = scores.ravel()
+    places = np.flatnonzero(flat > 0)
+    places = places[np.argsort(-flat[places], kind="stable")]
+    free = np.ones(scores.shape, bool)
+    found: list[int] = []
     count = 0
-    for place, row, column, counts in zip(
-        places.tolist(), rows.tolist(), columns.tolist(), off.tolist(), strict=True
-    ):
-        if not free[row, column]:
-            continue
-        free[
-            max(0, row - radius_px) : row + radius_px + 1,
-            max(0, column - radius_px) : column + radius_px + 1,
-        ] = False
-        found.append(place)
-        count += counts
-        if count >= most:
-            break
+    for block in np.array_split(places, max(1, len(places) // 1000)):
+        rows, columns = np.divmod(block, scores.shape[1])
+        off = _off_border(block, scores.shape, border_px)
+        for place, row, column, counts in zip(
+            block.tolist(), rows.tolist(), columns.tolist(), off.tolist(), strict=True
+        ):
+            if not free[row, column]:
+                continue
+            free[
+                max(0, row - radius_px) : row + radius_px + 1,
+                max(0, column - radius_px) : column + radius_px + 1,
+            ] = False
+            found.append(place)
+            count += counts
+            if count >= most:
+                return np.array(found, np.intp)
     return np.array(found, np.intp)
 
 
