@@ -1,0 +1,95 @@
+"""Trained weights to the model's file. Needs no torch: the weights are numpy arrays by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.importing.graph import Graph, fold_batch_norm
+from ground_station.features.model import ModelInfo
+from ground_station.features.training.errors import TrainingError
+from ground_station.features.training.topology import LOGITS, Conv, Shape
+
+EPSILON = 1e-5
+"""Of the batch normalisations, in training and where they are folded."""
+
+LICENCE = "BSD-3-Clause"
+NMS_PX = 3
+THRESHOLD = 0.02
+SUBPIXEL_PX = 2
+
+Weights = Mapping[str, npt.NDArray[np.float32]]
+
+
+def info(shape: Shape, source: str) -> ModelInfo:
+    """What the file says of itself."""
+    return ModelInfo(
+        name=shape.name,
+        layout="cells",
+        dimension=shape.dimension,
+        multiple=shape.multiple,
+        licence=LICENCE,
+        source=source,
+        nms_px=NMS_PX,
+        threshold=THRESHOLD,
+        subpixel_px=SUBPIXEL_PX,
+    )
+
+
+class _OnnxOperations:
+    """The graph's nodes; batch normalisations are folded into the convolutions before them."""
+
+    def __init__(self, graph: Graph, weights: Weights) -> None:
+        self._graph, self._weights = graph, weights
+
+    def _take(self, name: str, *shape: int) -> npt.NDArray[np.float32]:
+        if name not in self._weights:
+            raise TrainingError(f"the weights lack '{name}'")
+        array = self._weights[name]
+        if array.shape != shape:
+            raise TrainingError(f"'{name}' is {array.shape}; this network has {shape}")
+        return array
+
+    def conv(self, layer: Conv, x: str) -> str:
+        n, name = layer.channels_out, layer.name
+        weight = self._take(f"{name}.weight", n, layer.channels_in, layer.size, layer.size)
+        if layer.norm:
+            terms = [self._take(f"{name}.norm.{t}", n) for t in ("weight", "bias", "mean", "var")]
+            weight, bias = fold_batch_norm(weight, None, *terms, EPSILON)
+        else:
+            bias = self._take(f"{name}.bias", n)
+        return self._graph.conv(x, weight, bias, stride=layer.stride, padding=layer.size // 2)
+
+    def relu(self, x: str) -> str:
+        return self._graph.relu(x)
+
+    def add(self, first: str, second: str) -> str:
+        return self._graph.add(first, second)
+
+    def concat(self, first: str, second: str) -> str:
+        return self._graph.concat([first, second])
+
+    def half(self, x: str) -> str:
+        return self._graph.max_pool(x, 2)
+
+    def double(self, x: str) -> str:
+        return self._graph.resize_bilinear(x, 2)
+
+
+def export(shape: Shape, weights: Weights, path: str | Path, source: str) -> ModelInfo:
+    """Writes the model's file, atomically; raises `TrainingError` naming a weight that is wrong.
+
+    Weights by name: `LAYER.weight` (out, in, k, k), and either `LAYER.bias` or
+    `LAYER.norm.weight|bias|mean|var`, all (out,).
+    """
+    graph = Graph(shape.name)
+    image = graph.input("image", 1)
+    logits, descriptors = shape.build(_OnnxOperations(graph, weights), image)
+    graph.output(logits, "logits", LOGITS)
+    graph.output(descriptors, "descriptors", shape.dimension)
+    made = info(shape, source)
+    graph.save(path, made)
+    return made
