@@ -15,6 +15,11 @@ _COMMANDS = (
     # name, room's command module, help
     ("simulate", "ground_station.simulator.command", "fly a simulated blimp and record it"),
     ("map", "ground_station.mapping.command", "build, register and inspect maps"),
+    (
+        "models",
+        "ground_station.features.importing.command",
+        "bring, inspect and quantize learned features",
+    ),
     ("localize", "ground_station.localization.command", "find the camera in a map, frame by frame"),
     ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
     ("record", "ground_station.service.record_command", "record payloads without the service"),
