@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from ground_station.features.extractors import create
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.association import associate
 from ground_station.localization.estimate import PoseEstimate
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.kinematics import Kinematics, Sights
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.pose_direct import solve_direct
@@ -198,8 +198,7 @@ def _fly(
     map_: Map, camera: Camera, preset: str, pictures: list[Frame], truth: Trajectory
 ) -> list[PoseEstimate]:
     settings = load_preset(preset)
-    extractor = create(settings.features.extractor, settings.features.max_features)
-    localizer = Localizer(map_, camera, extractor, settings)
+    localizer = Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
     first = pictures[0].time_ns
     localizer.set_initial_pose(truth.wTc[truth.nearest(first)], first)
     return [localizer.process(frame.time_ns, frame.image, frame.index) for frame in pictures]

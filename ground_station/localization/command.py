@@ -83,10 +83,10 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ground_station.errors import InputError
-    from ground_station.features.extractors import create
     from ground_station.files import write_json
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.trajectory import read_tum
+    from ground_station.localization.extraction import extractor_for
     from ground_station.localization.localizer import LocalizationError, Localizer
     from ground_station.localization.results import (
         flight_observations,
@@ -114,8 +114,7 @@ def run(args: argparse.Namespace) -> int:
     if not map_.info.registered:
         _say(f"the map '{map_.info.name}' is not registered: poses are in its own frame and scale")
     camera = load_camera(args.camera) if args.camera else source.camera or map_.info.camera
-    extractor = create(settings.features.extractor, settings.features.max_features)
-    localizer = Localizer(map_, camera, extractor, settings)
+    localizer = Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     start_s = monotonic()

@@ -5,18 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from importlib import resources
 
+from ground_station.features.settings import FeatureSettings
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
 PRESETS = ("default", "thesis")
-
-
-@dataclass(frozen=True)
-class FeatureSettings:
-    """Which features a frame is described by; the map must have been built with the same."""
-
-    extractor: str = config.key("rootsift", "name of the extractor")
-    max_features: int = config.key(1000, "strongest key points kept a frame", low=50, high=20000)
 
 
 @dataclass(frozen=True)

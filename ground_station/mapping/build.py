@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
-from ground_station.features.extractor import Features
+from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import colmap, landmarks, store
 from ground_station.mapping.consistency import plausible_frames
@@ -146,7 +146,7 @@ def extract(
                 f"the camera {camera.width_px}x{camera.height_px}"
             )
         if not hasattr(local, "extractor"):  # an extractor of its own for each thread
-            local.extractor = extractors.create(settings.features, settings.max_features)
+            local.extractor = _extractor(settings)
         return frame.name, frame.time_ns, local.extractor.extract(frame.image)
 
     rows: list[tuple[str, int, Features]] = []
@@ -167,6 +167,11 @@ def extract(
         features=[row[2] for row in rows],
         pinhole_px=[camera.undistort_to_pinhole(row[2].keypoints_px) for row in rows],
     )
+
+
+def _extractor(settings: MappingSettings) -> Extractor:
+    """As the settings say. A network gets one thread: pictures are described beside each other."""
+    return extractors.create(settings.features, settings.max_features, learned=settings.learned)
 
 
 def match(
@@ -262,7 +267,7 @@ def assemble(
     model: colmap.Model, images: Images, camera: Camera, settings: MappingSettings, name: str
 ) -> store.Map:
     """The map in memory from a refined model and the features it was made of."""
-    extracted = extractors.create(settings.features, settings.max_features)
+    extracted = _extractor(settings)
     source = model.image_id[model.image] - 1  # images have id = index + 1 in the database
     pick = [
         (images.features[i], f)

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     build.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
     build.add_argument("--camera", metavar="TOML", help="camera file; a recording carries its own")
     build.add_argument("--out", required=True, metavar="MAP", help="folder of the map")
-    build.add_argument("--features", help="feature extractor (default: the settings')")
+    build.add_argument("--features", help="extractor or model by name (default: the settings')")
     build.add_argument("--range", metavar="A:B[:S]", help="frames A up to B, every S-th")
     build.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
     build.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")

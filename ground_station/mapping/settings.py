@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ground_station.features.settings import LearnedSettings
 from pi_firmware.wire import config
 
 SHIPPED = Path(__file__).with_name("mapping.toml")
@@ -123,7 +124,7 @@ class RefineSettings:
 class MappingSettings:
     """How `blimp map build` works."""
 
-    features: str = config.key("rootsift", "feature extractor")
+    features: str = config.key("rootsift", "name of the extractor or of a model")
     max_features: int = config.key(
         1500, "features of an image, the strongest", unit="features", low=50, high=20000
     )
@@ -137,6 +138,7 @@ class MappingSettings:
     seed: int = config.key(0, "of every random choice", low=0, high=2**31 - 1)
     threads: int = config.key(0, "worker threads, 0: one a core", unit="threads", low=0, high=256)
     quantise: bool = config.key(True, "keep descriptors as one byte a number")
+    learned: LearnedSettings = field(default_factory=LearnedSettings)
     match: MatchSettings = field(default_factory=MatchSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)

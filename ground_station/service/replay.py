@@ -10,10 +10,10 @@ from typing import Any
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
-from ground_station.features import extractors
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization import results
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings, for_live
 from ground_station.mapping import store
@@ -125,8 +125,7 @@ def replay(
     camera = camera_of(reader)
     if camera is None:
         raise InputError(f"{settings.recording}: it carries no camera calibration")
-    features = localizer_settings.features
-    extract = extractors.create(features.extractor, features.max_features)
+    extract = extractor_for(map_.info, localizer_settings.features)
     if not settings.stepped:
         localizer_settings = for_live(localizer_settings)
     localizer = Localizer(map_, camera, extract, localizer_settings)

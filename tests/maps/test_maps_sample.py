@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 
 from ground_station.evaluation.floorplan import load_floorplan
-from ground_station.features import extractors
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.poses import rotation_angle
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.settings import load_preset
 from ground_station.mapping import store
 from ground_station.mapping.settings import load_settings
@@ -64,8 +64,7 @@ def test_the_map_is_registered_to_the_building() -> None:
 
 def test_the_map_is_of_the_features_and_settings_that_are_used() -> None:
     info = store.load_info(SAMPLE)
-    features = load_preset("thesis").features
-    used = extractors.create(features.extractor, features.max_features)
+    used = extractor_for(info, load_preset("thesis").features)
     store.check_features(info, used.name, used.sha256)
     settings = load_settings(SAMPLE / "mapping.toml")
     assert info.built["settings"]["sfm"]["min_track"] == settings.sfm.min_track == 4

@@ -45,18 +45,18 @@ def maps(settings: MapSettings, preset: str) -> Iterator[Finding]:
 
 def _features(info, preset: str, folder: Path) -> Finding:  # type: ignore[no-untyped-def]
     """The extractor is there, with its model where it has one, and made the map's descriptors."""
-    from ground_station.features import extractors
+    from ground_station.localization.extraction import extractor_for
     from ground_station.localization.settings import load_preset
-    from ground_station.mapping import store
 
-    name = load_preset(preset).features.extractor
     try:
-        extractor = extractors.create(name)
-        store.check_features(info, extractor.name, extractor.sha256)
+        extractor = extractor_for(info, load_preset(preset).features)
     except GroundStationError as error:
-        mend = f"build {folder} anew with these features (blimp map build --features {name})"
+        mend = (
+            f"bring that model (blimp models), or build {folder} anew with features that are here "
+            "(blimp map build --features NAME)"
+        )
         return problem("features", str(error), mend)
-    found = f"'{name}' ({extractor.sha256[:12]}), the map's; preset '{preset}'"
+    found = f"'{extractor.name}' ({extractor.sha256[:12]}), the map's; preset '{preset}'"
     return ok("features", found)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ground_station.errors import MapError
-from ground_station.features import extractors
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import for_live, load_preset
 from ground_station.mapping import store
@@ -48,9 +48,7 @@ def prepare(folder: Path, settings: StationSettings) -> Localizer:
     if not map_.info.registered:
         raise MapError(f"{folder}: it is not registered, so its poses are not in metres")
     camera = camera_of(settings.map, map_.info)
-    features = live.features
-    extractor = extractors.create(features.extractor, features.max_features)
-    return Localizer(map_, camera, extractor, live)
+    return Localizer(map_, camera, extractor_for(map_.info, live.features), live)
 
 
 @dataclass

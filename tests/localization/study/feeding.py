@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from study.metrics import pose_errors
 
-from ground_station.features.extractors import create
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.store import Map
@@ -110,8 +110,7 @@ class Run:
 
 
 def make_localizer(map_: Map, camera: Camera, settings: LocalizerSettings) -> Localizer:
-    extractor = create(settings.features.extractor, settings.features.max_features)
-    return Localizer(map_, camera, extractor, settings)
+    return Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
 
 
 def close(localizer: Localizer) -> None:

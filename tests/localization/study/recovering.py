@@ -20,8 +20,8 @@ from study.metrics import (
 )
 from study.row import Line, Row, Study, seeds
 
-from ground_station.features.extractors import create
 from ground_station.localization.estimate import State
+from ground_station.localization.extraction import extractor_for
 from ground_station.localization.relocalization import Relocalizer
 
 BEFORE = 30
@@ -233,7 +233,7 @@ def ask_alone(study: Study, flights: Sequence[Flight]) -> dict[str, Any]:
     step = max(1.0, len(every) / study.count)
     chosen = [every[int(k * step)] for k in range(min(study.count, len(every)))]
     settings = study.settings
-    extractor = create(settings.features.extractor, settings.features.max_features)
+    extractor = extractor_for(study.map_.info, settings.features)
     finders = [Relocalizer(study.map_, f.camera, settings.recovery, settings.seed) for f in flights]
     accepted, refused, took = [], Counter[str](), []
     for k, frame in chosen:
