@@ -16,12 +16,29 @@ COMMANDS = [
     ["replay"],
     ["command"],
     ["serve"],
+    ["models", "list"],
+    ["models", "import"],
+    ["models", "quantize"],
+    ["models", "info"],
     ["evaluate"],
     ["keys"],
     ["bench", "localize"],
     ["bench", "payload"],
 ]
-HEAVY = ("numpy", "cv2", "pycolmap", "gtsam", "mujoco", "matplotlib", "zenoh", "av", "gi", "scipy")
+HEAVY = (
+    "numpy",
+    "cv2",
+    "pycolmap",
+    "gtsam",
+    "mujoco",
+    "matplotlib",
+    "zenoh",
+    "av",
+    "gi",
+    "scipy",
+    "onnx",
+    "onnxruntime",
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

@@ -8,7 +8,6 @@ import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ground_station.features.extractor import FeatureError
 from ground_station.files import write_json
 
 if TYPE_CHECKING:
@@ -107,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _list(_: argparse.Namespace) -> dict[str, Any]:
     from ground_station.features import catalogue, extractors
+    from ground_station.features.extractor import FeatureError
 
     models, broken = [], {}
     for name in catalogue.names():
@@ -148,6 +148,14 @@ def _import(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _quantize(args: argparse.Namespace) -> dict[str, Any]:
+    import hashlib
+
+    from ground_station.features import catalogue, extractors
+    from ground_station.features.extractor import FeatureError
+    from ground_station.features.importing import comparison, importer, quantize
+    from ground_station.features.model import Model
+    from ground_station.recording.open import open_input, parse_range
+
     for option, value, (low, high) in (
         ("--frames", args.frames, _FRAMES),
         ("--threads", args.threads, _THREADS),
@@ -155,13 +163,6 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     ):
         if not low <= value <= high:
             raise FeatureError(f"{option} is {value}; allowed: {low} to {high}")
-    import hashlib
-
-    from ground_station.features import catalogue, extractors
-    from ground_station.features.importing import comparison, importer, quantize
-    from ground_station.features.model import Model
-    from ground_station.recording.open import open_input, parse_range
-
     name = args.name or f"{args.model}-{args.to}"
     extractors.check_free(name)
     if name in catalogue.names():
