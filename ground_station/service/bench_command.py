@@ -19,6 +19,12 @@ _COMMANDS = (
         "start, latency, memory and instructions a frame of the firmware",
         "Measures the payload's own program on this machine, streaming its test picture.",
     ),
+    (
+        "features",
+        "ground_station.evaluation.features.command",
+        "extractors on known homographies, real poses and simulated flights",
+        "Measures all extractors: how often points are found again and matched, errors, time.",
+    ),
 )
 
 

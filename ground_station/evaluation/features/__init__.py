@@ -1,0 +1,1 @@
+"""How good features are: `blimp bench features`."""
