@@ -26,6 +26,7 @@ from ground_station.features.importing.weights import Weights, WeightsError
 
 MOST_BYTES: Final = 512 << 20
 """Of a file; SuperPoint's has 5 MB."""
+_PIECE_BYTES = 1 << 20
 _MOST_DIMENSIONS = 8
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_BEGINS = b"\x8a\x0a" + _LEGACY_MAGIC.to_bytes(10, "little")
@@ -69,15 +70,17 @@ def read(path: str | Path) -> Weights:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+        data = bytearray()
+        with path.open("rb") as file:  # in pieces: what is asked for at once is allocated at once
+            while piece := file.read(_PIECE_BYTES):
+                data += piece
+                if len(data) > MOST_BYTES:
+                    raise WeightsError(f"{path}: more than {MOST_BYTES >> 20} MB")
     except OSError as error:
         raise WeightsError(f"{path}: {error.strerror or error}") from None
-    if len(data) > MOST_BYTES:
-        raise WeightsError(f"{path}: more than {MOST_BYTES >> 20} MB")
     try:
-        return Weights(path, tensors(data), hashlib.sha256(data).hexdigest())
-    except (PickleError, RecursionError) as error:
+        return Weights(path, tensors(bytes(data)), hashlib.sha256(data).hexdigest())
+    except PickleError as error:
         raise WeightsError(f"{path}: {error}") from None
 
 
