@@ -45,14 +45,15 @@ class Graph:
         self._inputs.append(_value(name, channels, "height", "width"))
         return name
 
-    def output(self, x: str, name: str, channels: int) -> None:
-        """Makes `x` an output of that name, (N, channels, its own height, its own width)."""
+    def output(self, x: str, name: str, channels: int) -> str:
+        """Makes `x` an output (N, channels, its own height, its own width); it is called so now."""
         if any(value.name == x for value in (*self._inputs, *self._outputs)):
             x = self.node("Identity", [x])
         for node in self._nodes:
             for place in (node.input, node.output):
                 place[:] = [name if tensor == x else tensor for tensor in place]
         self._outputs.append(_value(name, channels, f"{name}_height", f"{name}_width"))
+        return name
 
     def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
         """Any ONNX operator with one output."""
