@@ -19,7 +19,7 @@ EPSILON = 1e-5
 LICENCE = "BSD-3-Clause"
 NMS_PX = 3
 THRESHOLD = 0.02
-SUBPIXEL_PX = 2
+SUBPIXEL_PX = 1
 
 Weights = Mapping[str, npt.NDArray[np.float32]]
 
