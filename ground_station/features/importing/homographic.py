@@ -66,8 +66,10 @@ def correct_matches(
 
     `matrix` takes the first picture to the second, whose shape is (H, W).
     """
+    if not len(first):
+        return 0, 0
     points = cv2.perspectiveTransform(first.keypoints_px[None].astype(np.float64), matrix)
-    there = points.reshape(-1, 2) if len(first) else np.empty((0, 2))
+    there = points.reshape(-1, 2)
     seen = np.all((there >= 0) & (there <= (shape[1] - 1, shape[0] - 1)), axis=1)
     there, descriptors = there[seen], first.descriptors[seen]
     if not len(there) or not len(second):
