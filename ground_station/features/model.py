@@ -169,4 +169,7 @@ def read(path: str | Path) -> Model:
         inspection.check(proto, info)
     except FeatureError as error:
         raise FeatureError(f"{path}: {error}") from None
+    except (TypeError, ValueError, LookupError) as error:
+        # protobuf hands on text that is none as bytes, and numbers beyond what they count.
+        raise FeatureError(f"{path}: it is damaged ({type(error).__name__})") from None
     return Model(path, info, data, hashlib.sha256(data).hexdigest())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import made_up
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 from reference import plain_alike, plain_superpoint
@@ -112,6 +113,16 @@ def test_scores_of_pixels_that_are_not_finite_give_no_features(pixels):
     found = extractor.of_outputs(scores, rng.normal(size=(8, 60, 60)).astype(np.float32), (60, 60))
     assert len(found) > 5 and found.keypoints_px[:, 1].min() > 27
     assert np.isfinite(found.keypoints_px).all() and found.scores.max() < 1
+
+
+def test_weights_that_are_no_numbers_give_no_features(tmp_path, image):
+    path = made_up.write_cells(tmp_path, made_up.info())
+    proto = onnx.load_model(path)
+    for tensor in proto.graph.initializer:
+        tensor.raw_data = np.full(len(tensor.raw_data) // 4, np.nan, np.float32).tobytes()
+    path.write_bytes(proto.SerializeToString())
+    found = CellFeatures(Network(model.read(path)), 100, LearnedSettings()).extract(image)
+    assert len(found) == 0
 
 
 def test_a_picture_without_anything_has_no_features(tmp_path):

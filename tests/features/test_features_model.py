@@ -195,3 +195,21 @@ def test_what_a_network_takes_is_counted(tmp_path):
     pixels = 640 * 480
     expected = pixels * 9 * (8 + 8 * 12 / 4 + 12 * 16 / 16) + pixels / 64 * 16 * (65 + 16)
     assert inspection.macs(found.data, found.info) == pytest.approx(expected)
+
+
+def test_flipped_bytes_are_read_or_refused_in_one_line(path):
+    """Nothing but `FeatureError` comes of a damaged file, whatever onnx makes of it."""
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    refusals = 0
+    for _ in range(500):
+        broken = bytearray(whole)
+        for place in rng.integers(0, len(whole), 3):
+            broken[place] ^= 1 << rng.integers(0, 8)
+        path.write_bytes(broken)
+        try:
+            model.read(path)
+        except FeatureError as error:
+            refusals += 1
+            assert "\n" not in str(error) and len(str(error)) < 500
+    # Most of the file is weights, of which any value is one.
+    assert 20 < refusals < 500
