@@ -30,7 +30,7 @@ def providers() -> dict[str, str]:
 def threads_beside_tracker() -> int:
     """All cores this process may use but one, which the tracker has; at least one, at most 4.
 
-    More than that many threads make no picture of our camera's size faster by much.
+    A ground station has other work than one network, and other payloads.
     """
     return min(4, max(1, len(os.sched_getaffinity(0)) - 1))
 
@@ -56,13 +56,14 @@ class Network:
         options.log_severity_level = 4  # what is wrong comes as an exception; its log is noise
         # Threads that wait for work in a loop take the tracker's core.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        # Values next to nought are reckoned a hundred times as slowly as others.
+        # Values next to nought take a processor many times as long as others.
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
-        wanted = [known[provider]]
-        if provider != "cpu":
-            wanted.append("CPU" + _SUFFIX)
+        # What a provider has no kernel for, onnxruntime's own run.
+        wanted = [(known[provider], _options(provider, threads)), ("CPU" + _SUFFIX, {})]
         try:
-            self._session = onnxruntime.InferenceSession(model.data, options, providers=wanted)
+            self._session = onnxruntime.InferenceSession(
+                model.data, options, providers=wanted[:1] if provider == "cpu" else wanted
+            )
         except Exception as error:  # onnxruntime's have no common base but this
             raise FeatureError(f"{model.path}: onnxruntime refuses it: {_line(error)}") from None
         if self._session.get_providers()[0] != known[provider]:
@@ -86,6 +87,13 @@ class Network:
             name: np.asarray(value, np.float32)
             for name, value in zip(self._outputs, values, strict=True)
         }
+
+
+def _options(provider: str, threads: int) -> dict[str, str]:
+    """What a provider is told beside the session's options, which OpenVINO does not look at."""
+    if provider == "openvino":
+        return {"device_type": "CPU", "num_of_threads": str(threads)}
+    return {}
 
 
 def _line(error: Exception) -> str:
