@@ -20,7 +20,8 @@ from types import FrameType, ModuleType
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parents[1])]  # of the checkout, `deploy` is not installed
-sys.path.append(str(HERE.parent / "mapping"))  # small models that its tests have, too
+# What the tests of these rooms make, too: small models, weights, networks.
+sys.path += [str(HERE.parent / "mapping"), str(HERE.parent / "features")]
 import pieces  # noqa: E402
 
 MEMORY_BYTES = 1 << 30

@@ -31,6 +31,8 @@ READERS = (
     Reader("maps", "map.toml, landmarks and keyframes"),
     Reader("colmap", "COLMAP's binary models"),
     Reader("observations", "a flight's observations for the refinement"),
+    Reader("weights", "weights of torch and safetensors, and networks built from them", 8192),
+    Reader("model", "learned models: ONNX files", 32768),
     Reader("floorplan", "floorplan.yaml and its picture"),
     Reader("image", "image files"),
     Reader("camera", "camera files"),
