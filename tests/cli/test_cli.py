@@ -20,6 +20,7 @@ COMMANDS = [
     ["models", "import"],
     ["models", "quantize"],
     ["models", "info"],
+    ["models", "train"],
     ["evaluate"],
     ["keys"],
     ["bench", "localize"],
@@ -38,6 +39,7 @@ HEAVY = (
     "scipy",
     "onnx",
     "onnxruntime",
+    "torch",
 )
 
 

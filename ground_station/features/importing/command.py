@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ground_station.features.training import command as training
 from ground_station.files import write_json
 
 if TYPE_CHECKING:
     from ground_station.features.importing.comparison import Comparison
     from ground_station.features.model import Model
 
-_TRAINING = "ground_station.features.training.command"
 _FRAMES = (4, 512)
 _THREADS = (1, 64)
 _SIZE_PX = (640, 480)
@@ -79,20 +77,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     small.add_argument("--seed", type=int, default=1, help="of the warps (default 1)")
     info = add("info", "Tells what a model is.", _INFO_EXAMPLE)
     info.add_argument("model", metavar="NAME", help="see `blimp models list`")
-    if importlib.util.find_spec(_TRAINING) is not None:
-        train = commands.add_parser(
-            "train",
-            help=_TRAIN_HELP,
-            description=_TRAIN_HELP[0].upper() + _TRAIN_HELP[1:] + ".",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        importlib.import_module(_TRAINING).add_arguments(train)
+    train = commands.add_parser(
+        "train",
+        help=_TRAIN_HELP,
+        description=_TRAIN_HELP[0].upper() + _TRAIN_HELP[1:] + ".",
+    )
+    training.add_arguments(train)
 
 
 def run(args: argparse.Namespace) -> int:
     """Runs one of them; returns the exit status."""
     if args.models_command == "train":
-        return int(importlib.import_module(_TRAINING).run(args))
+        return training.run(args)
     document = {
         "list": _list,
         "import": _import,
