@@ -29,6 +29,7 @@ def teacher(tmp_path_factory) -> str:
 def make(folder: Path, settings: CorpusSettings, teacher: str) -> None:
     """As `corpus.make` does, in this process."""
     worker = Teacher(load(teacher))
+    folder.mkdir(exist_ok=True)
     for kind, number in settings.shards():
         path = corpus.shard_path(folder, kind, number)
         if not path.exists():

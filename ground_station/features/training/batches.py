@@ -66,6 +66,7 @@ def batches(
         prefetch_factor=_AHEAD if jobs else None,
         pin_memory=on_gpu,
         worker_init_fn=_start,
+        generator=torch.Generator(),  # not the one whose state checkpoints keep
     )
     for items in loader:
         images, labels, known, points_px, used, teacher = (

@@ -40,7 +40,7 @@ def _digest(arrays: Arrays) -> str:
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(name.encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+        digest.update(arrays[name].tobytes())
     return digest.hexdigest()
 
 
@@ -49,7 +49,7 @@ def write(folder: Path, checkpoint: Checkpoint, keep_every: int) -> Path:
     path = folder / f"step-{checkpoint.step:07d}.safetensors"
     part = path.with_name(path.name + ".part")
     note = {"state": json.dumps(checkpoint.state), "sha256": _digest(checkpoint.arrays)}
-    data = save({k: np.ascontiguousarray(v) for k, v in checkpoint.arrays.items()}, note)
+    data = save({k: np.array(v, order="C") for k, v in checkpoint.arrays.items()}, note)
     try:
         with part.open("wb") as file:
             file.write(data)

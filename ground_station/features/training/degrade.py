@@ -53,7 +53,7 @@ def degrade(picture: Bytes, rng: Rng, chances: Chances | None = None) -> Bytes:
     result = quantized(code)
     if rng.random() < c.compression:
         # The frame before was taken a little elsewhere, and has another noise.
-        step = np.float32([[1, 0, 2 * motion[0]], [0, 1, 2 * motion[1]]])
+        step = np.array([[1, 0, 2 * motion[0]], [0, 1, 2 * motion[1]]], np.float32)
         before = cv2.warpAffine(
             code, step, (code.shape[1], code.shape[0]), borderMode=cv2.BORDER_REPLICATE
         )
@@ -106,8 +106,8 @@ def shadow(shape: tuple[int, ...], rng: Rng) -> F32:
             ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius[:, None]
             corners = ring + rng.uniform(0, 1, 2) * size
             cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1.0)
-    mask = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.7, 6)))
-    return (1 - np.float32(rng.uniform(0.3, 0.9)) * mask).astype(np.float32)
+    soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.7, 6)))
+    return np.asarray(1 - np.float32(rng.uniform(0.3, 0.9)) * soft, np.float32)
 
 
 def defocus(linear: F32, radius_px: float) -> F32:

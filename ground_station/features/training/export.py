@@ -57,8 +57,10 @@ class _OnnxOperations:
         n, name = layer.channels_out, layer.name
         weight = self._take(f"{name}.weight", n, layer.channels_in, layer.size, layer.size)
         if layer.norm:
-            terms = [self._take(f"{name}.norm.{t}", n) for t in ("weight", "bias", "mean", "var")]
-            weight, bias = fold_batch_norm(weight, None, *terms, EPSILON)
+            scale, shift, mean, variance = (
+                self._take(f"{name}.norm.{term}", n) for term in ("weight", "bias", "mean", "var")
+            )
+            weight, bias = fold_batch_norm(weight, None, scale, shift, mean, variance, EPSILON)
         else:
             bias = self._take(f"{name}.bias", n)
         return self._graph.conv(x, weight, bias, stride=layer.stride, padding=layer.size // 2)

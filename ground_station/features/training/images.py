@@ -129,7 +129,7 @@ def walls(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
         scale = float(rng.uniform(60, 240))
         albedo = MATERIALS[name](bank, h, w, scale, rng, **options) @ _LUMINANCE
         light = np.float32(np.exp(rng.normal(0, 0.6)))
-        corners = np.float32([[0, 0], [w, 0], [w, h], [0, h]])
+        corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32)
         place = rng.uniform(-0.2, 0.9, 2) * (columns, rows)
         bent = corners + place + rng.normal(0, 0.12, (4, 2)) * (w, h)
         turn = cv2.getRotationMatrix2D(bent.mean(axis=0).tolist(), float(rng.normal(0, 20)), 1.0)
@@ -150,7 +150,7 @@ def shapes(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
     """What people make: chequers, gratings, polygons, lines, discs and letters on a background."""
     rows, columns = size
     canvas = _texture(bank, size, rng) if rng.random() < 0.7 else np.ones(size, np.float32)
-    canvas *= np.float32(rng.uniform(0.1, 0.8))
+    canvas = canvas * np.float32(rng.uniform(0.1, 0.8))
     kinds = (_chequers, _grating, _polygon, _lines, _text, _text, _polygon)
     for _ in range(int(rng.integers(8, 40))):
         kind = kinds[int(rng.integers(len(kinds)))]

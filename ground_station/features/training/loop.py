@@ -19,6 +19,7 @@ import torch
 
 from ground_station.features import model
 from ground_station.features.cells import CellFeatures
+from ground_station.features.extractor import Extractor
 from ground_station.features.inference import Network
 from ground_station.features.pixels import PixelFeatures
 from ground_station.features.rootsift import RootSift
@@ -86,6 +87,7 @@ def train(
     start = checkpoint.newest(checkpoints)
     if start is not None and not resume:
         raise TrainingError(f"{out} holds a run at step {start.step}; go on with --resume")
+    fresh = start is None
     if start is None and decay_from is not None:
         start = checkpoint.read(decay_from)
         recipe = recipe.decaying_from(start.step)
@@ -112,7 +114,7 @@ def train(
     run = _Run(recipe, trainer, out, machine, before_s, [
         held.pair(0, k) for k in range(_HELD_OUT_PAIRS)
     ])  # fmt: skip
-    if step == 0 or decay_from is not None:
+    if fresh:
         run.baselines(teacher, step)
     return run.go(source, step)
 
@@ -140,7 +142,7 @@ class _Run:
     def baselines(self, teacher_name: str, step: int) -> None:
         """What others make of the same held-out pairs."""
         found = teacher.load(teacher_name)
-        others = {
+        others: dict[str, Extractor] = {
             "rootsift": RootSift(_MOST_POINTS),
             found.info.name: PixelFeatures(
                 Network(found, threads=self.machine.threads), _MOST_POINTS, LearnedSettings()
@@ -220,7 +222,8 @@ class _Run:
         """Raises `TrainingError` where the file does not say what torch says."""
         from ground_station.features.training.network import FeatureNetwork
 
-        mean = FeatureNetwork(self.trainer.shape)
+        with torch.random.fork_rng(devices=[]):  # the first weights are drawn for nothing
+            mean = FeatureNetwork(self.trainer.shape)
         mean.load_state_dict({k: v.cpu() for k, v in self.trainer.mean.items()})
         mean.eval()
         with torch.no_grad():

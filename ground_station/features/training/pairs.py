@@ -53,7 +53,8 @@ def view_of(picture: Bytes, matrix: npt.NDArray[np.float64], size: tuple[int, in
     """A view of (rows, columns) through `matrix`, from its pixels to the picture's."""
     scale = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
     if scale > 1.1:  # smaller than the picture: what a view's pixel collects
-        picture = cv2.GaussianBlur(picture, (0, 0), float(0.5 * np.sqrt(scale**2 - 1)))
+        sigma = float(0.5 * np.sqrt(scale**2 - 1))
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma), np.uint8)
     return np.asarray(
         cv2.warpPerspective(
             picture, matrix, size[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,

@@ -273,7 +273,8 @@ def _pictures(
             if choosy and float(np.percentile(depth[::8, ::8], 10)) < _NEAR_M:
                 continue
             size = (camera.width_px, camera.height_px)
-            radiance = cv2.resize(cv2.LUT(codes, lit.decoder()), size, interpolation=cv2.INTER_AREA)
+            small = cv2.resize(cv2.LUT(codes, lit.decoder()), size, interpolation=cv2.INTER_AREA)
+            radiance = np.asarray(small, np.float32)
             exposure_s, gain = AutoExposure(maker.sensor, radiance).settings
             # Noise is the degradation's business.
             picture = maker.expose(radiance, exposure_s, gain, None)

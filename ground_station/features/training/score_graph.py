@@ -76,6 +76,7 @@ def _prune(graph: onnx.GraphProto) -> None:
     nodes = [node for node in graph.node if node.output[0] in needed]
     weights = [tensor for tensor in graph.initializer if tensor.name in needed]
     outputs = [output for output in graph.output if output.name == "scores"]
-    for field, kept in ((graph.node, nodes), (graph.initializer, weights), (graph.output, outputs)):
-        del field[:]
-        field.extend(kept)
+    del graph.node[:], graph.initializer[:], graph.output[:]
+    graph.node.extend(nodes)
+    graph.initializer.extend(weights)
+    graph.output.extend(outputs)

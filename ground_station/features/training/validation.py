@@ -41,7 +41,9 @@ def figures(extractor: Extractor, pairs: list[Pair]) -> Figures:
         accuracies.append(correct / matches if matches else 0.0)
         numbers.append(correct)
         forth = _distances(first, second, matrix, pair.images[1].shape)
-        back = _distances(second, first, np.linalg.inv(matrix), pair.images[0].shape)
+        back = _distances(
+            second, first, np.asarray(np.linalg.inv(matrix), np.float64), pair.images[0].shape
+        )
         distances = np.concatenate([forth, back])
         near = distances <= LIMIT_PX
         repeated.append(float(near.mean()) if len(near) else 0.0)

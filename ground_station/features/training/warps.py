@@ -32,7 +32,7 @@ class WarpLimits:
     """Of a rolling shutter: the columns by which a row runs ahead of the one below it."""
 
 
-def apply(matrix: Array, points_px: npt.NDArray[np.floating]) -> Array:
+def apply(matrix: npt.NDArray[np.floating], points_px: npt.NDArray[np.floating]) -> Array:
     """Points (N, 2) through a homography: (N, 2). Points on or behind the horizon become NaN."""
     homogeneous = points_px @ matrix[:, :2].T + matrix[:, 2]
     depth = np.where(homogeneous[:, 2:] > 1e-9, homogeneous[:, 2:], np.nan)
