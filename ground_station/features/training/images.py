@@ -157,7 +157,8 @@ def shapes(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
         h, w = (int(s * np.exp(rng.uniform(np.log(0.06), np.log(0.5)))) + 8 for s in size)
         patch, mask = kind((h, w), rng)
         turn = cv2.getRotationMatrix2D((w / 2, h / 2), float(rng.normal(0, 35)), 1.0)
-        turn[:, 2] += rng.uniform(-0.2, 1.0, 2) * (columns, rows)
+        x, y = rng.uniform(-0.2, 1.0, 2) * (columns, rows)
+        turn = turn + np.array([[0, 0, x], [0, 0, y]])
         flags = cv2.INTER_LINEAR
         over = cv2.warpAffine(mask, turn, (columns, rows), flags=flags)
         tone = cv2.warpAffine(patch, turn, (columns, rows), flags=flags)
