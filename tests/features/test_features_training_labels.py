@@ -1,10 +1,13 @@
 """Warps, labels and pairs: what training calls true must be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ground_station.features import detection
-from ground_station.features.training import images, labels, pairs, warps
+from ground_station.features.rootsift import RootSift
+from ground_station.features.training import images, labels, pairs, validation, warps
 from ground_station.features.training.corpus import Place
 
 PICTURE, VIEW = (192, 256), (96, 128)
@@ -132,3 +135,20 @@ def test_the_same_step_gives_the_same_pair():
     first, again, other = source.pair(7, 1), source.pair(7, 1), source.pair(8, 1)
     assert all((getattr(first, k) == getattr(again, k)).all() for k in vars(first))
     assert (first.images != other.images).any()
+
+
+def test_the_figures_of_validation_are_those_of_the_truth():
+    one = place(np.random.default_rng(6))
+    pair = pairs.make_pair(one, np.random.default_rng(7), VIEW, 32)
+    size = (120, 160)
+    picture = images.procedural(9, 2, size)
+    shifted = np.roll(picture, (4, -6), axis=(0, 1))
+    matrix = np.array([[1, 0, -6], [0, 1, 4], [0, 0, 1.0]])
+    pair = replace(pair, images=np.stack([picture, shifted]), second_from_first=matrix)
+    right = validation.figures(RootSift(200), [pair])
+    assert right.accuracy > 0.9 and right.repeatability > 0.8 and right.correct > 20
+    assert right.error_px < 0.1
+    # A truth that is wrong by 20 px makes all of it chance.
+    wrong = replace(pair, second_from_first=matrix + np.array([[0, 0, 20], [0, 0, 0], [0, 0, 0]]))
+    chance = validation.figures(RootSift(200), [wrong])
+    assert chance.accuracy < 0.2 and chance.error_px > 0.5
