@@ -53,7 +53,7 @@ def outputs(found: model.Model, image: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(names, session.run(names, {"image": blob}), strict=True))
 
 
-@pytest.mark.parametrize(("kind", "most"), [("int8", 0.05), ("fp16", 5e-3)])
+@pytest.mark.parametrize(("kind", "most"), [("int8", 0.1), ("fp16", 5e-3)])
 def test_a_form_says_nearly_what_the_model_says(
     tmp_path: Path, fp32: model.Model, kind: str, most: float
 ) -> None:
@@ -76,8 +76,8 @@ def test_an_int8_form_computes_with_integers_but_for_the_heads(
     assert kinds.count("DequantizeLinear") == len(kinds) - heads and kinds.count("float") == heads
     weights = [array for array in constants.values() if array.dtype == np.int8 and array.ndim == 4]
     assert len(weights) == len(kinds) - heads
-    for array in weights:  # one scale a channel: each uses the whole range
-        assert np.all(np.abs(array.astype(int)).max(axis=(1, 2, 3)) == 127)
+    for array in weights:  # one scale a channel: each uses the whole range of seven bits
+        assert np.all(np.abs(array.astype(int)).max(axis=(1, 2, 3)) == 64)
 
 
 def test_an_fp16_form_is_half_the_file_and_the_same_for_the_same(
