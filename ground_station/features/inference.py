@@ -54,7 +54,8 @@ class Network:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what is wrong comes as an exception; its log is noise
-        # Threads that wait for work in a loop take the tracker's core.
+        # Threads that wait for work in a loop take the tracker's core: a picture at 1.2 GMAC with
+        # two threads took 26 ms of processor time without that, 88 ms with it, and was no faster.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         # Values next to nought take a processor many times as long as others.
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
