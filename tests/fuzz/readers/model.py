@@ -9,7 +9,7 @@ from typing import Any
 import made_up
 import onnx
 from onnx import helper
-from pieces import Picker, odd, refusing, scratch
+from pieces import Picker, as_json, odd, refusing, scratch
 
 from ground_station.features import inspection, model
 from ground_station.features.extractor import FeatureError
@@ -65,8 +65,7 @@ def _change(picker: Picker, proto: onnx.ModelProto) -> None:
         value.type.tensor_type.elem_type = picker.number(1) % 24
     elif how == 8:
         entry = _one_of(picker, proto.metadata_props)
-        text = str(odd(picker))
-        entry.value = text.encode(errors="replace").decode()[:4000]
+        entry.value = as_json(odd(picker)).decode(errors="replace")[:4000]
     elif how == 9:
         proto.opset_import[0].version = picker.of((1, 16, 17, 18, 20, 22, 26, 27, 2**40, -1))
 
