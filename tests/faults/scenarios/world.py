@@ -61,6 +61,7 @@ class World:
         seed: int = 0,
         rate_hz: float = RATE_HZ,
     ) -> None:  # fmt: skip
+        folder = folder.resolve()  # service and payload run in folders of their own
         self.folder = folder
         self.cameras = cameras
         self.heard = Heard()
