@@ -15,6 +15,8 @@ Example: blimp models train --size wren --teacher alike-n --out out/training/wre
          blimp models train --out out/training/final --decay-from \\
              out/training/wren/checkpoints/step-0010000.safetensors
 
+         blimp models train --device cuda --batch 64 --steps 6000 --rate 0.003
+
 The teacher is ALIKE, brought by `blimp models import alike-n.safetensors`. All pictures are made by
 code. A killed run goes on with --resume where its last checkpoint stands. Torch is needed:
 pip install 'blimp-localization[train]'."""
@@ -52,6 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Trains; 0 when done or stopped by Ctrl-C with a checkpoint written."""
+    # Threads that wait for each other in a loop take the cores of those that make the data; torch
+    # reads this once, when it is first imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         import torch  # noqa: F401
     except ImportError:

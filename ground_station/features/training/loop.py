@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,6 +28,7 @@ from ground_station.features.training import checkpoint, corpus, curve, teacher,
 from ground_station.features.training.batches import batches
 from ground_station.features.training.errors import TrainingError
 from ground_station.features.training.export import export
+from ground_station.features.training.losses import Losses
 from ground_station.features.training.pairs import Pair, PairSource
 from ground_station.features.training.recipe import Recipe, finite, is_due, pairs_seen
 from ground_station.features.training.trainer import Trainer
@@ -114,6 +115,7 @@ def train(
     run = _Run(recipe, trainer, out, machine, before_s, [
         held.pair(0, k) for k in range(_HELD_OUT_PAIRS)
     ])  # fmt: skip
+    run.begins(teacher, step)
     if fresh:
         run.baselines(teacher, step)
     return run.go(source, step)
@@ -139,6 +141,13 @@ class _Run:
             self.log = curve.Log(self.out / "log.jsonl", step)
         return self.log
 
+    def begins(self, teacher_name: str, step: int) -> None:
+        """Notes what goes on from here: a resumed run may have a larger corpus."""
+        teacher_sha256 = teacher.load(teacher_name).sha256
+        self.note(step).add(
+            "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256
+        )
+
     def baselines(self, teacher_name: str, step: int) -> None:
         """What others make of the same held-out pairs."""
         found = teacher.load(teacher_name)
@@ -148,7 +157,6 @@ class _Run:
                 Network(found, threads=self.machine.threads), _MOST_POINTS, LearnedSettings()
             ),
         }
-        self.note(step).add("recipe", step=step, recipe=self.recipe.as_dict(), teacher=found.sha256)
         for name, extractor in others.items():
             figures = validation.figures(extractor, self.held)
             self.note(step).add("baseline", step=step, name=name, **asdict(figures))
@@ -158,18 +166,20 @@ class _Run:
         """The steps that are left; an interrupt ends them after a checkpoint."""
         recipe, machine = self.recipe, self.machine
         log = self.note(step)
-        sums, count, since_s, written = np.zeros(5), 0, time.monotonic(), step
+        names = [field.name for field in fields(Losses)]
+        sums = torch.zeros(len(names), device=self.trainer.device)
+        count, since_s, written = 0, time.monotonic(), step
         stream = batches(
             source, recipe.batch, step, recipe.steps, machine.jobs, self.trainer.device
         )
         with _stop_noted() as stopped:
             for batch in stream:
                 made = self.trainer.step(step, batch)
-                sums += [float(value.detach()) for value in asdict_shallow(made).values()]
+                # Read only where it is logged: a GPU would wait for each number.
+                sums += torch.stack([getattr(made, name).detach() for name in names])
                 count, step = count + 1, step + 1
                 if is_due(step, _LOG_EVERY, recipe.steps):
-                    means, now_s = sums / count, time.monotonic()
-                    names = ("total", "detector", "descriptor", "distillation", "right")
+                    means, now_s = (sums / count).tolist(), time.monotonic()
                     values = {n: round(finite(v), 5) for n, v in zip(names, means, strict=True)}
                     rate = 2 * recipe.batch * count / (now_s - since_s)
                     log.add(
@@ -179,7 +189,7 @@ class _Run:
                     if is_due(step, 8 * _LOG_EVERY, recipe.steps):
                         text = " ".join(f"{k} {v:.3f}" for k, v in values.items())
                         print(f"step {step}: {text}, {rate:.1f} images/s", file=sys.stderr)
-                    sums, count, since_s = np.zeros(5), 0, now_s
+                    sums, count, since_s = torch.zeros_like(sums), 0, now_s
                 if is_due(step, machine.checkpoint_every, recipe.steps) or stopped[0]:
                     self.save(step)
                     written = step
@@ -233,11 +243,6 @@ class _Run:
             gap = float(np.abs(said[name] - ours.numpy()).max())
             if not gap <= _DIFFERENCE * max(1.0, float(ours.abs().max())):
                 raise TrainingError(f"{self.model}: its {name} differ from torch's by {gap:.2g}")
-
-
-def asdict_shallow(made: Any) -> dict[str, torch.Tensor]:
-    """A dataclass of tensors by name; `asdict` would copy them."""
-    return {name: getattr(made, name) for name in made.__dataclass_fields__}
 
 
 def _say(name: str, figures: validation.Figures) -> None:
