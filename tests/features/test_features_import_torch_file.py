@@ -278,6 +278,15 @@ def test_an_archive_that_would_grow_is_refused(tmp_path: Path) -> None:
     assert "is compressed, as torch writes none" in refused(tmp_path / "w.pth", data)
 
 
+def test_many_descriptions_of_nothing_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "w.pth"
+    crowd = made.as_zip(made.pickled(b"}"), {str(key): b"" for key in range(10_100)})
+    assert "the archive has 10103 files; at most 10000" in refused(path, crowd)
+    header = (b'{"a":' + b" " * (2 << 20) + b"{}}").ljust(3 << 20)
+    long = len(header).to_bytes(8, "little") + header
+    assert "it describes its tensors in 3145728 bytes; at most 1048576" in refused(path, long)
+
+
 @pytest.mark.parametrize(
     ("data", "says"),
     [

@@ -25,6 +25,9 @@ from ground_station.features.importing.weights import Weights, WeightsError
 MOST_BYTES: Final = 512 << 20
 """Of a file; SuperPoint's has 5 MB."""
 _PIECE_BYTES = 1 << 20
+_MOST_ENTRIES = 10_000
+"""Of an archive: one for each tensor. The zipfile module makes an object of each there is."""
+_ENTRY_BEGINS = b"PK\x01\x02"
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_BEGINS = b"\x8a\x0a" + _LEGACY_MAGIC.to_bytes(10, "little")
 """After the pickle's protocol, and from protocol 4 on its frame."""
@@ -65,6 +68,8 @@ def tensors(data: bytes) -> dict[str, npt.NDArray[Any]]:
 
 
 def _from_zip(data: bytes) -> dict[str, npt.NDArray[Any]]:
+    if (entries := data.count(_ENTRY_BEGINS)) > _MOST_ENTRIES:
+        raise PickleError(f"the archive has {entries} files; at most {_MOST_ENTRIES}")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = archive.namelist()
@@ -144,6 +149,11 @@ def _from_legacy(data: bytes) -> dict[str, npt.NDArray[Any]]:
 
 
 def _from_safetensors(data: bytes) -> dict[str, npt.NDArray[Any]]:
+    header = int.from_bytes(data[:8], "little")
+    if header > pickle_subset.MOST_BYTES:
+        raise PickleError(
+            f"it describes its tensors in {header} bytes; at most {pickle_subset.MOST_BYTES}"
+        )
     try:
         return load_safetensors(data)
     except SafetensorError as error:
