@@ -104,13 +104,13 @@ def test_long_rows_are_kept_and_a_bench_that_was_stopped_goes_on(bench, tmp_path
 
 
 def test_features_that_make_no_map_are_a_row_that_says_so(bench, tmp_path, monkeypatch, capsys):
-    def measure(sample, recording, mapping, localizer, work):
+    def measure(sample, recording, mapping, localizer, step, work):
         assert mapping.sfm.min_track == 4 and localizer.pose.solver == "graph"
         raise MapError("no two of the 9 images overlap")
 
     monkeypatch.setattr(flights, "measure", measure)
     monkeypatch.setattr(flights, "flight", lambda folder, seconds: tmp_path / "flight.mcap")
-    for name in ("mapping.mcap", "PAIRS.csv", "flight.mcap"):
+    for name in ("mapping.mcap", "flight.mcap"):
         (tmp_path / name).write_text("of a test")
     (tmp_path / "mapping.toml").write_text("[sfm]\nmin_track = 4\n")
     status, found = bench("--only", "flights")

@@ -143,12 +143,13 @@ def _flights(
 
     files = flights.map_inputs(args.sample)
     duration_s = flights.QUICK_S if args.quick else flights.FULL_S
+    step = flights.QUICK_STEP if args.quick else flights.FULL_STEP
     recording = flights.flight(args.work / "flights", duration_s)
 
     def measure(mapping: MappingSettings, localizer: LocalizerSettings, work: Path) -> Any:
-        return flights.measure(args.sample, recording, mapping, localizer, work)
+        return flights.measure(args.sample, recording, mapping, localizer, step, work)
 
-    about = {"kind": "flights"}
+    about = {"kind": "flights", "step": step}
     _in_maps(
         args, made, rows, "flights", "thesis", threads, [*files, recording], about, measure,
         args.sample / "mapping.toml",

@@ -9,7 +9,6 @@ from ground_station.errors import InputError
 from ground_station.evaluation.features.localizing import localized, registered_map
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sights import read_pairs
 from ground_station.progress import Progress
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import FrameRange
@@ -17,11 +16,13 @@ from pi_firmware.wire.recording import TRUTH_TOPIC
 
 PLAN, LIGHT, SEED = "loop", "sunset", 41
 FULL_S, QUICK_S = 20.0, 4.0
+FULL_STEP, QUICK_STEP = 1, 3
+"""Every so manieth frame of the mapping flight is an image of the map."""
 
 
 def map_inputs(sample: Path) -> list[Path]:
-    """Noon flight, its settings, known points; raises `InputError` naming what is missing."""
-    paths = [sample / name for name in ("mapping.mcap", "mapping.toml", "PAIRS.csv")]
+    """The noon flight and its map's settings; raises `InputError` naming what is missing."""
+    paths = [sample / name for name in ("mapping.mcap", "mapping.toml")]
     for path in paths:
         if not path.is_file():
             raise InputError(f"{path}: there is no such file; `make sample` makes it anew")
@@ -55,20 +56,20 @@ def measure(
     recording: Path,
     mapping: MappingSettings,
     localizer: LocalizerSettings,
+    step: int,
     work: Path,
 ) -> dict[str, Any]:
     """Builds the noon map in `work` and localizes the flight from its true first pose.
 
+    The map is registered by the mapping flight's true poses, so that an error is the features'.
     Raises `MapError` where these features make no map.
     """
-    source = FlightRecording(sample / "mapping.mcap")
+    noon = sample / "mapping.mcap"
+    source = FlightRecording(noon, FrameRange(0, None, step))
     if source.camera is None:
-        raise InputError(f"{sample / 'mapping.mcap'}: it carries no camera calibration")
-    total = source.count() or 0
-    step = max(1, -(-total // mapping.max_images))
-    thinned = FlightRecording(sample / "mapping.mcap", FrameRange(0, None, step))
-    sights = read_pairs(sample / "PAIRS.csv")
-    map_ = registered_map(thinned, source.camera, mapping, work / "map", sights=sights)
+        raise InputError(f"{noon}: it carries no camera calibration")
+    flown_at_noon = trajectory_of(noon, TRUTH_TOPIC, [])
+    map_ = registered_map(source, source.camera, mapping, work / "map", trajectory=flown_at_noon)
     row = {"registered": len(map_.keyframes), "landmarks": len(map_.landmarks)}
     flown = FlightRecording(recording)
     camera = flown.camera or map_.info.camera

@@ -23,7 +23,6 @@ from ground_station.mapping.build import build_map
 from ground_station.mapping.refine import straighten
 from ground_station.mapping.register import register_map
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sights import Sights
 from ground_station.mapping.store import Map
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameSource
@@ -38,13 +37,12 @@ def registered_map(
     settings: MappingSettings,
     folder: Path,
     *,
-    sights: Sights | None = None,
-    trajectory: Trajectory | None = None,
+    trajectory: Trajectory,
 ) -> Map:
-    """A map of all frames of the source, in world coordinates, as `blimp map` makes it."""
+    """A map of all frames of the source, registered by their true poses, as `blimp map` does it."""
     build_map(source, camera, settings, folder, total=source.count())
     straighten(folder, settings)
-    return register_map(folder, sights=sights, trajectory=trajectory, source="bench")[0]
+    return register_map(folder, trajectory=trajectory, source="truth")[0]
 
 
 def localized(
