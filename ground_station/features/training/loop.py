@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import FrameType
@@ -32,6 +32,7 @@ from ground_station.features.training.losses import Losses
 from ground_station.features.training.pairs import Pair, PairSource
 from ground_station.features.training.recipe import Recipe, finite, is_due, pairs_seen
 from ground_station.features.training.trainer import Trainer
+from ground_station.progress import Progress
 
 _LOG_EVERY = 25
 _HELD_OUT_PAIRS = 48
@@ -172,12 +173,16 @@ class _Run:
         stream = batches(
             source, recipe.batch, step, recipe.steps, machine.jobs, self.trainer.device
         )
-        with _stop_noted() as stopped:
+        # A log has lines enough of its own.
+        bar = Progress("steps", recipe.steps - step) if sys.stderr.isatty() else nullcontext()
+        with _stop_noted() as stopped, bar:
             for batch in stream:
                 made = self.trainer.step(step, batch)
                 # Read only where it is logged: a GPU would wait for each number.
                 sums += torch.stack([getattr(made, name).detach() for name in names])
                 count, step = count + 1, step + 1
+                if isinstance(bar, Progress):
+                    bar.step()
                 if is_due(step, _LOG_EVERY, recipe.steps):
                     means, now_s = (sums / count).tolist(), time.monotonic()
                     values = {n: round(finite(v), 5) for n, v in zip(names, means, strict=True)}
