@@ -114,12 +114,11 @@ def as_zip(
 ) -> bytes:
     """The archive that torch 1.6 and newer write."""
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", kind) as archive:
-        archive.writestr("archive/data.pkl", pickle)
-        archive.writestr("archive/byteorder", more.get("byteorder", b"little"))
-        for key, data in storages.items():
-            archive.writestr(f"archive/data/{key}", data)
-        archive.writestr("archive/version", b"3\n")
+    entries = {"data.pkl": pickle, "byteorder": more.get("byteorder", b"little")}
+    entries |= {f"data/{key}": data for key, data in storages.items()} | {"version": b"3\n"}
+    with zipfile.ZipFile(file, "w") as archive:
+        for label, data in entries.items():  # without the time, as torch writes them
+            archive.writestr(zipfile.ZipInfo(f"archive/{label}"), data, kind)
     return file.getvalue()
 
 
