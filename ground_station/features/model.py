@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -158,7 +159,9 @@ def read(path: str | Path) -> Model:
     path = Path(path)
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            # As much as is asked for is set aside, whatever the file has.
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(min(size, MAX_BYTES) + 1)
     except OSError as error:
         raise FeatureError(f"{path}: {error.strerror or error}") from None
     try:
@@ -169,7 +172,7 @@ def read(path: str | Path) -> Model:
         inspection.check(proto, info)
     except FeatureError as error:
         raise FeatureError(f"{path}: {error}") from None
-    except (TypeError, ValueError, LookupError) as error:
+    except (AttributeError, TypeError, ValueError, LookupError) as error:
         # protobuf hands on text that is none as bytes, and numbers beyond what they count.
         raise FeatureError(f"{path}: it is damaged ({type(error).__name__})") from None
     return Model(path, info, data, hashlib.sha256(data).hexdigest())
