@@ -35,7 +35,10 @@ class MatchSettings:
         5, "must give so many matches, or the pair is left out", unit="matches", low=1, high=1000
     )
     ratio: float = config.key(
-        0.8, "a match's distance over its runner-up's, both ways", low=0.1, high=1.0
+        0.8, "a match's distance over its runner-up's, both ways, of RootSIFT", low=0.1, high=1.0
+    )
+    ratio_others: float = config.key(
+        0.95, "the same of other features, whose distances differ less", low=0.1, high=1.0
     )
     error_px: float = config.key(
         1.5, "distance from the epipolar line", unit="px", low=0.1, high=20.0
