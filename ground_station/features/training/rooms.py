@@ -32,6 +32,8 @@ _NEAR_M = 0.7
 _LEAST_DEVIATION = 12.0
 """Of a picture's codes: a blank wall close by teaches nothing."""
 _TRIES = 30
+_LAMPS_OFF = 0.35
+"""Share of the lights in which no lamp is on."""
 
 
 class _Room:
@@ -189,15 +191,27 @@ def build_room(seed: int, number: int, texels_per_m: float = 80.0) -> Scene:
     )
 
 
-def _moved(base: Light, rng: Rng) -> Light:
-    """One of the simulator's lights at another hour, with another strength of sky and lamps."""
+def _lit(scene: Scene, base: Light, rng: Rng) -> LitTextures:
+    """A room in one of the simulator's lights, moved: another hour, another strength of the sky.
+
+    Its lamps are off, or some of them are on: in rooms with few windows they make the shadows.
+    """
+    on = rng.random(len(scene.lamps)) < rng.uniform(0.2, 1)
+    lamps = tuple(lamp for lamp, lights in zip(scene.lamps, on.tolist(), strict=True) if lights)
+    light = _moved(base, float(np.exp(rng.uniform(np.log(0.03), np.log(0.8)))), rng)
+    if rng.random() < _LAMPS_OFF:
+        light = replace(light, lamp_level=0.0)
+    return lit_textures(replace(scene, lamps=lamps), light)
+
+
+def _moved(base: Light, lamp_level: float, rng: Rng) -> Light:
     return replace(
         base,
         sun_azimuth_deg=float(rng.uniform(0, 360)),
         sun_elevation_deg=float(np.clip(base.sun_elevation_deg + rng.normal(0, 10), 4, 75)),
         sun_level=base.sun_level * float(np.exp(rng.normal(0, 0.3))),
         sky_level=base.sky_level * float(np.exp(rng.normal(0, 0.3))),
-        lamp_level=float(rng.choice([base.lamp_level, rng.uniform(0.05, 0.6)])),
+        lamp_level=lamp_level,
     )
 
 
@@ -212,7 +226,7 @@ def views_of_room(
     scene = build_room(seed, number)
     poses = [_pose(rng, scene) for _ in range(places * _TRIES)]
     names = rng.permutation(sorted(LIGHTS)).tolist()  # no two the same, if there are enough
-    lit = [lit_textures(scene, _moved(LIGHTS[names[k % len(names)]], rng)) for k in range(lights)]
+    lit = [_lit(scene, LIGHTS[names[k % len(names)]], rng) for k in range(lights)]
     rows, columns = size
     focal = float(rng.uniform(0.65, 1.0)) * columns
     camera = Camera(
