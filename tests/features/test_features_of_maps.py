@@ -72,3 +72,23 @@ def test_a_map_is_built_with_a_model_by_name_on_several_threads(bird):
     for picture, features in zip(pictures, found.features, strict=True):
         assert features.descriptors.shape[1] == 16 and len(features) > 10
         assert np.array_equal(features.keypoints_px, alone.extract(picture).keypoints_px)
+
+
+def test_lowes_ratio_is_rootsifts_and_other_features_have_their_own(bird, monkeypatch):
+    ratios = []
+
+    def matches(first, second, ratio):
+        ratios.append(ratio)
+        return np.empty((0, 2), np.int32)
+
+    monkeypatch.setattr(build, "mutual_matches", matches)
+    rng = np.random.default_rng(0)
+    camera = replace(THESIS_CAMERA, width_px=96, height_px=64)
+    pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(2)]
+    frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
+    for name in ("rootsift", "bird"):
+        settings = MappingSettings(features=name, max_features=50)
+        found = build.extract(frames, camera, settings, 1, 2, {})
+        with pytest.raises(MapError, match="no two of the 2 images overlap"):
+            build.match(found, camera, settings, 1, {})
+    assert ratios == [settings.match.ratio, settings.match.ratio_others] == [0.8, 0.95]
