@@ -124,7 +124,7 @@ def test_a_pair_has_fixed_shapes_and_true_correspondences():
         moved = warps.apply(pair.second_from_first, pair.points_px[0, :n])
         assert moved == pytest.approx(pair.points_px[1, :n], abs=1e-2)
         assert warps.inside(pair.points_px[1, :n], VIEW, 3.9).all()
-        assert pair.labels.sum(axis=1) == pytest.approx(np.ones((2, 12, 16)), abs=1e-5)
+        assert pair.labels.sum(axis=1) == pytest.approx(np.ones((2, 12, 16)), abs=2e-3)
         assert pair.known.any()
     assert np.mean(counts) > 24
 

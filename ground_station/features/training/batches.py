@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from ground_station.features.training.pairs import PairSource
 
-_AHEAD = 3
+_AHEAD = 2
 """Batches that each process has ready."""
 
 
@@ -74,7 +74,7 @@ def batches(
         )
         yield Batch(
             images=images.flatten(0, 1)[:, None].float().mul_(1 / 255),
-            labels=labels.flatten(0, 1),
+            labels=labels.flatten(0, 1).float(),
             known=known.flatten(0, 1).float(),
             points_px=points_px,
             used=used,

@@ -34,14 +34,14 @@ _MARGIN_PX = 4.0
 class Pair:
     """Two views and their truth; arrays of fixed shapes, so that pairs stack to batches.
 
-    `images` (2, H, W) uint8; `labels` (2, 65, H/8, W/8) float32; `known` (2, H/8, W/8) bool: cells
+    `images` (2, H, W) uint8; `labels` (2, 65, H/8, W/8) float16; `known` (2, H/8, W/8) bool: cells
     of which the labels say something; `points_px` (2, P, 2) float32, the same P points in both;
     `used` (P,) bool: the first so many are points; `teacher` (P, D) float16, nought where there is
     no descriptor; `second_from_first` (3, 3) float64.
     """
 
     images: Bytes
-    labels: F32
+    labels: npt.NDArray[np.float16]
     known: npt.NDArray[np.bool_]
     points_px: F32
     used: npt.NDArray[np.bool_]
@@ -126,7 +126,7 @@ def make_pair(
     vectors[:count] = teacher[chosen]
     return Pair(
         images=np.stack(images),
-        labels=np.stack(labels),
+        labels=np.stack(labels).astype(np.float16),
         known=np.stack(known),
         points_px=at_both,
         used=np.arange(points) < count,
