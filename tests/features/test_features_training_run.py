@@ -51,6 +51,7 @@ def test_the_rate_goes_up_stays_and_ends_at_nought_wherever_it_branches_off():
     assert not recipe.differences(branch.as_dict())
     assert recipe.differences(replace(recipe, batch=9).as_dict()) == ["batch"]
     assert recipe.differences({"size": "wren"})[-1] == "corpus"
+    assert recipe.as_long_as(branch.as_dict()).steps == 600
 
 
 @pytest.mark.parametrize(

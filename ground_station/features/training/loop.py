@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -95,16 +95,14 @@ def train(
         recipe = recipe.decaying_from(start.step)
     elif start is not None:
         # A resumed run is as long as it was, whoever asks.
-        recipe = replace(
-            recipe, **{k: start.state["recipe"][k] for k in ("steps", "decay", "warm_up")}
-        )
+        recipe = recipe.as_long_as(_recipe_of(start))
     trainer = Trainer(recipe, device)
     step, before_s = 0, 0.0
     if start is not None:
-        if other := recipe.differences(start.state["recipe"]):
+        if other := recipe.differences(_recipe_of(start)):
             raise TrainingError(f"the checkpoint is of another recipe: {', '.join(other)} differ")
         trainer.restore(start)
-        step, before_s = start.step, float(start.state["seconds"])
+        step, before_s = start.step, float(start.state.get("seconds", 0))
     corpus.make(corpus_folder, recipe.corpus, teacher, machine.jobs)
     held_folder = corpus_folder / "held-out"
     corpus.make(held_folder, recipe.held_out(), teacher, machine.jobs)
@@ -120,6 +118,13 @@ def train(
     if fresh:
         run.baselines(teacher, step)
     return run.go(source, step)
+
+
+def _recipe_of(start: checkpoint.Checkpoint) -> dict[str, Any]:
+    recipe = start.state.get("recipe")
+    if not isinstance(recipe, dict):
+        raise TrainingError(f"the checkpoint of step {start.step} names no recipe")
+    return recipe
 
 
 class _Run:

@@ -79,6 +79,13 @@ class Recipe:
         """The same until `step`; from there the rate goes down over `decay` steps."""
         return replace(self, steps=step + self.decay, warm_up=min(self.warm_up, step))
 
+    def as_long_as(self, other: dict[str, Any]) -> Recipe:
+        """The same for as many steps as another recipe, with its beginning and end."""
+        steps, decay, warm_up = (
+            int(other.get(name, getattr(self, name))) for name in ("steps", "decay", "warm_up")
+        )
+        return replace(self, steps=steps, decay=decay, warm_up=warm_up)
+
     def held_out(self) -> CorpusSettings:
         """What validates."""
         c = self.corpus
