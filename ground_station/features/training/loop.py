@@ -113,7 +113,7 @@ def train(
     held = PairSource(corpus.Corpus(held_folder, recipe.held_out()), 0, size, recipe.points)
     run = _Run(recipe, trainer, out, machine, before_s, [
         held.pair(0, k) for k in range(_HELD_OUT_PAIRS)
-    ])  # fmt: skip
+    ], fresh)  # fmt: skip
     run.begins(teacher, step)
     if fresh:
         run.baselines(teacher, step)
@@ -130,8 +130,9 @@ def _recipe_of(start: checkpoint.Checkpoint) -> dict[str, Any]:
 class _Run:
     def __init__(
         self, recipe: Recipe, trainer: Trainer, out: Path, machine: Machine, before_s: float,
-        held: list[Pair],
+        held: list[Pair], fresh: bool,
     ) -> None:  # fmt: skip
+        self._fresh = fresh
         self.recipe, self.trainer, self.machine, self.held = recipe, trainer, machine, held
         self.out, self.model = out, out / f"{trainer.shape.name}.onnx"
         self.log: curve.Log | None = None
@@ -144,7 +145,7 @@ class _Run:
 
     def note(self, step: int) -> curve.Log:
         if self.log is None:
-            self.log = curve.Log(self.out / "log.jsonl", step)
+            self.log = curve.Log(self.out / "log.jsonl", -1 if self._fresh else step)
         return self.log
 
     def begins(self, teacher_name: str, step: int) -> None:
@@ -205,29 +206,29 @@ class _Run:
                     written = step
                 if stopped[0]:
                     break
-                if is_due(step, machine.validate_every, recipe.steps):
-                    self.validate(step, batch.images)
+                if step % machine.validate_every == 0 and step < recipe.steps:
+                    self.validate(step)
                     since_s = time.monotonic()
         if written != step:
             self.save(step)
-        return self.validate(step, None)
+        return self.validate(step)
 
     def save(self, step: int) -> None:
-        """A checkpoint."""
+        """A checkpoint, unless training has run away: then the last one stays the last."""
+        finite(float(sum(p.detach().abs().sum() for p in self.trainer.network.parameters())))
         state = {"recipe": self.recipe.as_dict(), "seconds": self.seconds}
         checkpoint.write(
             self.out / "checkpoints", self.trainer.checkpoint(step, state),
             keep_every=20 * self.machine.checkpoint_every,
         )  # fmt: skip
 
-    def validate(self, step: int, images: torch.Tensor | None) -> dict[str, Any]:
+    def validate(self, step: int) -> dict[str, Any]:
         """Exports the weights' mean, holds the file to torch's outputs, and judges it."""
         pairs = pairs_seen(self.recipe, step)
         source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs; teacher ALIKE, BSD-3"
         export(self.trainer.shape, self.trainer.weights(), self.model, source)
         network = Network(model.read(self.model), threads=self.machine.threads)
-        if images is not None:
-            self.compare(network, images[:1].float().cpu())
+        self.compare(network)
         extractor = CellFeatures(network, _MOST_POINTS, LearnedSettings())
         figures = validation.figures(extractor, self.held)
         _say(f"step {step}", figures)
@@ -238,7 +239,7 @@ class _Run:
         return {"model": str(self.model), "step": step, "steps": self.recipe.steps, "pairs": pairs,
                 "seconds": round(self.seconds, 1), **values}  # fmt: skip
 
-    def compare(self, network: Network, image: torch.Tensor) -> None:
+    def compare(self, network: Network) -> None:
         """Raises `TrainingError` where the file does not say what torch says."""
         from ground_station.features.training.network import FeatureNetwork
 
@@ -246,6 +247,7 @@ class _Run:
             mean = FeatureNetwork(self.trainer.shape)
         mean.load_state_dict({k: v.cpu() for k, v in self.trainer.mean.items()})
         mean.eval()
+        image = torch.from_numpy(self.held[0].images[:1, None].astype(np.float32) / 255)
         with torch.no_grad():
             wanted = mean(image)
         said = network.run(image.numpy())
