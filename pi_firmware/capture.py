@@ -132,6 +132,7 @@ class Capture:
             self._fail(_CAMERA, _as_blimp_error(media.error))
         elif message is not None and message.type == self._gst.MessageType.EOS:
             if source.error is None:
+                media.settle()
                 return False
             self._give_up(source.error)
             return True

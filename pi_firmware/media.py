@@ -135,13 +135,22 @@ class Media:
         stopping.start()
         stopping.join(_STOP_LIMIT_S)
         self._stopped = True  # what hangs may come back to life, and must count no more
-        self.counters.discarded += len(self._in_encoder)
-        self._in_encoder.clear()
+        self.settle()
         if stopping.is_alive():
             return False
         while self._attached:
             self._attached.pop()()
         return True
+
+    def settle(self) -> None:
+        """Counts what is inside as discarded: called when nothing comes out any more.
+
+        After the stream's end that is what an encoder took and never gave.
+        """
+        for running_ns in list(self._in_encoder):
+            taken = self._in_encoder.pop(running_ns, None)
+            if taken is not None:
+                self._discard(taken[0].sequence)
 
     def set_bitrate(self, kbps: int) -> int:
         """Asks the encoder for this bit rate, within the configured bounds; returns the one set."""

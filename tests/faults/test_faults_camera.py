@@ -117,6 +117,22 @@ def test_an_encoder_that_gives_nothing_is_opened_anew(tmp_path: Path) -> None:
     assert messages.EVENT_FAILED not in events
 
 
+def test_a_flight_that_ends_while_the_encoder_gives_nothing_accounts_for_what_it_took(
+    tmp_path: Path,
+) -> None:
+    encoder = Shim(tmp_path, "encoder_fault")
+    with (
+        Ground(numbered=False) as ground,
+        Flight(tmp_path, ground, None, *SMALL, camera="test:", env=encoder.env) as flight,
+    ):
+        flight.wait_streaming(30)
+        encoder.set(TAKES_AND_GIVES_NONE)
+        time.sleep(0.4)  # not long enough to be noticed
+        account = flight.finish()
+    assert_accounted(account)
+    assert account.ended.counts["discarded"] > 1
+
+
 def test_an_encoder_that_never_comes_back_ends_the_process_for_a_new_one(tmp_path: Path) -> None:
     """What hangs inside a call cannot be closed: status 3, the counters right, and the next."""
     encoder = Shim(tmp_path, "encoder_fault")

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from numbered_flight import GOP, encoded, stamped
+from payload_process import Ended
 from scenarios import accounts
-from scenarios.camera import FLIGHT, Truth
+from scenarios.camera import FLIGHT, Camera, Truth
 from scenarios.heard import Told
 from scenarios.judge import OFF_M, poses
 from scenarios.link_steps import Loss, Outage
 from scenarios.matrix import BRIEF, MATRIX
+from scenarios.payload_run import UNBORN_S, PayloadRun
 from scenarios.recordings import CUT_S, NOISE_S, Came, Recorded, lacking, read
 from scenarios.step import Scenario, StepError, as_json, from_json
 from scenarios.tcp_wire import TcpWire
@@ -40,6 +43,26 @@ def test_a_payload_that_was_killed_may_have_a_few_inside_and_never_fewer_than_no
     assert accounts.of_killed_payload({}) == []
     assert accounts.of_killed_payload(COUNTS | {"captured": 99})
     assert accounts.of_killed_payload(COUNTS | {"captured": 200})
+
+
+@pytest.mark.parametrize(
+    ("status", "out", "ended_s", "unborn"),
+    [
+        (-15, "", 0.3, True),
+        (-15, "", UNBORN_S + 0.1, False),
+        (-15, "payload blimp-1: test: -> 127.0.0.1:5600", 0.3, False),
+        (-11, "", 0.3, False),
+        (1, "", 0.3, False),
+    ],
+)
+def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
+    status: int, out: str, ended_s: float, unborn: bool
+) -> None:
+    process: Any = None
+    run = PayloadRun(1, Camera("test:", None), process, 100.0, Path())
+    assert not run.unborn
+    run.ended, run.ended_s = Ended(status, out, "", ended_s), 100.0 + ended_s
+    assert run.unborn is unborn
 
 
 def test_what_came_to_the_link_is_what_was_sent() -> None:

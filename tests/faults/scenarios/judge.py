@@ -117,7 +117,7 @@ def _before_intake(world: World, run: PayloadRun) -> tuple[int, int]:
 
 def _of_run(run: PayloadRun, until_s: float, heard: Heard) -> list[str]:
     complaints: list[str] = []
-    if run.killed:
+    if run.killed or run.unborn:
         said = [
             note.frames
             for who, note, at_s in heard.payloads
@@ -221,7 +221,7 @@ def in_order(world: World) -> list[str]:
             run.ended.assert_no_accident()
         except AssertionError:
             complaints.append(f"payload: {run.ended.err[-600:]}")
-        if not run.killed and run.ended.status not in (0, 3):
+        if not (run.killed or run.unborn) and run.ended.status not in (0, 3):
             complaints.append(f"payload: ended with status {run.ended.status}")
     try:
         world.service.assert_no_accident()

@@ -16,6 +16,8 @@ from witness import Witness
 from ground_station.stream import rtp
 from scenarios.camera import Camera
 
+UNBORN_S = 2.0
+"""An interpreter that has not come to the program's first line by then hangs."""
 _KEPT_PACKETS = 2000
 
 
@@ -53,6 +55,16 @@ class PayloadRun:
     ended_s: float = float("inf")
     card: list[str] = field(default_factory=list)
     """Files on the card when it began: the others are its own."""
+
+    @property
+    def unborn(self) -> bool:
+        """Whether it was ended before its first line of Python ran: SIGTERM had no handler yet."""
+        return (
+            self.ended is not None
+            and self.ended.status == -signal.SIGTERM
+            and not self.ended.out
+            and self.ended_s - self.began_s < UNBORN_S
+        )
 
     def send(self, number: signal.Signals) -> None:
         """A signal, if it still runs."""
