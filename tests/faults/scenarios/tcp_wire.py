@@ -76,6 +76,8 @@ class TcpWire:
                     near.close()
                     continue
                 self._sockets |= {near, far}
+            near.settimeout(None)
+            far.settimeout(None)
             for ends in ((near, far), (far, near)):
                 thread = threading.Thread(target=self._carry, args=ends, name="wire", daemon=True)
                 self._threads.append(thread)
@@ -88,8 +90,6 @@ class TcpWire:
             return None
 
     def _carry(self, source: socket.socket, to: socket.socket) -> None:
-        for one in (source, to):
-            one.settimeout(None)
         with contextlib.suppress(OSError):
             while data := source.recv(65536):
                 while not self._open.wait(_POLL_S):
