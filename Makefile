@@ -66,10 +66,11 @@ hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="l
 	  sh deploy/packages.sh deploy/image/apt-packages.txt && sh deploy/emulator/tools.sh; fi
 	@.venv/bin/python tests/hil/suite.py $(CASES) --payload "$(or $(PAYLOAD),process)" $(OPTIONS)
 
-bench: setup  ## Measure what each step of localizer and payload costs, in ratios of one run
+bench: setup  ## Measure localizer, payload and features: costs in ratios of one run, and errors
 	@mkdir -p out
 	@$(BLIMP) bench localize --json out/bench.json
 	@$(BLIMP) bench payload --json out/bench-payload.json
+	@$(BLIMP) bench features --json out/bench-features.json
 
 budget: setup  ## Reckon the default build: table and plots in out/budget; status 1 without margin
 	@.venv/bin/python -m hw budget --out out/budget

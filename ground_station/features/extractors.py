@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ground_station.features import catalogue
 from ground_station.features.extractor import Extractor, FeatureError
 from ground_station.features.orb import Orb
 from ground_station.features.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
+
+if TYPE_CHECKING:
+    from ground_station.features.inference import Network
 
 _EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": RootSift, "orb": Orb}
 _DEFAULT = LearnedSettings()
@@ -33,13 +37,21 @@ def create(
         known = ", ".join(names())
         raise FeatureError(f"features: there is no extractor '{name:.80}' (known: {known})")
     # onnxruntime and onnx take half a second to import, which only models need.
-    from ground_station.features.cells import CellFeatures
     from ground_station.features.inference import Network, threads_beside_tracker
-    from ground_station.features.pixels import PixelFeatures
 
     model = catalogue.find(name)
     network = Network(model, learned.provider, threads or threads_beside_tracker())
-    kind = CellFeatures if model.info.layout == "cells" else PixelFeatures
+    return of_network(network, max_features, learned)
+
+
+def of_network(
+    network: Network, max_features: int = 1500, learned: LearnedSettings = _DEFAULT
+) -> Extractor:
+    """The extractor over a network, by the layout of its model."""
+    from ground_station.features.cells import CellFeatures
+    from ground_station.features.pixels import PixelFeatures
+
+    kind = CellFeatures if network.model.info.layout == "cells" else PixelFeatures
     return kind(network, max_features, learned)
 
 

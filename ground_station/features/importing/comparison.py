@@ -9,15 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.features.cells import CellFeatures
-from ground_station.features.extractor import Extractor
+from ground_station.features.extractors import of_network
 from ground_station.features.importing import homographic
 from ground_station.features.importing.homographic import Matching
 from ground_station.features.importing.quantize import network_input
 from ground_station.features.inference import Network
 from ground_station.features.model import Model
-from ground_station.features.pixels import PixelFeatures
-from ground_station.features.settings import LearnedSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameSource
 
@@ -52,7 +49,7 @@ def compare(
     random = np.random.default_rng(seed)
     pairs = [(image, *homographic.warp(image, random)) for image in images]
     of_reference, of_variant = (
-        homographic.matching(_extractor(network), pairs) for network in networks
+        homographic.matching(of_network(network, MAX_FEATURES), pairs) for network in networks
     )
     times: list[list[float]] = [[], []]
     blob = network_input(reference.info, images[0])
@@ -66,11 +63,6 @@ def compare(
     return Comparison(
         of_reference, of_variant, reference_ms, variant_ms, images[0].shape, len(pairs)
     )
-
-
-def _extractor(network: Network) -> Extractor:
-    kind = CellFeatures if network.model.info.layout == "cells" else PixelFeatures
-    return kind(network, MAX_FEATURES, LearnedSettings())
 
 
 def evenly(source: FrameSource, count: int) -> list[Image]:

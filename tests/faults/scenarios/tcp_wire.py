@@ -75,9 +75,9 @@ class TcpWire:
                 if far is None:
                     near.close()
                     continue
+                for one in (near, far):
+                    one.settimeout(None)
                 self._sockets |= {near, far}
-            near.settimeout(None)
-            far.settimeout(None)
             for ends in ((near, far), (far, near)):
                 thread = threading.Thread(target=self._carry, args=ends, name="wire", daemon=True)
                 self._threads.append(thread)
