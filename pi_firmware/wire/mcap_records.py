@@ -10,7 +10,7 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import IO
+from typing import IO, cast
 
 import lz4.frame
 import zstandard
@@ -188,3 +188,25 @@ def _unpacked(chunk: Chunk) -> bytes:
     if len(data) != claimed:
         raise ValueError("the chunk is not as long as it claims")
     return bytes(data)
+
+
+class Clamped:
+    """A file that is asked for no more than it has: what is asked for is set aside at once.
+
+    A length inside a record may claim four gigabytes. Not one of io's classes, which the reader of
+    MCAP would put a buffer before that asks as it was asked.
+    """
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file, self._size = file, size
+        self.seek, self.tell = file.seek, file.tell
+
+    @classmethod
+    def of(cls, file: IO[bytes], size: int) -> IO[bytes]:
+        """The file, clamped; as the type that readers of MCAP are declared to take."""
+        return cast(IO[bytes], cls(file, size))
+
+    def read(self, size: int = -1) -> bytes:
+        """At most what is left."""
+        left = max(0, self._size - self._file.tell())
+        return self._file.read(left if size < 0 else min(size, left))

@@ -27,7 +27,7 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from pi_firmware.wire.errors import RecordingError
-from pi_firmware.wire.mcap_records import CUT, MAGIC, PARSE_ERRORS, Damage, records
+from pi_firmware.wire.mcap_records import CUT, MAGIC, PARSE_ERRORS, Clamped, Damage, records
 
 VIDEO_TOPIC = "/camera/video"
 CALIBRATION_TOPIC = "/camera/calibration"
@@ -330,7 +330,7 @@ class RecordingReader:
             try:
                 size = file.seek(0, io.SEEK_END)
                 file.seek(0)
-                return SeekingReader(file, record_size_limit=size).get_summary()
+                return SeekingReader(Clamped.of(file, size), record_size_limit=size).get_summary()
             except (*PARSE_ERRORS, OSError):
                 return None
 
