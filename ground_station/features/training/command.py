@@ -19,7 +19,7 @@ Example: blimp models train --size wren --teacher alike-n --out out/training/wre
 
 The teacher is ALIKE, brought by `blimp models import alike-n.safetensors`. All pictures are made by
 code. A killed run goes on with --resume where its last checkpoint stands. Torch is needed:
-pip install 'blimp-localization[train]'."""
+.venv/bin/pip install torch."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         import torch  # noqa: F401
     except ImportError:
         raise TrainingError(
-            "training needs torch, which is not installed: pip install 'blimp-localization[train]'"
+            "training needs torch, which is not installed: .venv/bin/pip install torch"
         ) from None
     from ground_station import files
     from ground_station.features.training.corpus import CorpusSettings
