@@ -57,8 +57,7 @@ class Network:
         # Threads that wait for work in a loop take the tracker's core: a picture at 1.2 GMAC with
         # two threads took 26 ms of processor time without that, 88 ms with it, and was no faster.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        # Values next to nought take a processor many times as long as others.
-        options.add_session_config_entry("session.set_denormal_as_zero", "1")
+        # Not `session.set_denormal_as_zero`: it sets the calling thread's arithmetic for good.
         # What a provider has no kernel for, onnxruntime's own run.
         wanted = [(known[provider], _options(provider, threads)), ("CPU" + _SUFFIX, {})]
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import cv2
 import made_up
 import numpy as np
@@ -139,6 +141,13 @@ def test_a_picture_of_another_kind_is_refused(cells):
     for image in (np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64)), np.zeros((8, 64), np.uint8)):
         with pytest.raises(FeatureError, match="grey uint8 image"):
             extractor.extract(image)
+
+
+def test_a_network_leaves_the_arithmetic_of_its_thread_as_it_was(cells):
+    """Flushing small numbers to nought is the thread's, for good: a pose would change by it."""
+    Network(cells)
+    smallest = sys.float_info.min
+    assert smallest / 2 > 0
 
 
 def test_a_provider_that_is_not_installed_is_refused_with_those_that_are(cells):
