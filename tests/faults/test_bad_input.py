@@ -123,13 +123,13 @@ def test_a_map_built_with_other_features(tmp_path: Path, small_map: Path, camera
     copy = tmp_path / "other"
     shutil.copytree(small_map, copy)
     text = (copy / "map.toml").read_text()
-    (copy / "map.toml").write_text(text.replace('name = "rootsift"', 'name = "superpoint"'))
+    (copy / "map.toml").write_text(text.replace('name = "rootsift"', 'name = "nobodys"'))
     folder = images(tmp_path / "images", 2)
     line = refuse(
         BLIMP, "localize", folder, "--map", copy, "--camera", camera, "--init", "none",
         "--out", tmp_path / "estimate.txt",
     )  # fmt: skip
-    assert "'superpoint'" in line and "'rootsift'" in line
+    assert "built with 'nobodys'" in line and "not here (there are: " in line and "rootsift" in line
 
 
 def test_a_map_that_is_cut(tmp_path: Path, small_map: Path, camera: Path) -> None:
