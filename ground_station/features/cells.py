@@ -8,6 +8,7 @@ import numpy.typing as npt
 from ground_station.features import detection, sampling
 from ground_station.features.extractor import Features, check_image
 from ground_station.features.inference import Network
+from ground_station.features.learned import LearnedFeatures
 from ground_station.features.padding import padded
 from ground_station.features.settings import LearnedSettings
 
@@ -20,24 +21,18 @@ _CENTRE_PX = 3.5
 """Of a cell, from the centre of its first pixel."""
 
 
-class CellFeatures:
+class CellFeatures(LearnedFeatures):
     """DeTone et al., "SuperPoint", CVPR-W 2018; key points refined where the model says so.
 
     Scores are a softmax over each cell's 64 pixels and "none"; descriptors are interpolated
     bicubically between the cells' centres and then brought to unit length (section 3.3).
     """
 
+    NMS_PX, THRESHOLD = NMS_PX, THRESHOLD
+
     def __init__(self, network: Network, max_features: int, settings: LearnedSettings) -> None:
-        info = network.model.info
-        self.name, self.dimension = info.name, info.dimension
-        self.sha256 = network.model.sha256
-        self.max_features = max_features
-        self.nms_px = settings.nms_px or info.nms_px or NMS_PX
-        self.threshold = settings.threshold or (
-            THRESHOLD if info.threshold is None else info.threshold
-        )
-        self._network, self._info = network, info
-        self._border_px = max(_BORDER_PX, info.subpixel_px)
+        super().__init__(network, max_features, settings)
+        self._border_px = max(_BORDER_PX, self._info.subpixel_px)
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from ground_station.features import detection, sampling
 from ground_station.features.extractor import Features, check_image
 from ground_station.features.inference import Network
+from ground_station.features.learned import LearnedFeatures
 from ground_station.features.padding import padded
 from ground_station.features.settings import LearnedSettings
 
@@ -19,7 +20,7 @@ _TEMPERATURE = 0.1
 """Of the soft-argmax; the paper's."""
 
 
-class PixelFeatures:
+class PixelFeatures(LearnedFeatures):
     """Zhao et al., "ALIKE: Accurate and Lightweight Keypoint Detection and Descriptor Extraction",
     IEEE T-MM 2022: maxima of the score map, refined by a soft-argmax over the window of the
     suppression (section III-B), descriptors interpolated there bilinearly.
@@ -27,17 +28,11 @@ class PixelFeatures:
     The network takes colour; a grey picture is given to it three times.
     """
 
+    NMS_PX, THRESHOLD = NMS_PX, THRESHOLD
+
     def __init__(self, network: Network, max_features: int, settings: LearnedSettings) -> None:
-        info = network.model.info
-        self.name, self.dimension = info.name, info.dimension
-        self.sha256 = network.model.sha256
-        self.max_features = max_features
-        self.nms_px = settings.nms_px or info.nms_px or NMS_PX
-        self.threshold = settings.threshold or (
-            THRESHOLD if info.threshold is None else info.threshold
-        )
-        self._network, self._info = network, info
-        self._window_px = info.subpixel_px or NMS_PX
+        super().__init__(network, max_features, settings)
+        self._window_px = self._info.subpixel_px or NMS_PX
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""

@@ -91,6 +91,7 @@ def _from_zip(data: bytes) -> dict[str, npt.NDArray[Any]]:
                 size = storage.count * storage.dtype.itemsize
                 contents[key] = _entry(archive, f"{root}data/{key}", min(size, left))
                 left -= size
+    # zipfile says NotImplementedError of a compression that it does not know.
     except (zipfile.BadZipFile, NotImplementedError, EOFError, struct.error) as error:
         raise PickleError(f"a damaged zip archive ({shown(str(error))})") from None
     except (OSError, ValueError, OverflowError, KeyError, RuntimeError) as error:
