@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         write_smoothed,
     )
     from ground_station.mapping import store
-    from ground_station.mapping.observations import save_observations
+    from ground_station.mapping.refinement.observations import save_observations
     from ground_station.recording.open import open_input, parse_range
 
     settings = load_settings(args)

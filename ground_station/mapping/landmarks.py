@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.mapping.colmap import Model
+from ground_station.mapping.sfm.colmap import Model
 from ground_station.mapping.store import Landmarks
 
 F32 = npt.NDArray[np.float32]

@@ -11,11 +11,11 @@ from ground_station.errors import InputError
 from ground_station.evaluation.report import summary_table, write_report
 from ground_station.files import write_json
 from ground_station.localization.settings import load_preset
-from ground_station.mapping.build import build_map
-from ground_station.mapping.refine import straighten
-from ground_station.mapping.register import register_map
+from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.refinement.refine import straighten
+from ground_station.mapping.registration.register import register_map
+from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import load_settings
-from ground_station.mapping.sights import read_pairs
 from ground_station.mapping.store import Map
 from ground_station.recording.frames import FrameRange
 from ground_station.recording.open import open_input

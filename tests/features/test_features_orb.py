@@ -7,7 +7,7 @@ import numpy as np
 
 from ground_station.features import extractors
 from ground_station.features.orb import unit_of_bits
-from ground_station.mapping.matching import mutual_matches
+from ground_station.mapping.construction.matching import mutual_matches
 
 
 def picture() -> np.ndarray:

@@ -122,7 +122,7 @@ def test_smoothed_poses_go_to_a_file_of_their_own(flight, tmp_path):
 
 def test_what_was_seen_is_written_for_the_maps_refinement(flight, tmp_path):
     from ground_station.mapping import store
-    from ground_station.mapping.observations import landmarks_sha256, load_observations
+    from ground_station.mapping.refinement.observations import landmarks_sha256, load_observations
 
     out = tmp_path / "seen.safetensors"
     more = ["--init", str(flight / "truth.txt"), "--observations", str(out)]

@@ -15,7 +15,8 @@ from ground_station.features import extractors
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.mapping import build, store
+from ground_station.mapping import store
+from ground_station.mapping.construction import build
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 

@@ -12,12 +12,14 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
-from ground_station.mapping import colmap, landmarks, shutter, store
-from ground_station.mapping.observations import (
+from ground_station.mapping import landmarks, store
+from ground_station.mapping.refinement import shutter
+from ground_station.mapping.refinement.observations import (
     FlightObservations,
     landmarks_sha256,
 )
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm import colmap
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = MappingSettings(threads=2)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import colmap
+from ground_station.mapping.sfm import colmap
 
 
 def write(folder: Path) -> Path:

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from ground_station.errors import InputError
 from ground_station.features.extractor import Extractor, Features
-from ground_station.mapping.matching import mutual_matches
+from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.recording.folder import read_grey
 
 F64 = npt.NDArray[np.float64]

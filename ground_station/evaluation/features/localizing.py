@@ -19,9 +19,9 @@ from ground_station.localization.estimate import PoseEstimate
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.mapping.build import build_map
-from ground_station.mapping.refine import straighten
-from ground_station.mapping.register import register_map
+from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.refinement.refine import straighten
+from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.store import Map
 from ground_station.progress import Progress

@@ -1,4 +1,4 @@
-"""`ground_station.mapping.sights`: PAIRS.csv."""
+"""`ground_station.mapping.registration.sights`: PAIRS.csv."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from pieces import refusing, scratch, stretch
 
 from ground_station.errors import MapError
-from ground_station.mapping.sights import COLUMNS, read_pairs
+from ground_station.mapping.registration.sights import COLUMNS, read_pairs
 
 _FILE = scratch("pairs") / "PAIRS.csv"
 _HEAD = ",".join(COLUMNS).encode() + b"\n"

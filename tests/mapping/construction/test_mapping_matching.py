@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.matching import mutual_matches, verify
-from ground_station.mapping.pairs import choose_pairs, vlad
+from ground_station.mapping.construction.matching import mutual_matches, verify
+from ground_station.mapping.construction.pairs import choose_pairs, vlad
 from ground_station.mapping.settings import MatchSettings
 
 CAMERA = Camera()

@@ -15,7 +15,9 @@ from ground_station.errors import InputError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import build, colmap, store
+from ground_station.mapping import store
+from ground_station.mapping.construction import build
+from ground_station.mapping.sfm import colmap
 from ground_station.recording.frames import Frame
 
 pycolmap = colmap.pycolmap
@@ -190,7 +192,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from pathlib import Path
 import numpy as np
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.build import build_map
+from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
@@ -211,7 +213,7 @@ def test_a_killed_build_leaves_the_old_map_whole(built, tmp_path, how):
     with subprocess.Popen(
         [sys.executable, "-c", _BLOCKED, str(target)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
     ) as process:  # fmt: skip
         assert process.stdout is not None
         assert process.stdout.readline() == "reading\n"

@@ -11,7 +11,9 @@ import pytest
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import colmap, landmarks, register, sights, store
+from ground_station.mapping import landmarks, store
+from ground_station.mapping.registration import register, sights
+from ground_station.mapping.sfm import colmap
 
 pycolmap = colmap.pycolmap
 

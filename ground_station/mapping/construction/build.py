@@ -22,12 +22,13 @@ from ground_station.features import extractors
 from ground_station.features.extractor import Extractor, Features
 from ground_station.features.rootsift import RootSift
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import colmap, landmarks, store
-from ground_station.mapping.consistency import plausible_frames
+from ground_station.mapping import landmarks, store
+from ground_station.mapping.construction.consistency import plausible_frames
+from ground_station.mapping.construction.matching import TwoView, mutual_matches, verify
+from ground_station.mapping.construction.pairs import choose_pairs
 from ground_station.mapping.folder import replacing
-from ground_station.mapping.matching import TwoView, mutual_matches, verify
-from ground_station.mapping.pairs import choose_pairs
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm import colmap
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
 

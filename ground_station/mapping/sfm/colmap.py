@@ -21,8 +21,8 @@ import pycolmap
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import colmap_files
-from ground_station.mapping.matching import TwoView
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.sfm import colmap_files
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -10,7 +10,7 @@ import pytest
 import two_images
 
 from ground_station.errors import MapError
-from ground_station.mapping import colmap, colmap_files
+from ground_station.mapping.sfm import colmap, colmap_files
 
 FILES = ("cameras.bin", "rigs.bin", "images.bin", "frames.bin", "points3D.bin")
 
@@ -90,4 +90,4 @@ def test_what_contradicts_itself_is_refused(
 
 
 def test_the_shipped_map_is_taken() -> None:
-    colmap_files.check(Path(__file__).parents[2] / "maps" / "atrium" / "sparse")
+    colmap_files.check(Path(__file__).parents[3] / "maps" / "atrium" / "sparse")

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
-from ground_station.mapping import shutter
-from ground_station.mapping.observations import FlightObservations
+from ground_station.mapping.refinement import shutter
+from ground_station.mapping.refinement.observations import FlightObservations
 from ground_station.mapping.settings import RefineSettings
 from ground_station.mapping.store import Map
 

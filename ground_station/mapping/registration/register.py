@@ -15,9 +15,9 @@ from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import colmap, store
+from ground_station.mapping import store
 from ground_station.mapping.folder import replacing
-from ground_station.mapping.pose_similarity import (
+from ground_station.mapping.registration.pose_similarity import (
     Positions,
     joint_similarity,
     orientation_offset,
@@ -25,13 +25,14 @@ from ground_station.mapping.pose_similarity import (
     robust_rotation,
     similarity_on_a_line,
 )
-from ground_station.mapping.sights import Sights, Triangulated, triangulate_sights
-from ground_station.mapping.similarity import (
+from ground_station.mapping.registration.sights import Sights, Triangulated, triangulate_sights
+from ground_station.mapping.registration.similarity import (
     MIN_POINTS,
     check_spread,
     refine_similarity,
     robust_similarity,
 )
+from ground_station.mapping.sfm import colmap
 
 F64 = npt.NDArray[np.float64]
 

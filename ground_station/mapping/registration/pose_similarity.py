@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
-from ground_station.mapping.similarity import GATE_DEVIATION, MIN_POINTS
+from ground_station.mapping.registration.similarity import GATE_DEVIATION, MIN_POINTS
 
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

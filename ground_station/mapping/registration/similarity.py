@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.sights import Triangulated
+from ground_station.mapping.registration.sights import Triangulated
 
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

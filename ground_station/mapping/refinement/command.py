@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from ground_station.mapping.table import print_table
 
 HELP = "Adds what flights saw to a map, and adjusts it."
 
@@ -37,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
 
 
-def run(args: argparse.Namespace, print_table: Callable[[dict[str, Any]], None]) -> int:
+def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can mend."""
     from ground_station.errors import InputError, MapError
     from ground_station.files import write_json
-    from ground_station.mapping.observations import load_observations
-    from ground_station.mapping.refine import refine_map
+    from ground_station.mapping.refinement.observations import load_observations
+    from ground_station.mapping.refinement.refine import refine_map
     from ground_station.mapping.settings import load_settings
 
     settings = load_settings(args.settings)

@@ -16,13 +16,14 @@ from refining import ROOT, SETTINGS, _along, _localized
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
-from ground_station.mapping import colmap, folder, landmarks, store
-from ground_station.mapping.observations import (
+from ground_station.mapping import folder, landmarks, store
+from ground_station.mapping.refinement.observations import (
     save_observations,
 )
-from ground_station.mapping.refine import refine_map
-from ground_station.mapping.refined import Refined
+from ground_station.mapping.refinement.refine import refine_map
+from ground_station.mapping.refinement.refined import Refined
 from ground_station.mapping.settings import RefineSettings
+from ground_station.mapping.sfm import colmap
 
 
 def test_a_flight_makes_landmarks_and_poses_better(world):

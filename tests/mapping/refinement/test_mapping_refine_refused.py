@@ -12,12 +12,12 @@ from refining import SETTINGS
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.mapping import store
-from ground_station.mapping.observations import (
+from ground_station.mapping.refinement.observations import (
     landmarks_sha256,
     load_observations,
     save_observations,
 )
-from ground_station.mapping.refine import refine_map
+from ground_station.mapping.refinement.refine import refine_map
 
 
 def test_sights_of_another_map_are_refused_by_name(world):

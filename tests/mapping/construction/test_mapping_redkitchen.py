@@ -13,7 +13,7 @@ from ground_station.geometry.alignment import align
 from ground_station.geometry.trajectory import read_tum
 from ground_station.mapping import command, store
 
-DATA = Path(__file__).parents[2] / "../shared/data/redkitchen"
+DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/redkitchen is not there")
 

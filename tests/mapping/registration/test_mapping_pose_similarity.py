@@ -13,11 +13,12 @@ from ground_station.errors import BlimpError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory, read_tum
-from ground_station.mapping import pose_similarity, store
-from ground_station.mapping.register import by_trajectory
+from ground_station.mapping import store
+from ground_station.mapping.registration import pose_similarity
+from ground_station.mapping.registration.register import by_trajectory
 
 STEP_NS = 500_000_000
-DATA = Path(__file__).parents[2] / "../shared/data/redkitchen"
+DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/redkitchen is not there")
 

@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import colmap, landmarks, shutter
-from ground_station.mapping.chosen import Chosen
+from ground_station.mapping import landmarks
+from ground_station.mapping.refinement import shutter
+from ground_station.mapping.refinement.chosen import Chosen
+from ground_station.mapping.sfm import colmap
 from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""What a map holds, and how good it is."""

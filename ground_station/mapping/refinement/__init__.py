@@ -1,0 +1,1 @@
+"""A map that flights made better."""

@@ -1,0 +1,1 @@
+"""From a model's coordinates to the world's."""

@@ -1,0 +1,1 @@
+"""The border to COLMAP: structure from motion, and its models on disk."""
