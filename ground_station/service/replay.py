@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import cv2
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
@@ -141,6 +145,7 @@ def replay(
             localizer.set_initial_pose(start.at(time_ns), time_ns)
 
     with (
+        _threads_as_in_the_service(),
         tempfile.TemporaryDirectory(prefix="blimp-replay-") as folder,
         stand.receiver(_AHEAD + 2 if settings.stepped else settings.queue_frames) as receiver,
         stand.telemetry() as telemetry,
@@ -172,6 +177,17 @@ def replay(
     if truth is not None and map_.info.registered and len(done.estimate):
         evaluation = ate.evaluate(done.estimate, truth)
     return ReplayResult(settings, localizer_settings, camera, result, truth, evaluation)
+
+
+@contextlib.contextmanager
+def _threads_as_in_the_service() -> Iterator[None]:
+    """OpenCV's own threads would wait for the core on which the keyframes are described."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def first_pose(init: str, truth: Trajectory | None) -> Trajectory | None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from limits_axes import AXES, Axis, Conditions, chosen
-from limits_search import Found, search
+from limits_search import BORNE, Found, search
 from limits_stand import Flight, Measured, TrialError, measure
 from limits_store import Store, read
 from limits_table import QUIET_CORES, accept, render
@@ -103,6 +103,8 @@ def _level(
             + (f", others used {measured.others_cores:.2f} cores" if measured.others_cores else "")
             + (", as measured before" if known else "")
         )
+        if measured.share < BORNE:
+            break  # it is refused, whatever the other seeds give
     return shares
 
 

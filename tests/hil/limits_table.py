@@ -24,8 +24,9 @@ def render(document: dict[str, Any]) -> str:
     lines = [
         f"Borne is the highest level at which at least {100 * document['borne_from']:g} % of the"
         f" captured frames are TRACKING in each of {len(seeds)} runs of"
-        f" {document['duration_s']:g} s, and at all easier levels that were tried; measured by"
-        f" `make limits` with a simulated flight ({document['flight'].split(',')[0]}) on"
+        f" {document['duration_s']:g} s, counted from the first TRACKING one, and at all easier"
+        " levels that were tried; a level is given up at the first run that falls short. Measured"
+        f" by `make limits` with a simulated flight ({document['flight'].split(',')[0]}) on"
         f" {machine['cores']} cores ({model}), {machine['date']}, load"
         f" {machine['load_before']:g} before; others used {max(others, default=0.0):.2f} cores at"
         " most meanwhile. Of a link only the video's packets are burdened.",

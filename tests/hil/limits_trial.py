@@ -20,13 +20,17 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from ground_station.service.live import LiveFrame
+
 TESTS = Path(__file__).resolve().parents[1]
 SETTLE_S = 3.0
-"""From when all payloads are tracked to the first frame that counts."""
+"""From when all payloads are tracked to the first frame that counts, and how long one flight may
+search for its place before its frames count."""
 TRACKING_S = 90.0
 LATE_S = 3.0
 SEAM_S = 2.0
@@ -52,8 +56,9 @@ class Trial:
 class Outcome:
     """`due` are the frames that a camera had to give, `tracking` those of them called TRACKING.
 
-    Of several payloads both are the worst one's. Latencies are in ms and of all of them, memory and
-    processor of one flight's two sides (MB, cores); None where it is not known.
+    Both count from when the place was found, and of several payloads are the worst one's. Latencies
+    are in ms and of all of them, memory and processor of one flight's two sides (MB, cores); None
+    where it is not known.
     """
 
     due: int
@@ -143,15 +148,33 @@ def fly(trial: Trial) -> Outcome:
     live = replay(store.load(Path(trial.map)), load_preset("default"), settings, stand).live
     latency = live.latency_ms()
     p50, p99 = np.quantile(latency, (0.5, 0.99)) if len(latency) else (None, None)
+    captured, frames = live.accounts()["captured"], since_found(live.frames)
+    if frames:
+        captured -= frames[0].sequence
     return Outcome(
-        due=due(live.accounts()["captured"], [f.clock_ns for f in live.frames], trial.rate_hz),
-        tracking=sum(frame.estimate.state.value == "TRACKING" for frame in live.frames),
+        due=due(captured, [frame.clock_ns for frame in frames or live.frames], trial.rate_hz),
+        tracking=sum(_tracking(frame) for frame in frames),
         latency_p50_ms=None if p50 is None else float(p50),
         latency_p99_ms=None if p99 is None else float(p99),
         received=live.accounts()["received"],
         ground_cores=watches[0].side().cpu,
         payload_cores=watches[1].side().cpu,
     )
+
+
+def since_found(frames: list[LiveFrame]) -> list[LiveFrame]:
+    """The frames from the first TRACKING one on: what comes before is the search for the place.
+
+    A search that takes longer than `SETTLE_S` counts from then on.
+    """
+    for n, frame in enumerate(frames):
+        if _tracking(frame) or frame.clock_ns - frames[0].clock_ns >= SETTLE_S * 1e9:
+            return frames[n:]
+    return []
+
+
+def _tracking(frame: LiveFrame) -> bool:
+    return frame.estimate.state.value == "TRACKING"
 
 
 @dataclass(frozen=True)

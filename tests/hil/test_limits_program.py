@@ -48,7 +48,7 @@ def test_limits_of_the_made_up_system_are_found_and_told(
     assert (axes["jitter"]["borne"], axes["jitter"]["refused"]) == ("50 ms", "100 ms")
     assert axes["loss"]["shares"]["2 %"] == pytest.approx([0.989, 0.988, 0.987])
     said = capsys.readouterr()
-    assert "| 2 % | 98.7 to 98.9 % | 3 % | 87 to 89 % |" in said.out
+    assert "| 2 % | 98.7 to 98.9 % | 3 % | 89 % |" in said.out  # given up at its first run
     assert out.with_suffix(".md").read_text() == said.out
     assert "loss: 2 %, seed 1: 98.9 % TRACKING" in said.err
 

@@ -11,16 +11,20 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import limits_trial
 import pytest
 from limits_axes import Conditions
 from limits_stand import Flight, TrialError, measure
 from limits_throttle import Group, method, stopped_in_turn, throttled, usable_group
-from limits_trial import SEAM_S, Outcome, Round, Trial, due, judge, round_of
+from limits_trial import SEAM_S, SETTLE_S, Outcome, Round, Trial, due, judge, round_of, since_found
 
 from ground_station.errors import InputError
+from ground_station.localization.estimate import State
 from ground_station.service.firmware import FirmwareError
+from ground_station.service.live import LiveFrame
 from pi_firmware.wire.errors import StreamError
 
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
@@ -52,6 +56,23 @@ def test_frames_of_a_flight_that_keeps_its_pace_are_those_captured() -> None:
 def test_a_flight_that_a_slow_firmware_stretches_owes_what_a_camera_would_have_given() -> None:
     """960 frames in twice their time: a camera would not have waited."""
     assert due(960, [k * S // 15 for k in range(960)], 30.0) == 1919
+
+
+def test_a_flight_counts_from_when_its_place_was_found() -> None:
+    states = ["INITIALIZING", "DEGRADED", "TRACKING", "LOST", "TRACKING"]
+
+    def flown(step_s: float) -> list[LiveFrame]:
+        return [
+            cast(LiveFrame, SimpleNamespace(
+                clock_ns=S + round(n * step_s * S), estimate=SimpleNamespace(state=State(state))))
+            for n, state in enumerate(states)
+        ]  # fmt: skip
+
+    flight = flown(0.1)
+    assert since_found(flight) == flight[2:]
+    assert since_found(flight[:2]) == []
+    slow = flown(SETTLE_S)
+    assert since_found(slow) == slow[1:]  # a search so long is a limit, too
 
 
 def test_the_share_of_nothing_is_nothing() -> None:
@@ -163,7 +184,7 @@ def test_a_flight_over_a_link_with_a_firmware_held_back_is_flown_and_told() -> N
     measured = measure(flight, under, seed=1)
     assert measured.why == "" and measured.held_by == method()
     outcome = Outcome(**measured.outcome)
-    assert outcome.due >= 10 and outcome.received and outcome.ground_cores
+    assert outcome.due >= 1 and outcome.received and outcome.ground_cores
     assert 0.0 <= measured.share == outcome.share <= 1.0
     assert measured.link["received"] == measured.link["delayed"] > 10
     assert measured.others_cores is not None and measured.took_s > 2.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import threading
 
 import cv2
@@ -16,7 +17,7 @@ from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import TrackingSettings, load_preset
 from ground_station.localization.tracking import Keyframe, spread_out, track
-from ground_station.localization.worker import Worker
+from ground_station.localization.worker import BESIDE_NICE, Worker
 from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
 
 DEPTH_M = 4.0
@@ -258,6 +259,15 @@ def test_a_time_that_jumps_back_is_refused_while_tracking(wall):
 
 def test_the_thesis_preset_describes_every_frame():
     assert not load_preset("thesis").tracking.enabled
+
+
+def test_the_thread_beside_the_tracking_steps_aside():
+    """Both want the same core when a machine has two: the frame goes first."""
+    worker: Worker[int] = Worker(1)
+    worker.submit(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    mine = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    assert worker.collect() == min(mine + BESIDE_NICE, 19)
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == mine
 
 
 def test_a_result_lands_at_its_frame_and_is_waited_for():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 import time
@@ -36,8 +35,6 @@ _ANSWER_S = 3.0
 _WAITING_EVERY_S = 1.0
 _FORGET_AFTER, _END_AFTER = 3, 10
 """Frames in a row that failed: what is known of the flight may be the cause; the process is."""
-_BESIDE_NICE = 5
-"""On two busy cores, three rounds each: a pose's p99 49 to 72 ms, and 66 to 74 ms without."""
 
 
 class LocalizingError(GroundStationError):
@@ -132,7 +129,6 @@ class Localizing:
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
         self._bus.say(notes.ESTIMATE, self._payload_id, told)
-        _step_aside()
 
     def _fail(self, localizer: Localizer, reason: str) -> None:
         self._failed += 1
@@ -199,14 +195,3 @@ class Localizing:
     def _event(self, level: str, name: str, text: str) -> None:
         note = EventNote(time.time_ns(), "localizer", level, name, text)
         self._bus.say(notes.EVENT, self._payload_id, note)
-
-
-def _step_aside() -> None:
-    """Lets tracking go before the keyframes' thread, where both want the same core."""
-    nice = min(os.getpriority(os.PRIO_PROCESS, 0) + _BESIDE_NICE, 19)
-    for thread in threading.enumerate():
-        number = thread.native_id
-        if number is None or not thread.name.startswith("keyframes"):
-            continue
-        if os.getpriority(os.PRIO_PROCESS, number) < nice:
-            os.setpriority(os.PRIO_PROCESS, number, nice)
