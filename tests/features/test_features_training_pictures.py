@@ -122,3 +122,22 @@ def test_a_room_looks_otherwise_in_another_light_but_stands_where_it_stood(monke
         edges = [np.hypot(*np.gradient(v)) for v in (a, b)]
         assert np.corrcoef(edges[0].ravel(), edges[1].ravel())[0, 1] > 0.5
     assert np.abs(stacks[0][0].astype(float) - stacks[1][0]).mean() > 5  # the place
+
+
+def test_a_wide_blur_of_black_stays_a_picture() -> None:
+    """OpenCV blurs by a wide kernel in the frequency domain, which leaves black just below nought.
+
+    (A negative number to a broken power is no number.)
+    """
+    picture = np.zeros((96, 128), np.uint8)
+    picture[::9, ::7] = 255
+    picture[40:, 60:] = 0
+    wide = degrade.Chances(light=0, shadow=0, defocus=0, motion=1, tone=0, noise=0, compression=0)
+    ever = 0.0
+    with np.errstate(invalid="raise"):
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            blurred = degrade.motion_blur((picture / 255).astype(np.float32), [14.0, 3.0 + seed])
+            ever = min(ever, float(blurred.min()))
+            degrade.degrade(picture, rng, wide)
+    assert ever < 0  # or this shows nothing

@@ -46,6 +46,8 @@ def degrade(picture: Bytes, rng: Rng, chances: Chances | None = None) -> Bytes:
     if rng.random() < c.motion:
         motion = rng.normal(0, 1, 2) * rng.uniform(0.5, 4)
         linear = motion_blur(linear, motion)
+    # A blur by a Fourier transform leaves black a little below nought, which has no power.
+    linear = np.maximum(linear, 0)
     tone = rng.random() < c.tone
     code = developed(linear, rng) if tone else linear ** np.float32(1 / 2.2)
     if rng.random() < c.noise:
