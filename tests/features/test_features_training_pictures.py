@@ -133,11 +133,6 @@ def test_a_wide_blur_of_black_stays_a_picture() -> None:
     picture[::9, ::7] = 255
     picture[40:, 60:] = 0
     wide = degrade.Chances(light=0, shadow=0, defocus=0, motion=1, tone=0, noise=0, compression=0)
-    ever = 0.0
     with np.errstate(invalid="raise"):
-        for seed in range(12):
-            rng = np.random.default_rng(seed)
-            blurred = degrade.motion_blur((picture / 255).astype(np.float32), [14.0, 3.0 + seed])
-            ever = min(ever, float(blurred.min()))
-            degrade.degrade(picture, rng, wide)
-    assert ever < 0  # or this shows nothing
+        for seed in range(200):
+            degrade.degrade(picture, np.random.default_rng(seed), wide)
