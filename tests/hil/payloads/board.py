@@ -4,8 +4,8 @@ Standard library of Python 3.11 only. Standard input is the line to the ground: 
 does the flight. Standard output is JSON, one object a line; an error is one line on standard error
 and status 2. A card (it has the payload's service) flies with that service itself: the same
 release, user, certificates and payload.toml, with `--set` for what is another in a replay, by a
-drop-in below /run that a power cut takes away. A transient unit owns the drop-in, and systemd
-undoes it whatever becomes of that unit. Any other machine runs the firmware from a folder.
+drop-in below /run that a power cut takes away. A unit of its own below /run owns the drop-in, and
+systemd undoes it whatever becomes of that unit. Any other machine runs the firmware from a folder.
 """
 
 from __future__ import annotations
@@ -33,12 +33,15 @@ TRIAL = Path("/data/releases/trial.json")
 RECORDINGS = Path("/data/hil")
 WORK = Path("/run/blimp-hil")
 DROP_IN = Path("/run/systemd/system") / f"{SERVICE}.d" / "90-hil.conf"
+UNIT_FILE = Path("/run/systemd/system") / UNIT
 LOG = WORK / "firmware.log"
+LINE, SAID = WORK / "line", WORK / "said"
+"""Pipes between the ground's line and the unit: what comes from the ground, what goes to it."""
 KEPT = 4
 """Recordings that stay; those not used the longest go."""
 ROOM_BYTES = 32 << 20
 """Of the data partition, left to the payload."""
-_SHOWN = "ActiveState,Result,ExecMainStatus,MemoryPeak,CPUUsageNSec"
+_PROPERTIES = "ActiveState,Result,ExecMainStatus,MemoryPeak,CPUUsageNSec"
 _BLOCK = 1 << 16
 _END_S = 10.0
 _START_S = 60.0
@@ -156,23 +159,90 @@ def fly(spec: dict[str, Any]) -> None:
     if not is_card():
         _fly_plainly(spec, words)
         return
-    if _systemctl("is-active", UNIT).stdout.strip() not in ("inactive", "failed", "unknown"):
+    if _is_on(UNIT):
         raise BoardError(f"{UNIT} is active: another replay is under way on this card")
     shutil.rmtree(WORK, ignore_errors=True)
     WORK.mkdir(mode=0o755)
     (WORK / "board.py").write_bytes(SOURCE)
     was_active = _systemctl("is-active", "--quiet", SERVICE).returncode == 0
     (WORK / "spec.json").write_text(json.dumps({"settings": words, "was_active": was_active}))
+    status = _in_a_unit(int(spec["limit_s"]))
+    if status:
+        sys.exit(status)
+
+
+def _in_a_unit(limit_s: int) -> int:
+    """Runs `lent` in a unit of its own and stands between it and the line; returns its status.
+
+    `systemd-run` would do that, but it asks D-Bus, which a card does not carry.
+    """
+    for pipe in (LINE, SAID):
+        os.mkfifo(pipe, 0o600)
+    said, line = os.open(SAID, os.O_RDONLY | os.O_NONBLOCK), os.open(LINE, os.O_RDWR)
+    UNIT_FILE.parent.mkdir(parents=True, exist_ok=True)
+    UNIT_FILE.write_text(unit(limit_s))
+    try:
+        _checked("daemon-reload")
+        _checked("start", UNIT)
+        _relay(said, line)
+        until_s = time.monotonic() + 1.5 * _START_S
+        while _is_on(UNIT) and time.monotonic() < until_s:
+            time.sleep(0.2)
+        found = _shown(UNIT)
+        good = found.get("Result", "success") == "success"
+        return 0 if good else int(found.get("ExecMainStatus") or 0) or 1
+    finally:
+        UNIT_FILE.unlink(missing_ok=True)
+        _systemctl("reset-failed", UNIT)
+        _systemctl("daemon-reload")
+
+
+def unit(limit_s: int) -> str:
+    """The unit's words; its end undoes what it did, also after a kill."""
     program = f"/usr/bin/python3 -I {WORK}/board.py"
-    os.execvp("systemd-run", [
-        "systemd-run", "--quiet", "--pipe", "--wait", "--collect", f"--unit={UNIT}",
-        f"--property=ExecStopPost={program} restore", "--property=TimeoutStopSec=60",
-        f"--property=RuntimeMaxSec={int(spec['limit_s'])}", *program.split(), "hold",
-    ])  # fmt: skip
+    return (
+        "[Unit]\nDescription=A recorded flight, replayed for the ground\n"
+        f"[Service]\nType=exec\nExecStart={program} lent\nExecStopPost={program} restore\n"
+        f"TimeoutStopSec=60\nRuntimeMaxSec={limit_s}\n"
+    )
+
+
+def _relay(said: int, line: int) -> None:
+    """Passes the unit's words on until it says no more; the ground's line ends its own."""
+    watched, rest = [0, said], b""
+    while said in watched:
+        ready = select.select(watched, [], [], 5.0)[0]
+        if 0 in ready and not os.read(0, _BLOCK):
+            watched.remove(0)
+            os.close(line)
+        if said in ready:
+            block = os.read(said, _BLOCK)
+            *lines, rest = (rest + block).split(b"\n")
+            for one in lines:
+                # Nobody may listen any more, and the unit has to end all the same.
+                with contextlib.suppress(BrokenPipeError):
+                    to = sys.stdout if one.startswith(b"{") else sys.stderr
+                    to.write(one.decode(errors="replace") + "\n")
+                    to.flush()
+            if not block:
+                watched.remove(said)
+        elif not ready and not _is_on(UNIT):
+            return  # it never came to say a word
+
+
+def lent() -> None:
+    """Inside the unit: `hold`, with the pipes for a line; the unit's end finds none in its way."""
+    taken, given = (os.open(LINE, os.O_RDONLY | os.O_NONBLOCK),
+                    os.open(SAID, os.O_WRONLY | os.O_NONBLOCK))  # fmt: skip
+    os.set_blocking(given, True)
+    for descriptor, stream in ((taken, 0), (given, 1), (given, 2)):
+        os.dup2(descriptor, stream)
+    os.close(given)
+    hold()
 
 
 def hold() -> None:
-    """Inside the transient unit: lets the payload's own service fly the recording, and watches."""
+    """Lets the payload's own service fly the recording, and watches."""
     spec = json.loads((WORK / "spec.json").read_text())
     _checked("stop", SERVICE)
     LOG.touch()
@@ -238,9 +308,17 @@ def restore() -> None:
 
 def _state() -> tuple[dict[str, str], float]:
     begun_s = time.monotonic()
-    said = _systemctl("show", "-p", _SHOWN, SERVICE).stdout
-    found = dict(line.split("=", 1) for line in said.splitlines() if "=" in line)
+    found = _shown(SERVICE)
     return found, time.monotonic() - begun_s
+
+
+def _shown(name: str) -> dict[str, str]:
+    said = _systemctl("show", "-p", _PROPERTIES, name).stdout
+    return dict(line.split("=", 1) for line in said.splitlines() if "=" in line)
+
+
+def _is_on(name: str) -> bool:
+    return _systemctl("is-active", name).stdout.strip() not in ("inactive", "failed", "unknown")
 
 
 def _line_ended(for_s: float, log: _Tail) -> bool:
@@ -347,10 +425,10 @@ def _tell_lines(lines: list[bytes]) -> None:
 
 
 def main(verb: str, text: str = "{}") -> NoReturn:
-    """One command of the ground's, or of the transient unit's."""
+    """One command of the ground's, or of the unit's."""
     try:
-        if verb in ("hold", "restore"):
-            {"hold": hold, "restore": restore}[verb]()
+        if verb in ("lent", "hold", "restore"):
+            {"lent": lent, "hold": hold, "restore": restore}[verb]()
         else:
             {"look": look, "receive": receive, "fly": fly}[verb](json.loads(text))
     except BoardError as error:
