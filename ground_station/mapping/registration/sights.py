@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.mapping.registration.rows import numbers, read_rows, word
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -20,6 +21,8 @@ I64 = npt.NDArray[np.int64]
 COLUMNS = ("point", "image", "u_px", "v_px", "x_m", "y_m", "z_m")
 _SAME_POINT_M = 1e-6
 _HUBER_PX = 2.0
+_LEAST_PX = 0.1
+"""No sight is better than a tenth of a pixel, however well a few of them happen to meet."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Sights:
     """S sights of P known points.
 
     `points`, P names; `world_m` (P, 3); `point` (S,), an index into the points; `image`, S image
-    names; `pixel_px` (S, 2), distorted pixels.
+    names; `pixel_px` (S, 2), distorted pixels. Points that were measured as one thing, such as a
+    tag's corners, share a number in `thing` (P,); without it each is one of its own.
     """
 
     points: list[str]
@@ -35,6 +39,12 @@ class Sights:
     point: I64
     image: list[str]
     pixel_px: F64
+    thing: I64 | None = None
+
+    @property
+    def group(self) -> I64:
+        """The number of the thing that each point belongs to, (P,)."""
+        return np.arange(len(self.points)) if self.thing is None else self.thing
 
 
 @dataclass(frozen=True)
@@ -56,48 +66,41 @@ class Triangulated:
 
 
 def read_pairs(path: str | Path) -> Sights:
-    """Reads `point,image,u_px,v_px,x_m,y_m,z_m` lines; raises `MapError` naming the line."""
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise MapError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise MapError(f"{path}: not a text file") from None
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    reader = csv.DictReader(lines)
-    missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-    if missing:
-        raise MapError(
-            f"{path}: the column '{missing[0]}' is missing (needed: {','.join(COLUMNS)})"
-        )
+    """Reads `point,image,u_px,v_px,x_m,y_m,z_m` lines; raises `MapError` naming the line.
+
+    So it does for a point that is seen twice in one image, and for two points at one place: of two
+    names for one thing, or two clicks on it, one is a mistake.
+    """
     index: dict[str, int] = {}
     world: list[list[float]] = []
     point: list[int] = []
     image: list[str] = []
     pixels: list[list[float]] = []
-    try:
-        for number, row in enumerate(reader, start=1):
-            where = f"{path}, sight {number}"
-            try:
-                u, v, *xyz = (float(row[name]) for name in COLUMNS[2:])
-            except (TypeError, ValueError):
-                raise MapError(f"{where}: five numbers are needed in {COLUMNS[2:]}") from None
-            if not all(math.isfinite(value) for value in (u, v, *xyz)):
-                raise MapError(f"{where}: a number is not finite")
-            name = row["point"].strip()
-            if name not in index:
-                index[name] = len(world)
-                world.append(xyz)
-            elif math.dist(world[index[name]], xyz) > _SAME_POINT_M:
-                raise MapError(f"{where}: the point '{name}' was at {world[index[name]]} before")
-            point.append(index[name])
-            image.append(row["image"].strip())
-            pixels.append([u, v])
-    except csv.Error as error:
-        raise MapError(f"{path}: {error}") from None
+    seen: set[tuple[str, str]] = set()
+    for where, row in read_rows(path, COLUMNS, "sight"):
+        u, v, *xyz = numbers(row, COLUMNS[2:], where)
+        name, picture = word(row, "point", where), word(row, "image", where)
+        if name not in index:
+            index[name] = len(world)
+            world.append(xyz)
+        elif math.dist(world[index[name]], xyz) > _SAME_POINT_M:
+            raise MapError(f"{where}: the point '{name}' was at {world[index[name]]} before")
+        if (name, picture) in seen:
+            raise MapError(f"{where}: the point '{name}' was seen in '{picture}' before")
+        seen.add((name, picture))
+        point.append(index[name])
+        image.append(picture)
+        pixels.append([u, v])
     if not point:
         raise MapError(f"{path}: it holds no sights")
+    places: dict[tuple[float, ...], str] = {}
+    for name, k in index.items():
+        place = tuple(round(x / _SAME_POINT_M) for x in world[k])
+        if place in places:
+            raise MapError(
+                f"{path}: the points '{places[place]}' and '{name}' are at the same place"
+            )
+        places[place] = name
     return Sights(
         points=list(index),
         world_m=np.array(world),
@@ -115,13 +118,13 @@ def triangulate_sights(
     `names`, K images of the model, and their poses `wTc` (K, 4, 4). An image is known by its name,
     or by its name without folder and suffix where only one has that.
     """
-    lookup = _lookup(names)
+    lookup = lookup_images(names)
     found: list[Triangulated] = []
     notes: list[str] = []
     rays = camera.undistort(sights.pixel_px)
     for p, name in enumerate(sights.points):
         mine = np.flatnonzero(sights.point == p)
-        known = [(s, lookup[key]) for s in mine if (key := _key(sights.image[s], lookup))]
+        known = [(s, lookup[key]) for s in mine if (key := known_image(sights.image[s], lookup))]
         if len({k for _, k in known}) < 2:
             notes.append(
                 f"point '{name}' left out: {len(known)} of its {len(mine)} images are in the map"
@@ -193,7 +196,15 @@ def reproject(X: F64, wTc: F64, rays: F64, camera: Camera) -> tuple[F64, F64]:
     return (rays - xy) * f, J
 
 
-def _lookup(names: list[str]) -> dict[str, int]:
+def sigma_px(points: Sequence[Triangulated]) -> float:
+    """The standard deviation of a sight's coordinate, pixels: what the triangulation leaves."""
+    squares = sum(len(point.ray) * point.error_px**2 for point in points)
+    freedom = sum(2 * len(point.ray) - 3 for point in points)
+    return max(float(np.sqrt(squares / max(freedom, 1))), _LEAST_PX)
+
+
+def lookup_images(names: list[str]) -> dict[str, int]:
+    """Where an image stands in `names`, by its name and by its stem where only one has that."""
     stems: dict[str, list[int]] = {}
     for k, name in enumerate(names):
         stems.setdefault(Path(name).stem, []).append(k)
@@ -201,5 +212,6 @@ def _lookup(names: list[str]) -> dict[str, int]:
     return result | {name: k for k, name in enumerate(names)}
 
 
-def _key(image: str, lookup: dict[str, int]) -> str | None:
+def known_image(image: str, lookup: dict[str, int]) -> str | None:
+    """The key of `lookup` under which an image is known, None where it is not."""
     return next((key for key in (image, Path(image).stem) if key in lookup), None)

@@ -15,7 +15,7 @@ from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.mapping import store
 from ground_station.mapping.registration import pose_similarity
-from ground_station.mapping.registration.register import by_trajectory
+from ground_station.mapping.registration.from_trajectory import by_trajectory
 
 STEP_NS = 500_000_000
 DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"

@@ -187,10 +187,18 @@ def test_an_image_is_known_without_its_suffix_and_folder(built, target, tmp_path
         ("", "'point' is missing"),
         ("point,image,u_px,v_px,x_m,y_m\n", "'z_m' is missing"),
         ("point,image,u_px,v_px,x_m,y_m,z_m\n", "no sights"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4\n", "sight 1.*five numbers"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,x\n", "sight 1.*five numbers"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,nan\n", "sight 1.*not finite"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4\n", "sight 1: numbers are needed"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,x\n", "sight 1: numbers are needed"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,nan\n", "sight 1: z_m is nan"),
         ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,5\na,c,1,2,3,4,6\n", "'a' was at"),
+        (
+            "point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,1e9\n",
+            "sight 1: z_m is 1e\\+09; allowed",
+        ),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\n,b,1,2,3,4,5\n", "column 'point' is empty"),
+        ("z_m,image,u_px,v_px,x_m,y_m,point\n1,b,1,2,3,4\n", "column 'point' is empty"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,5\na,b,1,2,3,4,5\n", "was seen in 'b'"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,5\nc,b,1,2,3,4,5\n", "'a' and 'c' are at"),
     ],
 )
 def test_a_pairs_file_that_is_wrong_is_refused_by_line(tmp_path, text, words):

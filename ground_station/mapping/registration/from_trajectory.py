@@ -1,0 +1,176 @@
+"""The similarity from a trajectory that has poses at the keyframes' times."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import GeometryError, MapError
+from ground_station.geometry import poses
+from ground_station.geometry.alignment import Alignment, align
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.registration.pose_similarity import (
+    Positions,
+    joint_similarity,
+    orientation_offset,
+    position_scatter,
+    robust_rotation,
+    similarity_on_a_line,
+)
+from ground_station.mapping.registration.registration import Registration, rms, similarity_report
+from ground_station.mapping.registration.similarity import (
+    MIN_POINTS,
+    check_spread,
+    robust_similarity,
+)
+from ground_station.mapping.registration.uncertainty import Uncertainty, jacobian
+from ground_station.mapping.store import Keyframes, Map
+
+F64 = npt.NDArray[np.float64]
+
+_MAX_DIFF_NS = 10_000_000
+"""A trajectory's pose counts for a keyframe within 10 ms, as in the evaluation."""
+
+_MIN_EXTENT, _MAX_EXTENT = 1e-9, 1e9
+"""Of a path, in a model's units or metres: beyond, squares leave the numbers' range."""
+
+
+def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
+    """The similarity from the keyframes' poses to a trajectory's at the same times.
+
+    Positions and orientations count each by its own scatter. Orientations that are a constant
+    rotation off the camera's (a vehicle's own axes) are left out, with a note. Positions on one
+    line leave the roll about it to the orientations. Raises `MapError` for fewer than three poses,
+    numbers that are not finite, positions in one place, and positions on one line where the
+    orientations cannot be used.
+    """
+    model, truth = _matched(map_.keyframes, trajectory)
+    n, total = len(model), len(map_.keyframes)
+    notes = [f"{n} of {total} keyframes have a pose in the trajectory"]
+    positions = Positions(model[:, :3, 3], truth[:, :3, 3])
+    turned = truth[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)
+    mean, turned_alike = robust_rotation(turned, seed)
+    try:
+        check_spread(positions.target, "positions")
+        noise = np.zeros(n)
+        fit, alike = robust_similarity(positions.source, positions.target, noise, seed, "positions")
+        on_line = False
+    except (MapError, GeometryError):
+        fit, alike = similarity_on_a_line(positions, mean, seed)
+        on_line = True
+        notes.append("the positions lie on one line: the orientations give the roll about it")
+    used = positions.of(alike)
+    scatter_m = max(position_scatter(used, fit), used.floor_m())
+    offset = orientation_offset(
+        fit, used.information(fit, scatter_m), model[:, :3, :3], truth[:, :3, :3], seed
+    )
+    report: dict[str, Any] = {"method": "trajectory", "points": len(used.source), "points_given": n}
+    if offset.another_frame:
+        if on_line:
+            raise MapError(
+                f"registration: the {n} positions lie on one line, and the trajectory's "
+                f"orientations, {offset.angle_deg:.1f} deg off the camera's, do not give the roll"
+            )
+        notes.append(
+            f"the trajectory's orientations are {offset.angle_deg:.1f} deg off the camera's "
+            f"(scatter {offset.scatter_deg:.1f} deg): only its positions are used"
+        )
+        scales = _jackknife_scales(used.source, used.target)
+        report |= {"orientations": 0, "sigma_m": scatter_m}
+        known = _uncertainty(used, fit, scatter_m, 0, 1.0)
+    else:
+        joint = joint_similarity(used, turned[turned_alike], fit)
+        fit, scales = joint.fit, used.jackknife_scales(joint.fit.rotation)
+        count = int(turned_alike.sum())
+        known = _uncertainty(used, fit, joint.sigma_m, count, joint.sigma_rad)
+        report |= {
+            "orientations": count,
+            "sigma_m": joint.sigma_m,
+            "sigma_deg": float(np.degrees(joint.sigma_rad)),
+        }
+    if not alike.all():
+        notes.append(f"{int((~alike).sum())} positions left out: far off where the others agree")
+    if not (turned_alike.all() or offset.another_frame):
+        notes.append(f"{int((~turned_alike).sum())} orientations left out: far off the others'")
+    error = np.linalg.norm(fit.apply(used.source) - used.target, axis=1)
+    seen = turned if offset.another_frame else turned[turned_alike]
+    angle = np.degrees(poses.rotation_angle(seen @ fit.rotation.T))
+    report |= {
+        "residual_rms_m": rms(error),
+        "residual_max_m": float(error.max()),
+        "residual_rms_deg": rms(angle),
+        "residual_max_deg": float(angle.max()),
+        "orientation_offset_deg": offset.angle_deg,
+        **similarity_report(fit, scales),
+    }
+    return Registration(fit, report, known, notes)
+
+
+def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
+    """Poses (N, 4, 4) of keyframes and the trajectory's at their times."""
+    if not len(trajectory):
+        raise MapError("registration: the trajectory has no poses")
+    order = np.argsort(trajectory.time_ns, kind="stable")
+    sorted_ns = trajectory.time_ns[order]
+    right = np.clip(np.searchsorted(sorted_ns, kf.time_ns), 0, len(order) - 1)
+    left = np.maximum(right - 1, 0)
+    # In floats: the difference of two times out of a hostile file need not be an integer of 64 bit.
+    ahead, behind = (
+        np.abs(sorted_ns[i].astype(np.float64) - kf.time_ns.astype(np.float64))
+        for i in (right, left)
+    )
+    nearest = order[np.where(behind <= ahead, left, right)]
+    close = np.minimum(ahead, behind) <= _MAX_DIFF_NS
+    if close.sum() < MIN_POINTS:
+        raise MapError(
+            f"registration: {int(close.sum())} of {len(kf)} keyframes have a pose within "
+            f"{_MAX_DIFF_NS / 1e9} s in the trajectory; at least {MIN_POINTS} are needed"
+        )
+    position = trajectory.position_m[nearest[close]]
+    quaternion = trajectory.quaternion_xyzw[nearest[close]]
+    # Compared this way round, what is not a number fails, too.
+    good = (np.abs(position) < _MAX_EXTENT).all(axis=1)
+    good &= (np.abs(quaternion) < 2).all(axis=1) & (np.abs(quaternion).max(axis=1) > 1e-6)
+    if not good.all():
+        time_s = trajectory.time_ns[nearest[close]][~good][0] / 1e9
+        raise MapError(
+            f"registration: the trajectory's pose at {time_s:.6f} s is not finite, is further than "
+            f"{_MAX_EXTENT:.0e} m or has a quaternion that is not of length 1"
+        )
+    model = kf.wTc[close]
+    good = np.asarray((np.abs(model) < _MAX_EXTENT).all(axis=(1, 2)))
+    R = np.where(good[:, None, None], model[:, :3, :3], 0.0)
+    good &= np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) < 1e-3
+    good &= np.linalg.det(R) > 0
+    if not good.all():
+        name = np.array(kf.names)[close][~good][0]
+        raise MapError(f"registration: the map's pose of '{name}' is not finite or no rigid motion")
+    for which, centre in (("map", model[:, :3, 3]), ("trajectory", position)):
+        if np.ptp(centre, axis=0).max() < _MIN_EXTENT:
+            raise MapError(
+                f"registration: the {len(centre)} positions of the {which} lie in one place"
+            )
+    return model, poses.from_quaternion(position, quaternion)
+
+
+def _uncertainty(
+    positions: Positions, fit: Alignment, sigma_m: float, rotations: int, sigma_rad: float
+) -> Uncertainty:
+    """The similarity's covariance; every pose counts as independent, which a drift is not."""
+    placed = fit.apply(positions.source)
+    centre = placed.mean(axis=0)
+    J = jacobian(placed - centre)
+    normal = np.einsum("nki,nkj->ij", J, J) / sigma_m**2
+    if rotations:
+        normal[:3, :3] += rotations / sigma_rad**2 * np.eye(3)
+    freedom = max(3 * len(placed) - 7, 1)
+    return Uncertainty(np.linalg.pinv(normal, hermitian=True), centre, freedom)
+
+
+def _jackknife_scales(source: F64, target: F64) -> list[float]:
+    keep = ~np.eye(len(source), dtype=bool)
+    if len(source) <= MIN_POINTS:
+        return []
+    return [align(source[others], target[others], True).scale for others in keep]
