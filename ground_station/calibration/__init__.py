@@ -1,0 +1,1 @@
+"""The camera's calibration from views of a printed board: lens, and rolling shutter."""

@@ -1,0 +1,206 @@
+"""From sightings of the board to a camera: choose views, fit the lens, time the rows, fit again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.calibration import lens, selection, verdict
+from ground_station.calibration.detection import BoardFinder
+from ground_station.calibration.errors import CalibrationError
+from ground_station.calibration.gather import Gathered
+from ground_station.calibration.lens import Fit, Points
+from ground_station.calibration.readout import Readout, readout_of
+from ground_station.calibration.views import View, views_of
+from ground_station.geometry.camera import Camera
+
+Array = npt.NDArray[np.float64]
+
+MAX_VIEWS = 40
+_POOR = 3.0
+"""A view whose corners are off by so many times what is usual is left out."""
+_TURNS = 2
+"""Lens and readout, each with the other's: the second changes neither by a tenth of its sigma."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the picture: corners of the board in it, and how far they are off."""
+
+    name: str
+    corners: int
+    rms_px: float
+
+
+@dataclass
+class Result:
+    """A calibration. `views` are those that the `fit` is of, `seen` all that had the board."""
+
+    camera: Camera
+    fit: Fit
+    views: list[View]
+    seen: list[View]
+    readout: Readout | None
+    size_px: tuple[int, int]
+    tilts_deg: Array
+    distances_m: Array
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def readout_known(self) -> bool:
+        """Whether the camera's readout was measured."""
+        r = self.readout
+        return r is not None and r.determined and not r.backwards
+
+    @property
+    def corners(self) -> tuple[int, int]:
+        """How many corners count, and how many were left out as wrong."""
+        used = sum(int(np.count_nonzero(kept)) for kept in self.fit.used)
+        return used, sum(len(kept) for kept in self.fit.used) - used
+
+    def regions(self) -> list[Region]:
+        """The four corners of the picture, and the rest of it."""
+        px = np.concatenate(
+            [v.seen.px[kept] for v, kept in zip(self.views, self.fit.used, strict=True)]
+        )
+        off = np.concatenate(
+            [r[kept] for r, kept in zip(self.fit.residuals, self.fit.used, strict=True)]
+        )
+        rest = np.ones(len(px), bool)
+        found = []
+        for name in selection.CORNERS:
+            inside = selection.in_corner(px, self.size_px, name)
+            rest &= ~inside
+            found.append(Region(name, int(inside.sum()), lens.rms(off[inside])))
+        return [*found, Region("the rest", int(rest.sum()), lens.rms(off[rest]))]
+
+
+def calibrate(
+    gathered: Gathered, finder: BoardFinder, timed: list[bool], most_views: int = MAX_VIEWS
+) -> Result:
+    """The camera by what was seen; raises `CalibrationError` naming what is missing.
+
+    `timed` says of each input whether its frames' times can be trusted.
+    """
+    verdict.check_seen(gathered, finder)
+    size_px, height_px = gathered.size_px, gathered.size_px[1]
+    middle_m = finder.points_m.mean(axis=0)
+    seen = views_of(gathered.sightings, finder.points_m, timed)
+    usable = selection.sharp(seen)
+    verdict.check_sharp(seen, usable)
+    theta = _first(usable, size_px, finder.points_m)
+    choose = _Chooser(usable, size_px, finder.points_m, most_views)
+    views, fit = choose(theta, None)
+    fit, views, left_out = _without_poor(fit, views, height_px, None)
+    notes = []
+    readout: Readout | None = None
+    for _ in range(_TURNS):
+        readout = readout_of(seen, fit.theta, height_px)
+        if readout is None or not readout.determined:
+            break
+        # With the skew gone, views in motion tell as much as others.
+        views, fit = choose(fit.theta, readout.readout_s)
+        fit, views, left_out = _without_poor(fit, views, height_px, readout.readout_s)
+    verdict.check_determined(fit, usable, size_px, middle_m)
+    if left_out:
+        notes.append(f"{left_out} views left out: they fit the others' lens badly")
+    known_s = _known_readout_s(readout, notes)
+    return Result(
+        camera=fit.camera(size_px, known_s),
+        fit=fit,
+        views=views,
+        seen=seen,
+        readout=readout,
+        size_px=size_px,
+        tilts_deg=verdict.tilts_deg(fit.poses),
+        distances_m=verdict.distances_m(fit.poses, middle_m),
+        notes=notes,
+    )
+
+
+def _outline_m(points_m: Array) -> Array:
+    """The board's outermost corners (4, 2), metres."""
+    low, high = points_m[:, :2].min(axis=0), points_m[:, :2].max(axis=0)
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+
+
+def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: Array) -> Array:
+    """A lens (9,) to choose views by: of a few that are unlike each other."""
+    begin = selection.spread(usable, size_px, _outline_m(points_m))
+    points = [usable[k].points(size_px[1], None) for k in begin]
+    theta = lens.first_guess(points, size_px)
+    few, poses = _located(theta, points)
+    if len(few) < verdict.MIN_VIEWS:
+        return theta
+    return lens.adjust([points[k] for k in few], theta, poses, lens.weak_prior(size_px)).theta
+
+
+@dataclass(frozen=True)
+class _Chooser:
+    """Chooses the views that tell most, and fits a lens to them."""
+
+    usable: Sequence[View]
+    size_px: tuple[int, int]
+    points_m: Array
+    most: int
+
+    def __call__(self, theta: Array, readout_s: float | None) -> tuple[list[View], Fit]:
+        points = [view.points(self.size_px[1], readout_s) for view in self.usable]
+        located, poses = _located(theta, points)
+        if len(located) < verdict.MIN_VIEWS:
+            raise CalibrationError("the views fit no camera: is the board flat, its file right?")
+        candidates, points = [self.usable[k] for k in located], [points[k] for k in located]
+        chosen = selection.informative(
+            candidates, points, theta, poses, self.size_px, _outline_m(self.points_m), self.most
+        )
+        fit = lens.adjust([points[k] for k in chosen], theta, [poses[k] for k in chosen])
+        return [candidates[k] for k in chosen], fit
+
+
+def _located(theta: Array, points: Sequence[Points]) -> tuple[list[int], list[Array]]:
+    """Which views the board has a pose in, and these poses."""
+    poses = [lens.locate(theta, one) for one in points]
+    found = [(k, pose) for k, pose in enumerate(poses) if pose is not None]
+    return [k for k, _ in found], [pose for _, pose in found]
+
+
+def _refit(fit: Fit, views: Sequence[View], height_px: int, readout_s: float | None) -> Fit:
+    points = [view.points(height_px, readout_s) for view in views]
+    return lens.adjust(points, fit.theta, list(fit.poses))
+
+
+def _without_poor(
+    fit: Fit, views: list[View], height_px: int, readout_s: float | None
+) -> tuple[Fit, list[View], int]:
+    """The fit without views that hardly fit, or of which most corners do not count."""
+    left_out = 0
+    while len(views) > verdict.MIN_VIEWS:
+        sigma = np.array([view.points(height_px, readout_s).sigma_px for view in views])
+        off = np.nan_to_num(np.array(fit.view_rms_px()), nan=np.inf) / sigma
+        share = np.array([np.mean(kept) for kept in fit.used])
+        poor = (off > _POOR * np.median(off)) | (share < 0.5)
+        # The worst alone first: it may be what the others do not fit to.
+        worst = int(np.argmax(np.where(poor, off + 1e6 * (share < 0.5), -1.0)))
+        if not poor[worst]:
+            break
+        views = views[:worst] + views[worst + 1 :]
+        fit.poses = np.delete(fit.poses, worst, axis=0)
+        fit = _refit(fit, views, height_px, readout_s)
+        left_out += 1
+    return fit, views, left_out
+
+
+def _known_readout_s(readout: Readout | None, notes: list[str]) -> float:
+    """The readout for the camera's file, 0 where it is not known; a note says why."""
+    if readout is None or not readout.determined:
+        return 0.0
+    if readout.backwards:
+        notes.append(
+            f"the rows are read from the last to the first ({1e3 * readout.readout_s:.1f} ms): the "
+            "pictures were turned by half after they were taken; readout_s is left out"
+        )
+        return 0.0
+    return max(readout.readout_s, 0.0)

@@ -1,0 +1,116 @@
+"""Pictures of a calibration: where corners were seen, how far each is off, and each view's RMS."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+
+from ground_station.calibration.calibrate import Result
+from ground_station.calibration.selection import CORNER_SHARE
+from ground_station.evaluation.plots import Dress
+
+WIDTH_IN = 6.6
+_SMALL = 8.5
+_ARROW_SHARE = 0.02
+"""Of the width: how long a residual of usual size is drawn."""
+
+
+def coverage(result: Result, dress: Dress) -> Figure:
+    """All corners that count, in the picture; its four corners are framed."""
+    figure, axes = _picture(result, dress)
+    for k, (view, kept) in enumerate(zip(result.views, result.fit.used, strict=True)):
+        px = view.seen.px
+        label = "corner of the board" if k == 0 else None
+        axes.plot(*px[kept].T, ".", color=dress.estimate, ms=2.5, label=label)
+        if not kept.all():
+            axes.plot(*px[~kept].T, "x", color=dress.second, ms=5, mew=1.2)
+    if result.corners[1]:
+        axes.plot([], [], "x", color=dress.second, ms=5, mew=1.2, label="left out as wrong")
+    _legend(axes, dress)
+    return figure
+
+
+def magnification(result: Result) -> float:
+    """How many times longer residuals are drawn: a round number."""
+    usual = max(result.fit.rms_px, 1e-3)
+    power = 10 ** np.floor(np.log10(_ARROW_SHARE * result.size_px[0] / usual))
+    times = _ARROW_SHARE * result.size_px[0] / usual / power
+    return float(power * (5 if times >= 5 else 2 if times >= 2 else 1))
+
+
+def residuals(result: Result, dress: Dress) -> Figure:
+    """From where the lens puts each corner to where it was seen, magnified."""
+    figure, axes = _picture(result, dress)
+    px = np.concatenate([v.seen.px[k] for v, k in zip(result.views, result.fit.used, strict=True)])
+    off = np.concatenate([r[k] for r, k in zip(result.fit.residuals, result.fit.used, strict=True)])
+    axes.quiver(
+        *px.T, *(off * magnification(result)).T, angles="xy", scale_units="xy", scale=1,
+        width=0.0014, headwidth=4, color=dress.estimate,
+    )  # fmt: skip
+    return figure
+
+
+def per_view(result: Result, dress: Dress) -> Figure:
+    """The RMS of each view, in order of the inputs, and the median."""
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained", facecolor=dress.paper)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    _style(axes, dress)
+    order = np.lexsort(
+        ([v.seen.index for v in result.views], [v.seen.source for v in result.views])
+    )
+    values = np.array(result.fit.view_rms_px())[order]
+    axes.bar(np.arange(1, len(values) + 1), values, color=dress.estimate, width=0.75)
+    axes.axhline(float(np.median(values)), color=dress.limit, ls="--", lw=1.2, label="median")
+    axes.set_xlabel("view", fontsize=_SMALL)
+    axes.set_ylabel("RMS, px", fontsize=_SMALL)
+    axes.set_xlim(0.4, len(values) + 0.6)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(False, axis="x")
+    _legend(axes, dress)
+    return figure
+
+
+def _picture(result: Result, dress: Dress) -> tuple[Figure, Axes]:
+    w, h = result.size_px
+    figure = Figure(figsize=(WIDTH_IN, 0.5 + 6.0 * h / w), layout="constrained")
+    figure.set_facecolor(dress.paper)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    _style(axes, dress)
+    axes.set_aspect("equal")
+    axes.set_xlim(-0.01 * w, 1.01 * w)
+    axes.set_ylim(1.01 * h, -0.01 * h)
+    axes.add_patch(Rectangle((0, 0), w - 1, h - 1, fill=False, edgecolor=dress.ink, lw=0.8))
+    wide, high = CORNER_SHARE * w, CORNER_SHARE * h
+    for x in (0, w - wide):
+        for y in (0, h - high):
+            axes.add_patch(
+                Rectangle((x, y), wide, high, fill=False, edgecolor=dress.limit, lw=0.8, ls=":")
+            )
+    axes.set_xlabel("u, px", fontsize=_SMALL)
+    axes.set_ylabel("v, px", fontsize=_SMALL)
+    return figure, axes
+
+
+def _style(axes: Axes, dress: Dress) -> None:
+    axes.set_facecolor(dress.paper)
+    axes.grid(True, color=dress.grid, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=dress.ink, length=3, labelsize=_SMALL)
+    axes.xaxis.label.set_color(dress.ink)
+    axes.yaxis.label.set_color(dress.ink)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(dress.ink)
+
+
+def _legend(axes: Axes, dress: Dress) -> None:
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
+        labelcolor=dress.ink, fontsize=_SMALL, borderaxespad=0.2,
+    )  # fmt: skip
