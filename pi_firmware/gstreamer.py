@@ -10,6 +10,7 @@ _PACKAGES = {
     "x264enc": "gstreamer1.0-plugins-ugly",
     "avdec_h264": "gstreamer1.0-libav",
     "h264parse": "gstreamer1.0-plugins-bad",
+    "openh264dec": "gstreamer1.0-plugins-bad",
     "srtpenc": "gstreamer1.0-plugins-bad",
     "appsrc": "gstreamer1.0-plugins-base",
     "videotestsrc": "gstreamer1.0-plugins-base",
@@ -51,6 +52,16 @@ def require(elements: tuple[str, ...], what: str) -> None:
             raise StreamError(
                 f"{what}: GStreamer has no element '{name}' here (Debian package {package})"
             )
+
+
+def first_of(elements: tuple[str, ...], what: str) -> str:
+    """The first of these elements that is there; raises `StreamError` naming the first of all."""
+    gst = load()
+    for name in elements:
+        if gst.ElementFactory.find(name) is not None:
+            return name
+    require(elements[:1], what)
+    raise AssertionError("an element was installed meanwhile")
 
 
 def launch(description: str) -> Any:

@@ -13,7 +13,10 @@ from pi_firmware.wire.annexb import NO_PARAMETER_SETS, has_parameter_sets
 from pi_firmware.wire.errors import BlimpError, RecordingError
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
 
-_ELEMENTS = ("appsrc", "h264parse", "avdec_h264", "videoconvert")
+_ELEMENTS = ("appsrc", "h264parse", "videoconvert")
+DECODERS = ("avdec_h264", "v4l2h264dec", "openh264dec")
+"""By preference: on a desk; the Pi's own, where its driver is there; and what each card carries."""
+_PROPERTIES = {"avdec_h264": " max-threads=1"}  # frame threads would hold pictures back
 _AHEAD_FRAMES = 4
 _POLL_NS = 100_000_000
 
@@ -33,6 +36,7 @@ class RecordingDecoder:
 
     def __init__(self, path: Path) -> None:
         gstreamer.require(_ELEMENTS, f"replay of {path}")
+        decoder = gstreamer.first_of(DECODERS, f"replay of {path}")
         self.caps: Any = None
         """Of the decoded pictures, once the first one is out."""
         self.cut_reason = ""
@@ -45,8 +49,8 @@ class RecordingDecoder:
         self._pipeline = gstreamer.launch(
             "appsrc name=units format=time block=true max-bytes=0 max-buffers=8 "
             "caps=video/x-h264,stream-format=byte-stream,alignment=au "
-            # One thread: frame threads would hold pictures back.
-            "! h264parse ! avdec_h264 max-threads=1 ! videoconvert ! video/x-raw,format=I420 "
+            f"! h264parse ! {decoder}{_PROPERTIES.get(decoder, '')} "
+            "! videoconvert ! video/x-raw,format=I420 "
             f"! appsink name=pictures sync=false max-buffers={_AHEAD_FRAMES}"
         )
         self._units = self._pipeline.get_by_name("units")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import subprocess
@@ -29,11 +30,13 @@ from recorded import (
 )
 
 from ground_station.recording.open import open_input
+from pi_firmware import gstreamer
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import RecordingSettings
-from pi_firmware.sources.decoding import RecordingDecoder
+from pi_firmware.sources import decoding
+from pi_firmware.sources.decoding import DECODERS, RecordingDecoder
 from pi_firmware.wire import annexb, messages
-from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.errors import RecordingError, StreamError
 from pi_firmware.wire.messages import EVENT_RECORDING_ENDED, EVENT_RECORDING_STARTED
 from pi_firmware.wire.recorder import file, run
 from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader
@@ -237,6 +240,37 @@ def test_a_failing_link_or_encoder_ends_no_recording(tmp_path: Path) -> None:
     assert video(*files(tmp_path)) == units
 
 
+@pytest.mark.parametrize("decoder", DECODERS)
+def test_each_decoder_plays_the_same_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decoder: str
+) -> None:
+    """H.264 says each bit of a picture, so that a card's decoder gives what a desk's does."""
+    if gstreamer.load().ElementFactory.find(decoder) is None:
+        pytest.skip(f"GStreamer has no '{decoder}' here")
+    made = recorder(tmp_path)
+    made.start()
+    feed(made, range(40))
+    path = tmp_path / made.stop()
+
+    def played(*names: str) -> list[tuple[int, bytes]]:
+        monkeypatch.setattr(decoding, "DECODERS", names)
+        with contextlib.closing(RecordingDecoder(path)) as one:
+            pictures = list(one.pictures())
+        return [(p.time_ns, p.buffer.extract_dup(0, p.buffer.get_size())) for p in pictures]
+
+    first = played("avdec_h264")
+    assert len(first) == 40 and len({data for _, data in first}) == 40
+    assert played("of nobody", decoder) == first
+
+
+def test_a_machine_without_a_decoder_is_told_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decoding, "DECODERS", ("avdec_none", "openh264none"))
+    with pytest.raises(StreamError, match=r"replay of .*a\.mcap: .* no element 'avdec_none'"):
+        RecordingDecoder(tmp_path / "a.mcap")
+
+
 def test_replay_and_ground_station_read_it(tmp_path: Path) -> None:
     made = recorder(tmp_path)
     made.start()
@@ -268,6 +302,7 @@ def test_replay_and_ground_station_read_it(tmp_path: Path) -> None:
 def test_a_payload_that_only_streams_loads_no_writer(tmp_path: Path) -> None:
     code = f"""
 import sys
+from pi_firmware import gstreamer
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import RecordingSettings
 heavy = lambda: sorted({{"mcap", "google.protobuf", "zstandard", "lz4"}} & set(sys.modules))

@@ -34,7 +34,7 @@ _BROUGHT_BY = {
     "zenoh": "eclipse-zenoh",
     "zstandard": "python3-zstandard",
 }
-# Plays recordings on a desk; its decoder would bring 100 MB more.
+# Plays recordings on a desk and would bring 100 MB more; a card has another decoder.
 _NOT_ON_A_CARD = {"avdec_h264"}
 # Words of the firmware's that happen to be elements, too: a test picture, a speed.
 _WORDS = {"smpte", "speed"}
