@@ -14,6 +14,7 @@ from pi_firmware.wire.errors import BlimpError
 _COMMANDS = (
     # name, room's command module, help
     ("simulate", "ground_station.simulator.command", "fly a simulated blimp and record it"),
+    ("calibrate", "ground_station.calibration.command", "print a board, calibrate a camera by it"),
     ("map", "ground_station.mapping.command", "build, register and inspect maps"),
     (
         "models",
