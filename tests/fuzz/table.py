@@ -36,6 +36,7 @@ READERS = (
     Reader("floorplan", "floorplan.yaml and its picture"),
     Reader("image", "image files"),
     Reader("camera", "camera files"),
+    Reader("charuco", "files of boards to calibrate with"),
     Reader("tum", "TUM trajectories"),
     Reader("pairs", "PAIRS.csv"),
     Reader("config", "payload.toml, station.toml, settings of mapping and localizer"),
