@@ -49,7 +49,7 @@ def by_picks(landmarks: Landmarks, picks: Picks, seed: int) -> Registration:
     world = picks.scale.to_world(np.array([pick.plan_px for pick in picks.picks]))
     points = KnownPoints(
         model=np.array([pick.place for pick in picks.picks]),
-        covariance=picks.spread[:, None, None] * np.eye(3),
+        covariance=picks.covariance,
         world=np.column_stack([world, np.zeros(len(world))]),
         group=np.arange(len(world)),
         axes=2,

@@ -49,13 +49,16 @@ class Pick:
 
 @dataclass(frozen=True)
 class Picks:
-    """Picks, the plan's scale, and the vertical, all in the map's coordinates as they were."""
+    """Picks, the plan's scale, and the vertical, all in the map's coordinates as they were.
+
+    `covariance` (N, 3, 3) is of the clusters' centroids, map units; only `at_present` knows it.
+    """
 
     picks: list[Pick]
     scale: PlanScale
     upright: Upright
     plan: str = ""
-    spread: F64 = field(default_factory=lambda: np.zeros(0))
+    covariance: F64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True)
@@ -197,7 +200,7 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
     check_picks(picks)
     row = {int(number): k for k, number in enumerate(landmarks.id.tolist())}
     now: list[Pick] = []
-    spread: list[float] = []
+    scatter: list[F64] = []
     for pick in picks.picks:
         rows = [row[i] for i in pick.landmarks.tolist() if i in row]
         if not rows:
@@ -207,7 +210,9 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
             )
         found = landmarks.position_m[rows]
         now.append(replace(pick, place=found.mean(axis=0)))
-        spread.append(float(np.mean(np.var(found, axis=0))) / len(rows))
+        scatter.append(
+            np.cov(found.T, bias=True) / len(rows) if len(rows) > 1 else np.zeros((3, 3))
+        )
     before, after = (np.array([p.place for p in group]) for group in (picks.picks, now))
     try:
         went = align(before, after, True)
@@ -229,7 +234,7 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
         level=went.scale * up.level + float(direction @ went.translation),
         sigma_level=went.scale * up.sigma_level,
     )
-    return replace(picks, picks=now, upright=upright, spread=np.array(spread))
+    return replace(picks, picks=now, upright=upright, covariance=np.array(scatter))
 
 
 def _pick(item: Any, where: str) -> Pick:

@@ -97,6 +97,35 @@ def upright_rotation(up: F64) -> F64:
     return np.asarray(Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix())
 
 
+def along_walls(positions: F64) -> F64:
+    """The turn (3, 3) about z that lays a top view's walls along its axes, the longer side level.
+
+    Walls are to x and y what floors are to heights: many landmarks (M, 3) share a coordinate.
+    """
+    if len(positions) < _FEWEST:
+        return np.eye(3)
+    flat = positions[:: max(1, len(positions) // _LANDMARKS), :2]
+    low, high = np.quantile(flat, (0.05, 0.95), axis=0)
+    flat = flat[((flat >= low) & (flat <= high)).all(axis=1)] - (low + high) / 2
+    width = float(np.linalg.norm(high - low)) / _BINS
+    if not len(flat) or width <= 0:
+        return np.eye(3)
+    angles = np.radians(np.arange(0.0, 90.0, 0.5))
+    across = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    along = np.stack([-np.sin(angles), np.cos(angles)], axis=1)
+    score = [
+        _crowding(flat @ x, width) + _crowding(flat @ y, width)
+        for x, y in zip(across, along, strict=True)
+    ]
+    best = int(np.argmax(score))
+    x, y = across[best], along[best]
+    if np.ptp(flat @ y) > np.ptp(flat @ x):
+        x, y = y, -x
+    turn = np.eye(3)
+    turn[0, :2], turn[1, :2] = x, y
+    return turn
+
+
 def _across_cameras(wTc: F64) -> F64:
     """Up, (3,), from camera poses (K, 4, 4)."""
     across, down = wTc[:, :3, 0], wTc[:, :3, 1]

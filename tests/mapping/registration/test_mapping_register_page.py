@@ -167,7 +167,7 @@ class Page:
         u, v = self.page.evaluate(f"{view}View.toScreen({x}, {y})")
         box = self.page.locator(f"#{view}").bounding_box()
         assert 0 < u < box["width"] and 0 < v < box["height"]
-        self.page.mouse.click(box["x"] + u, box["y"] + v)
+        self.page.mouse.click(box["x"] + 1 + u, box["y"] + 1 + v)  # its border
         self.settled()
 
     def pick(self, place: np.ndarray, off_px: float = 0.0) -> None:
@@ -199,6 +199,9 @@ def test_a_map_is_registered_on_the_page(browser: Any, stand: Stand, tmp_path: P
     assert stand.ask("upright", {"source": "cameras", **true_up(stand)})[0] == 200
     page.reload()
     page.wait_for_selector("body[data-ready]")
+    page.click("#map-turn")
+    hand.settled()
+    assert stand.desk._quarters == 1
     places = places_to_pick(stand)
     # The wrong order, and two picks: both said, nothing lost.
     hand.click("plan", 100, 100)

@@ -52,6 +52,8 @@ class Desk:
         self._lock = threading.RLock()
         self._up = vertical.find_up(map_)
         self._sources = {self._up.source: self._up}
+        self._quarters = 0
+        self._view = self._top_view()
         self._tilt_deg = (0.0, 0.0)
         self._picks: list[Pick] = []
         self._pending: Pending | None = None
@@ -130,6 +132,14 @@ class Desk:
             self._open()
             self.plan = self.plan.with_distance(one, other, length_m)
 
+    def turn(self) -> None:
+        """The top view a quarter turn further, so that it lies as the plan does."""
+        with self._lock:
+            self._open()
+            self._quarters = (self._quarters + 1) % 4
+            self._view = self._top_view()
+            self._revision += 1
+
     def upright(
         self, source: str, tilt_deg: tuple[float, float], level: float | None, height_m: float
     ) -> None:
@@ -152,6 +162,7 @@ class Desk:
                 sigma_deg = float(np.degrees(found.upright.sigma_rad))
                 found = vertical.with_up(self.map, up, sigma_deg, found.source, level)
             self._up = replace(found, upright=replace(found.upright, height_m=height_m))
+            self._view = self._top_view()
             self._tilt_deg = tilt_deg
             self._revision += 1
 
@@ -247,9 +258,8 @@ class Desk:
 
     def _to_plan(self, found: Registration, picks: Picks) -> list[float]:
         """a b c d e f of u = a x + c y + e, v = b x + d y + f, from the top view to the plan."""
-        turn = vertical.upright_rotation(self._up.upright.direction)
-        z = float(np.median(self.map.landmarks.position_m @ turn[2]))
-        corners = np.array([[0.0, 0.0, z], [1.0, 0.0, z], [0.0, 1.0, z]]) @ turn
+        z = float(np.median(self.map.landmarks.position_m @ self._view[2]))
+        corners = np.array([[0.0, 0.0, z], [1.0, 0.0, z], [0.0, 1.0, z]]) @ self._view
         o, x, y = picks.scale.to_pixels(found.fit.apply(corners)[:, :2])
         return [float(value) for value in (*(x - o), *(y - o), *o)]
 
@@ -282,7 +292,15 @@ class Desk:
             raise MapError("the map is registered; the page is done")
 
     def _turned(self, positions: F64) -> F64:
-        return np.asarray(positions @ vertical.upright_rotation(self._up.upright.direction).T)
+        return np.asarray(positions @ self._view.T)
+
+    def _top_view(self) -> F64:
+        """The rotation (3, 3) to the top view: z up, and walls along its sides."""
+        turn = vertical.upright_rotation(self._up.upright.direction)
+        if not self.map.info.registered:
+            turn = vertical.along_walls(self.map.landmarks.position_m @ turn.T) @ turn
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(np.linalg.matrix_power(quarter, self._quarters) @ turn)
 
     def _free_name(self) -> str:
         taken = {pick.name for pick in self._picks}

@@ -20,7 +20,7 @@ function heightRange() {
   return [at("low"), at("high")];
 }
 
-function drawMark(c, u, v, name, of) {
+function drawMark(c, u, v, name, of, halo = "paper") {
   c.lineWidth = 2;
   c.strokeStyle = c.fillStyle = colour(of);
   c.beginPath();
@@ -32,7 +32,7 @@ function drawMark(c, u, v, name, of) {
   c.stroke();
   c.font = "bold 14px system-ui, sans-serif";
   c.lineWidth = 4;
-  c.strokeStyle = colour("paper");
+  c.strokeStyle = colour(halo);
   c.strokeText(name, u + 9, v - 8);
   c.fillText(name, u + 9, v - 8);
 }
@@ -83,7 +83,7 @@ function drawPlan(c, view) {
   }
   if (state.fit && byId("overlay").checked) {
     const [low, high] = heightRange();
-    c.fillStyle = colour("overlay");
+    c.fillStyle = colour("plan-overlay");
     c.globalAlpha = 0.5;
     for (let k = 0; k < points.length; k += 3) {
       if (points[k + 2] < low || points[k + 2] > high) continue;
@@ -95,16 +95,16 @@ function drawPlan(c, view) {
   for (const pick of state.picks) {
     const [u, v] = view.toScreen(...pick.plan_px);
     if (state.fit) {
-      c.strokeStyle = colour("bad");
+      c.strokeStyle = colour("plan-bad");
       c.lineWidth = 2;
       c.beginPath();
       c.moveTo(u, v);
       c.lineTo(...view.toScreen(...toPlan(pick.map[0], pick.map[1])));
       c.stroke();
     }
-    drawMark(c, u, v, pick.name, markOf(pick));
+    drawMark(c, u, v, pick.name, pick.used ? "plan-accent" : "plan-bad", "plan-paper");
   }
-  for (const at of scaling ?? []) drawMark(c, ...view.toScreen(...at), "", "bad");
+  for (const at of scaling ?? []) drawMark(c, ...view.toScreen(...at), "", "plan-bad", "plan-paper");
 }
 
 function drawHeights() {
@@ -269,7 +269,7 @@ function show(refused) {
   byId("tilt-y").value = up.tilt_deg[1];
   byId("level-height").value = up.height_m;
   byId("save").disabled = !state.fit || state.saved;
-  for (const control of document.querySelectorAll("aside input, aside select, aside td button, #plan-scale")) control.disabled = state.saved;
+  for (const control of document.querySelectorAll("aside input, aside select, aside td button, #plan-scale, #map-turn")) control.disabled = state.saved;
   drawHeights();
   say();
   repaint();
@@ -292,6 +292,10 @@ byId("heights").addEventListener("click", (event) => {
 });
 for (const id of ["low", "high"]) byId(id).addEventListener("input", () => { drawHeights(); repaint(); });
 byId("overlay").addEventListener("change", repaint);
+byId("map-turn").addEventListener("click", async () => {
+  mapView.touched = false;
+  await ask("turn");
+});
 byId("map-fit").addEventListener("click", () => mapView.fit());
 byId("plan-fit").addEventListener("click", () => planView.fit());
 byId("plan-scale").addEventListener("click", () => { scaling = []; say(); repaint(); });

@@ -168,6 +168,11 @@ def build(desk: Desk, token: str, done: Callable[[], None]) -> FastAPI:
         desk.scale(one, other, asked.length_m)
         return desk.state()
 
+    @app.post(f"{root}/turn")
+    def turn() -> Any:
+        desk.turn()
+        return desk.state()
+
     @app.post(f"{root}/upright")
     def upright(asked: Upright) -> Any:
         tilt = asked.tilt_x_deg, asked.tilt_y_deg

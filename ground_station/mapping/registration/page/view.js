@@ -57,6 +57,12 @@ class View {
     this.touched = this.dirty = true;
   }
 
+  /** Where an event is, in parts of a pixel: offsetX would be cut to whole ones. */
+  at(event) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    return [event.clientX - left - this.canvas.clientLeft, event.clientY - top - this.canvas.clientTop];
+  }
+
   listen() {
     let from = null;
     let moved = 0;
@@ -75,14 +81,14 @@ class View {
         from = [event.clientX, event.clientY];
         moved = Infinity;
       } else {
-        this.hover = [event.offsetX, event.offsetY];
+        this.hover = this.at(event);
         this.dirty = true;
       }
     });
     canvas.addEventListener("pointerup", (event) => {
       const is_click = from && moved < CLICK_PX && event.button === 0;
       from = null;
-      if (is_click && this.scale > 0) this.click(...this.toWorld(event.offsetX, event.offsetY));
+      if (is_click && this.scale > 0) this.click(...this.toWorld(...this.at(event)));
     });
     canvas.addEventListener("pointercancel", () => (from = null));
     canvas.addEventListener("pointerleave", () => {
@@ -92,7 +98,7 @@ class View {
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       const delta = event.deltaY * (event.deltaMode === 1 ? 16 : 1);
-      this.zoom(Math.exp(-0.0015 * Math.max(-300, Math.min(300, delta))), event.offsetX, event.offsetY);
+      this.zoom(Math.exp(-0.0015 * Math.max(-300, Math.min(300, delta))), ...this.at(event));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
       const middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
