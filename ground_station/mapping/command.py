@@ -6,10 +6,19 @@ import argparse
 
 from ground_station.mapping.construction import command as build
 from ground_station.mapping.inspection import command as info
+from ground_station.mapping.inspection import export_command as export
+from ground_station.mapping.inspection import view_command as view
 from ground_station.mapping.refinement import command as refine
 from ground_station.mapping.registration import command as register
 
-_COMMANDS = {"build": build, "register": register, "refine": refine, "info": info}
+_COMMANDS = {
+    "build": build,
+    "register": register,
+    "refine": refine,
+    "info": info,
+    "view": view,
+    "export": export,
+}
 """Each says HELP and EXAMPLE and has `add_arguments` and `run`."""
 
 

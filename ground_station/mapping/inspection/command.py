@@ -7,16 +7,24 @@ import argparse
 from ground_station.files import write_json
 from ground_station.mapping.table import print_table
 
-HELP = "Says what a map holds."
+HELP = "Says what a map holds, and how good it is."
 
 EXAMPLE = """\
-example:
-  blimp map info maps/atrium --json out/atrium.json"""
+examples:
+  blimp map info maps/atrium --json out/atrium.json
+  blimp map info maps/atrium --localizability
+
+track, angle_deg and landmark_sigma are of the landmarks, error_px of their observations, each as
+its 5th, 50th and 95th percentile; lengths are in the map's units."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map info`."""
     parser.add_argument("map", metavar="MAP", help="folder of the map")
+    parser.add_argument(
+        "--localizability", action="store_true",
+        help="also say in which share of places and headings a camera would get lost (seconds)",
+    )  # fmt: skip
     parser.add_argument("--json", metavar="FILE", help="write it as JSON, too")
 
 
@@ -25,7 +33,13 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.mapping.inspection.summary import describe
     from ground_station.mapping.store import load
 
-    document = describe(load(args.map))
+    map_ = load(args.map)
+    document = describe(map_)
+    if args.localizability:
+        from ground_station.mapping.inspection.localizability import localizability, plan_of
+        from ground_station.mapping.inspection.prediction import levelled
+
+        document["localizability"] = localizability(levelled(map_), plan_of(map_)).summary()
     print_table(document)
     if args.json:
         write_json(args.json, document)
