@@ -43,7 +43,7 @@ def readout_words(result: Result) -> str:
         return f"not measured: the motion leaves it open (± {1e3 * readout.sigma_s:.1f} ms)"
     if readout.backwards:
         return f"not written: measured {1e3 * readout.readout_s:.2f} ms, rows from last to first"
-    return f"± {readout.sigma_s:.6f}, first row to last, {readout.windows} stretches of motion"
+    return f"± {readout.sigma_s:.2g} s, first row to last, {readout.windows} stretches of motion"
 
 
 def document(result: Result, board: Board, inputs: Sequence[str], frames: int) -> dict[str, Any]:

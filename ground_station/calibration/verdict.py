@@ -118,7 +118,7 @@ def _why(fit: Fit, focal: float, centre: float, middle_m: Array) -> str:
     tilt = float(tilts_deg(fit.poses).max())
     distance = distances_m(fit.poses, middle_m)
     known = (
-        f"the focal length is known to {100 * focal:.2g} % only (at most "
+        f"the focal length is known to {100 * focal:.3g} % only (at most "
         f"{100 * MAX_FOCAL_SHARE:g} %) and the centre to {centre:.2g} px"
         if math.isfinite(focal)
         else "the views leave the focal length open"

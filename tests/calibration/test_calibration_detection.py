@@ -1,5 +1,8 @@
 """The board in a picture: whichever way it is held, as far as it is there, and how sharp."""
 
+from collections.abc import Iterator
+from typing import ClassVar
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from board_views import BoardCamera, Image, Pictured, Waypoints, pose_of, scaled
 from ground_station.calibration.board import Board
 from ground_station.calibration.detection import BoardFinder, Sighting, other_board
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.gather import Gathered
+from ground_station.calibration.gather import Gathered, gather
 from ground_station.calibration.verdict import check_seen
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.recording.frames import Frame
@@ -110,6 +113,27 @@ def test_blur_along_one_direction_counts() -> None:
     sharp, blurred = found(image), found(smeared)
     assert sharp is not None and blurred is not None
     assert blurred.edge_px > sharp.edge_px + 1
+
+
+class Interrupted:
+    """An input whose person has seen enough after two frames."""
+
+    camera = None
+    notes: ClassVar[list[str]] = []
+
+    def count(self) -> int:
+        return 5
+
+    def __iter__(self) -> Iterator[Frame]:
+        image = taken(still())
+        for k in range(2):
+            yield Frame(k, f"frame-{k}", k, image)
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_keeps_what_was_seen() -> None:
+    seen = gather([Interrupted()], ["live"], FINDER)
+    assert seen.interrupted and seen.frames == len(seen.sightings) == 2
 
 
 def refusal(*images: Image, finder: BoardFinder = FINDER) -> str:
