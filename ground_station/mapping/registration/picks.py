@@ -24,6 +24,8 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 FILE = "PICKS.toml"
+DRAFT = "PICKS.draft.toml"
+"""Picks that were made and not saved: a browser or a machine that goes takes none with it."""
 FORMAT = 1
 MOST_PICKS = 200
 MOST_LANDMARKS = 300
@@ -188,6 +190,15 @@ def check_picks(picks: Picks) -> None:
     check_spread(picks.scale.to_world(pixel), "picks on the plan", MIN_WIDTH)
     up = picks.upright.direction
     check_spread(place - np.outer(place @ up, up), "picks in the map", MIN_WIDTH)
+
+
+def unmoved(picks: Picks, landmarks: Landmarks) -> bool:
+    """Whether the map is as it was when the picks were made, however few of them there are."""
+    for pick in picks.picks:
+        found = landmarks.position_m[np.isin(landmarks.id, pick.landmarks)]
+        if len(found) != len(pick.landmarks) or not np.allclose(found.mean(axis=0), pick.place):
+            return False
+    return True
 
 
 def at_present(picks: Picks, landmarks: Landmarks) -> Picks:

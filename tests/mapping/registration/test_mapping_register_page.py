@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import socket
@@ -280,6 +281,29 @@ def test_what_cannot_be_is_refused_in_one_line_and_changes_nothing(
     assert 400 <= status < 500 and words in answer["detail"] and "\n" not in answer["detail"]
     assert stand.desk.state() == before
     assert not store.load_info(stand.folder).registered
+
+
+def test_picks_outlive_the_program_and_the_browser(stand: Stand) -> None:
+    """Two picks, and the machine goes: the next page begins with them."""
+    desk = stand.desk
+    desk.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
+    for k, place in enumerate(places_to_pick(stand)[:4], 1):
+        desk.cluster(place, 0.1, desk._up.low, desk._up.high)
+        assert desk._pending is not None and desk._pending.pick is not None
+        desk.place(stand.pixel_of(desk._pending.pick.place))
+        again = Desk(stand.folder, store.load(stand.folder), desk.plan, None, 0)
+        assert len(again.state()["picks"]) == k
+    desk.delete("2")
+    again = Desk(stand.folder, store.load(stand.folder), desk.plan, None, 0)
+    shown, before = again.state(), desk.state()
+    assert [pick["name"] for pick in shown["picks"]] == ["1", "3", "4"]
+    assert shown["picks"] == before["picks"] and "3 picks of PICKS.draft.toml" in shown["notes"]
+    again.save()
+    assert not (stand.folder / "PICKS.draft.toml").exists()
+    assert len(read_picks(stand.folder / "PICKS.toml").picks) == 3
+    other = dataclasses.replace(desk.plan, name="other.png")
+    told = Desk(stand.folder, store.load(stand.folder), other, None, 0)
+    assert told.state()["picks"] == [] and "of another plan" in told.state()["notes"][0]
 
 
 def test_picks_are_refused_until_they_determine_something(stand: Stand) -> None:

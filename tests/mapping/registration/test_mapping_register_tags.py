@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,8 @@ from refining import look_at
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.mapping.registration import tags
+from ground_station.mapping import store
+from ground_station.mapping.registration import command, tags
 from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.tags import FAMILIES, find_tags, read_tags
 from ground_station.recording.frames import Frame
@@ -217,6 +219,22 @@ def test_images_of_a_map_of_several_inputs_have_the_inputs_name(flight, listed):
     assert (
         find_tags(map_, listed, flight.frames[:3], ["walk"]).sights.image[0] == "walk/frame-000000"
     )
+
+
+def test_a_folder_of_frames_is_looked_through(flight, tmp_path, monkeypatch, capsys):
+    """As the command does it: what the map was built from, by the names of its images."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    for frame in flight.frames[:4]:
+        cv2.imwrite(str(folder / f"{frame.name}.png"), frame.image)
+    (tmp_path / "TAGS.toml").write_text(TOML)
+    names = [f"{name}.png" for name in flight.map.keyframes.names]
+    info = SimpleNamespace(camera=CAMERA, built={"rate_hz": 5.0})
+    map_ = SimpleNamespace(info=info, keyframes=Keyframes(names, flight.map.keyframes.wTc))
+    monkeypatch.setattr(store, "load", lambda _: map_)
+    args = argparse.Namespace(map="m", tags=tmp_path / "TAGS.toml", frames=[str(folder)])
+    seen = command._seen_tags(args)
+    assert set(seen.sights.image) == set(names[:4]) and not seen.notes
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,7 @@ class Desk:
                     raise MapError(f"'{other.name}' and '{pick.name}' are the same place {where}")
             self._picks = sorted([*self._picks, pick], key=_order)
             self._pending = None
+            self._draft()
 
     def redo(self, name: str) -> None:
         """Takes a pick away to make it again under its name."""
@@ -125,6 +126,7 @@ class Desk:
             if len(left) == len(self._picks):
                 raise MapError(f"there is no pick '{printable(name, 40)}'")
             self._picks = left
+            self._draft()
 
     def scale(self, one: F64, other: F64, length_m: float) -> None:
         """The plan's scale: two of its pixels (2,) are so far apart."""
@@ -174,6 +176,7 @@ class Desk:
             check_picks(picks)
             find_similarity(self.map, picks=picks, distances=self._distances, seed=self._seed)
             files.write_picks(self.folder / files.FILE, picks)
+            (self.folder / files.DRAFT).unlink(missing_ok=True)
             keep_plan(self.folder, self.plan)
             _, self.found = register_map(
                 self.folder,
@@ -272,20 +275,31 @@ class Desk:
 
     def _resume(self) -> list[str]:
         """Begins with the picks of an earlier time, where they are of this map and plan."""
-        path = self.folder / files.FILE
-        if not path.is_file():
+        there = (self.folder / name for name in (files.DRAFT, files.FILE))
+        path = next((file for file in there if file.is_file()), None)
+        if path is None:
             return []
         try:
             kept = files.read_picks(path)
             if (kept.plan, kept.scale.height_px) != (self.plan.name, len(self.plan.image)):
-                return [f"{files.FILE} is of another plan ('{printable(kept.plan, 40)}')"]
-            now = files.at_present(kept, self.map.landmarks)
+                return [f"{path.name} is of another plan ('{printable(kept.plan, 40)}')"]
+            landmarks = self.map.landmarks
+            now = kept if files.unmoved(kept, landmarks) else files.at_present(kept, landmarks)
         except BlimpError as error:
-            return [f"{files.FILE} is left alone: {printable(str(error), 200)}"]
+            return [f"{path.name} is left alone: {printable(str(error), 200)}"]
         self._picks = sorted(now.picks, key=_order)
         if self.plan.scale is None:
             self.plan = replace(self.plan, scale=kept.scale)
-        return [f"{len(now.picks)} picks of {files.FILE}"]
+        return [f"{len(now.picks)} picks of {path.name}"]
+
+    def _draft(self) -> None:
+        """Keeps what was picked so far; that it cannot is said, and no reason to lose a pick."""
+        if self.plan.scale is None:
+            return
+        try:
+            files.write_picks(self.folder / files.DRAFT, self._all())
+        except BlimpError as error:
+            self.notes = [printable(str(error), 200)]
 
     def _open(self) -> None:
         if self.found is not None:

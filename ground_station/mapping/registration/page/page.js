@@ -265,6 +265,8 @@ function show(refused) {
   ]));
   list("notes", [...state.notes, ...(state.fit?.notes ?? [])]);
   byId("up-source").replaceChildren(...up.sources.map((name) => new Option({ levels: "level structure", cameras: "the cameras", map: "the map's z" }[name], name, false, name === up.source)));
+  const axis = up.direction.map((x) => x.toFixed(3)).join(", ");
+  byId("up-words").textContent = `Up is (${axis}) in the map, ±${up.sigma_deg.toFixed(1)}°; the level is at ${up.level.toPrecision(3)} along it.`;
   byId("tilt-x").value = up.tilt_deg[0];
   byId("tilt-y").value = up.tilt_deg[1];
   byId("level-height").value = up.height_m;
