@@ -18,6 +18,8 @@ from ground_station.mapping.store import Map
 F64 = npt.NDArray[np.float64]
 
 _MAX_DIFF_S = 0.005
+_LEAST_SHARE = 0.6
+"""Of the estimate's interval the truth's is at least so much."""
 _SPAN_S = 1.0
 """Frames of so long a time share their view and their error: they are also judged together."""
 
@@ -71,10 +73,17 @@ def compare(map_: Map, estimate: Trajectory, truth: Trajectory, step: int = 1) -
     """Every `step`-th true pose of a flight in a registered map, within the estimate's time.
 
     The localizer's poses (its file holds the frames that it solved) are taken at the same times.
-    Raises `InputError` when none fits.
+    The truth has a pose for each frame, so that one without an estimate is a frame that was lost.
+    Raises `InputError` when it has far more, and when none fits.
     """
     if not map_.info.registered:
         raise InputError(f"the map '{map_.info.name}' is not registered: its errors have no unit")
+    apart_s = [_interval_s(trajectory) for trajectory in (truth, estimate)]
+    if apart_s[0] < _LEAST_SHARE * apart_s[1]:
+        raise InputError(
+            f"the truth has a pose every {1e3 * apart_s[0]:.3g} ms, the estimate every "
+            f"{1e3 * apart_s[1]:.3g} ms; one for each frame is needed"
+        )
     chosen = np.arange(0, len(truth), step)
     part = Trajectory(
         truth.time_ns[chosen], truth.position_m[chosen], truth.quaternion_xyzw[chosen]
@@ -85,6 +94,11 @@ def compare(map_: Map, estimate: Trajectory, truth: Trajectory, step: int = 1) -
     error = np.full(len(part), np.inf)
     error[j] = np.linalg.norm(estimate.position_m[i] - part.position_m[j], axis=1)
     return Comparison(part, Predictor(map_).poses(part.wTc), error)
+
+
+def _interval_s(trajectory: Trajectory) -> float:
+    """The median time between two poses, 0 where there are not two."""
+    return float(np.median(np.diff(trajectory.time_ns))) / 1e9 if len(trajectory) > 1 else 0.0
 
 
 def spearman(a: F64, b: F64) -> float | None:

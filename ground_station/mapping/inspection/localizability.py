@@ -33,6 +33,8 @@ _FREE = 205
 """Pixels brighter than this are free space (map_server's free_thresh); walls and what lies
 outside of the building are not."""
 _NEIGHBOURS = 5
+_NARROWEST = 0.02
+"""Of its length a region is taken as at least so wide where cells are counted."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def _region(map_: Map) -> tuple[F64, F64]:
 
 def _sides(size: F64, asked: float | None) -> list[float]:
     """The cell's side as asked, or round ones from too small to surely large enough."""
-    area = float(np.prod(np.maximum(size, 1e-9)))
+    longest = max(float(size.max()), 1e-9)
+    area = float(np.prod(np.maximum(size, _NARROWEST * longest)))
     if asked is not None:
         least = math.sqrt(area / _MOST_ASKED)
         if not (math.isfinite(asked) and asked >= least and asked > 0):

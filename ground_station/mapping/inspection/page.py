@@ -29,6 +29,8 @@ MOST_POINTS, MOST_CAMERAS, MOST_FLIGHT = 150_000, 4_000, 4_000
 
 _TEMPLATE = Path(__file__).parent / "web" / "map.html"
 _COLOURS = 64
+_LONGEST_PX = 2000
+"""A larger floor plan's picture is made smaller."""
 _EASY = (3.0, 250.0)
 """A map whose longer side is not of so many units is drawn in others."""
 _DRAWN = 24.0
@@ -171,7 +173,11 @@ def _placed(plan: FloorPlan, scale: float) -> dict[str, Any]:
 
 
 def _picture(plan: FloorPlan) -> str:
-    return data_uri("png", cv2.imencode(".png", plan.image)[1].tobytes())
+    image = plan.image
+    shrink = min(1.0, _LONGEST_PX / max(image.shape))
+    if shrink < 1:
+        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return data_uri("png", cv2.imencode(".png", image)[1].tobytes())
 
 
 def _arrays(

@@ -58,7 +58,7 @@ def about(document: dict[str, Any], map_: Map) -> Rows:
         ("frame", f"{document['frame']}, units: {document['units']}"),
         ("landmarks", f"{document['landmarks']}"),
         ("keyframes", f"{document['images']} of {document['images_given']} images given"),
-        ("models", ", ".join(map(str, document["model_sizes"]))),
+        ("models", _plain(document["model_sizes"])),
         ("features", f"{document['features']} ({document['features_sha256'][:12]})"),
         ("camera", document["camera"]),
     ]

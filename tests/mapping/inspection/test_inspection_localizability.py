@@ -177,6 +177,9 @@ def test_rank_correlation_counts_lost_frames_as_the_worst(rooms):
     summary = found.summary()
     assert summary["rank_correlation"] > 0.8
     assert summary["frames"] == 41 and summary["lost_and_predicted"] == lost.sum()
+    dense = Trajectory.from_poses(np.arange(41) * 3_000_000, wTc)
+    with pytest.raises(InputError, match="a pose every 3 ms, the estimate every 33 ms"):
+        compare(rooms, estimate, dense)
     with pytest.raises(InputError, match="no estimated pose"):
         compare(rooms, Trajectory.from_poses([10**15], wTc[:1]), truth)
 
@@ -185,3 +188,16 @@ def test_spearman_of_ranks_with_ties():
     assert spearman(np.array([1.0, 2, 3, 4]), np.array([10.0, 20, 30, 99])) == 1
     assert spearman(np.array([1.0, 2, 3, np.inf, np.inf]), np.array([5.0, 4, 3, 2, 1])) < -0.9
     assert spearman(np.array([1.0, 1, 1]), np.array([1.0, 2, 3])) is None
+
+
+def test_a_map_of_one_line_has_a_row_of_places(rooms):
+    flat = dataclasses.replace(
+        rooms,
+        landmarks=dataclasses.replace(
+            rooms.landmarks, position_m=rooms.landmarks.position_m * [1, 0, 1] + [0, 3, 0]
+        ),
+        keyframes=dataclasses.replace(rooms.keyframes, wTc=rooms.keyframes.wTc.copy()),
+    )
+    flat.keyframes.wTc[:, 1, 3] = 3.0
+    found = localizability(flat, headings=1)
+    assert found.shape[1] == 1 and 10 < found.shape[0] <= 600
