@@ -173,7 +173,7 @@ def _placed(plan: FloorPlan, scale: float) -> dict[str, Any]:
 
 
 def _picture(plan: FloorPlan) -> str:
-    image = plan.image
+    image: npt.NDArray[Any] = plan.image
     shrink = min(1.0, _LONGEST_PX / max(image.shape))
     if shrink < 1:
         image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--compare", nargs=2, metavar=("EST", "TRUTH"),
-        help="a flight's estimated and true poses: TUM text, or recordings",
+        help="a flight: its estimated poses and a true one for each frame; TUM text, or recordings",
     )  # fmt: skip
     parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
 
