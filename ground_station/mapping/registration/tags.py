@@ -27,10 +27,12 @@ U8 = npt.NDArray[np.uint8]
 FAMILIES = {
     "16h5": cv2.aruco.DICT_APRILTAG_16h5,
     "25h9": cv2.aruco.DICT_APRILTAG_25h9,
-    "36h10": cv2.aruco.DICT_APRILTAG_36h10,
     "36h11": cv2.aruco.DICT_APRILTAG_36h11,
 }
 """Olson, "AprilTag: a robust and flexible visual fiducial system", ICRA 2011."""
+_FIRST = {"16h5": 0x231B, "25h9": 0x155CBF1, "36h11": 0xD5D628584}
+"""The bits of each family's tag 0, row by row from the top left, as AprilTag's own images show it.
+OpenCV 4 has them all turned by half a turn, OpenCV 5 has not."""
 
 _MOST_TAGS = 1000
 _LARGEST_M = 1e6
@@ -142,9 +144,20 @@ def _places(tag: _Tag, size_m: float, where: str) -> F64:
     return places + half * np.array([-right + up, right + up, right - up, -right - up])
 
 
+def quarter_turns(family: str) -> int:
+    """How often OpenCV's tags of a family must turn to the left to lie as AprilTag's own do."""
+    dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[family])
+    side = dictionary.markerSize
+    drawn = cv2.aruco.generateImageMarker(dictionary, 0, side + 2)[1:-1, 1:-1] > 127
+    shift = np.arange(side * side - 1, -1, -1)
+    own = ((_FIRST[family] >> shift) & 1).reshape(side, side) == 1
+    return next(turn for turn in range(4) if (np.rot90(drawn, turn) == own).all())
+
+
 def detect(image: U8, family: str) -> list[tuple[int, F64]]:
     """Tags in a grey image (H, W): id and corners (4, 2), pixels, from the top left, clockwise.
 
+    The top left is that of AprilTag's own images, which are what people print.
     Corners are refined to parts of a pixel on the picture as it is: a lens bends a line of a few
     pixels too little to matter.
     """
@@ -154,8 +167,9 @@ def detect(image: U8, family: str) -> list[tuple[int, F64]]:
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if ids is None:
         return []
+    turns = quarter_turns(family)
     return [
-        (int(number), np.asarray(places, np.float64).reshape(4, 2))
+        (int(number), np.roll(np.asarray(places, np.float64).reshape(4, 2), -turns, axis=0))
         for number, places in zip(np.ravel(ids), corners, strict=True)
     ]
 
@@ -187,7 +201,7 @@ def find_tags(map_: Map, tags: Tags, frames: Iterable[Frame], stems: Iterable[st
         for number, corners in detect(frame.image, tags.family):
             if name in seen[number]:
                 twice.add(number)
-            seen[number][name] = np.roll(corners, -tags.turn, axis=0)
+            seen[number][name] = np.roll(corners, tags.turn, axis=0)
     if not looked:
         own = map_.keyframes.names[0] if len(map_.keyframes) else "none"
         raise MapError(
