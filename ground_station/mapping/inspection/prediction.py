@@ -47,7 +47,7 @@ class Prediction:
 
     @property
     def lost(self) -> npt.NDArray[np.bool_]:
-        """Where fewer landmarks are expected than the localizer needs."""
+        """Where fewer landmarks are expected than are followed; to be found anew it takes more."""
         return self.count < self.needs.count
 
 
