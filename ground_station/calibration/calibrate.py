@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.calibration import lens, selection, verdict
+from ground_station.calibration.certainty import at_corners_px
 from ground_station.calibration.detection import BoardFinder
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.gather import Gathered
@@ -28,11 +29,15 @@ _TURNS = 2
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the picture: corners of the board in it, and how far they are off."""
+    """A part of the picture: corners of the board in it, and how far they are off.
+
+    `lens_px` is the deviation of where the lens sees its outermost pixel's ray, for a corner.
+    """
 
     name: str
     corners: int
     rms_px: float
+    lens_px: float | None = None
 
 
 @dataclass
@@ -71,10 +76,11 @@ class Result:
         )
         rest = np.ones(len(px), bool)
         found = []
+        known = at_corners_px(self.fit, self.size_px)
         for name in selection.CORNERS:
             inside = selection.in_corner(px, self.size_px, name)
             rest &= ~inside
-            found.append(Region(name, int(inside.sum()), lens.rms(off[inside])))
+            found.append(Region(name, int(inside.sum()), lens.rms(off[inside]), known[name]))
         return [*found, Region("the rest", int(rest.sum()), lens.rms(off[rest]))]
 
 

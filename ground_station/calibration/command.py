@@ -92,6 +92,8 @@ def _print(args: argparse.Namespace) -> int:
         square_mm = paper.largest_square_mm(size, columns, rows)
     board = new_board(columns, rows, square_mm)
     description = args.out.with_suffix(".toml")
+    if description.exists():
+        _check_is_a_board(description)
     paper.write_pdf(args.out, board, size)
     write_board(description, board)
     print(
@@ -100,6 +102,19 @@ def _print(args: argparse.Namespace) -> int:
         f"{paper.RULER_MM:g} mm on it."
     )
     return 0
+
+
+def _check_is_a_board(path: Path) -> None:
+    """Refuses to write a board's file over another program's."""
+    from ground_station.calibration.board import load_board
+    from pi_firmware.wire.errors import BlimpError
+
+    try:
+        load_board(path)
+    except BlimpError:
+        raise CalibrationError(
+            f"{path}: is there and no board's file; give --out another name"
+        ) from None
 
 
 def _squares(text: str) -> tuple[int, int]:

@@ -31,7 +31,9 @@ _HUBER = 2.0
 _GROSS = 5.0
 """Deviations from which a corner does not count."""
 _LEAST_SIGMA_PX = 0.02
-_ROUNDS, _STEPS = 3, 60
+_ROUNDS, _STEPS = 3, 40
+_CONVERGED = 1e-7
+"""Of the cost, in one step: far below what a deviation would change it by."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ class _Problem:
                 gain = (cost - new_cost) / max(cost, 1e-12)
                 state, cost, parts = trial, new_cost, new_parts
                 damping = max(damping / 5, 1e-9)
-                if gain < 1e-9:
+                if gain < _CONVERGED:
                     break
                 scale_now = _spread(self.residuals(state), self.views)
                 if abs(scale_now - scale) > 0.02 * scale:

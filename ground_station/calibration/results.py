@@ -108,10 +108,15 @@ def numbers(result: Result) -> list[tuple[str, str, str]]:
     return rows
 
 
-def region_rows(result: Result) -> list[tuple[str, str, str]]:
-    """Each region's name, corners and RMS as text."""
+def region_rows(result: Result) -> list[tuple[str, str, str, str]]:
+    """Each region's name, corners, RMS and how well the lens is known at its edge, as text."""
     return [
-        (r.name, str(r.corners), f"{r.rms_px:.3f} px" if r.corners else "none used")
+        (
+            r.name,
+            str(r.corners),
+            f"{r.rms_px:.3f} px" if r.corners else "none used",
+            "" if r.lens_px is None else f"± {r.lens_px:.2f} px",
+        )
         for r in result.regions()
     ]
 
@@ -130,7 +135,10 @@ def table(result: Result, frames: int) -> str:
     ]
     if not result.readout_known:
         lines.append(f"readout_s   {readout_words(result)}")
-    lines += ["", *columns([["picture", "corners", "RMS"], *map(list, region_rows(result))])]
+    lines += [
+        "",
+        *columns([["picture", "corners", "RMS", "lens"], *map(list, region_rows(result))]),
+    ]
     return "\n".join(lines)
 
 

@@ -16,7 +16,7 @@ START_NS = 1_700_000_000_000_000_000
 
 def write_board_flight(
     path: Path, taker: BoardCamera, motion: Waypoints, times_s: npt.NDArray[np.float64],
-    exposure_s: float, rng: np.random.Generator, *, crf: float = 18.0, instants: int = 2,
+    exposure_s: float, rng: np.random.Generator, *, crf: float = 18.0,
 ) -> Path:  # fmt: skip
     """Takes a picture at each time and records it; the recording carries no camera."""
     camera = taker.camera
@@ -24,7 +24,7 @@ def write_board_flight(
     encoder = H264Encoder(camera.width_px, camera.height_px, rate_hz, crf=crf)
     with RecordingWriter(path) as recording:
         for time_s in times_s:
-            image = taker.take(motion, float(time_s), exposure_s, instants=instants, rng=rng)
+            image = taker.take(motion, float(time_s), exposure_s, rng)
             for index, unit in encoder.encode(np.dstack([image] * 3)):
                 recording.write_video(START_NS + round(times_s[index] * 1e9), unit)
         for index, unit in encoder.finish():

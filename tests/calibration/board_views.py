@@ -138,32 +138,32 @@ class BoardCamera:
         self._vignette = 1 - np.float32(0.15) * r2 / r2.max()
 
     def take(
-        self, motion: Waypoints, time_s: float, exposure_s: float = 0.0, *, instants: int = 2,
+        self, motion: Waypoints, time_s: float, exposure_s: float = 0.0,
         rng: np.random.Generator | None = None,
     ) -> Image:  # fmt: skip
-        """A picture (H, W); without `rng` it has no noise."""
-        instants = instants if exposure_s else 1
-        offsets = ((np.arange(instants) + 0.5) / instants - 0.5) * exposure_s
+        """A picture (H, W); without `rng` it has no noise.
+
+        Of four samples of each pixel, each lies in another quarter of it and of the exposure.
+        """
         total = np.zeros(self._x.shape, np.float32)
-        for offset in offsets:
+        for quarter, (du, dv) in enumerate(_JITTER):
+            offset = ((quarter + 0.5) / len(_JITTER) - 0.5) * exposure_s
             poses = motion.at(time_s + offset + self._row_s)
             columns = Rotation.from_rotvec(poses[:, :3]).as_matrix()
             columns[:, :, 2] = poses[:, 3:]  # of the plane z = 0 only x and y count
             to_board = np.linalg.inv(columns).astype(np.float32)[:, :, :, None]
-            for du, dv in _JITTER:
-                x = self._x + np.float32(du / self.camera.fx_px)
-                y = self._y + np.float32(dv / self.camera.fy_px)
-                a, b, c = (
-                    to_board[:, i, 0] * x + to_board[:, i, 1] * y + to_board[:, i, 2]
-                    for i in range(3)
-                )
-                scale = np.float32(self._per_m) / c
-                shift = np.float32(self._pad - 0.5)
-                total += cv2.remap(
-                    self._texture, a * scale + shift, b * scale + shift, cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_CONSTANT, borderValue=self.look.around,
-                )  # fmt: skip
-        total /= len(offsets) * len(_JITTER)
+            x = self._x + np.float32(du / self.camera.fx_px)
+            y = self._y + np.float32(dv / self.camera.fy_px)
+            a, b, c = (
+                to_board[:, i, 0] * x + to_board[:, i, 1] * y + to_board[:, i, 2] for i in range(3)
+            )
+            scale = np.float32(self._per_m) / c
+            shift = np.float32(self._pad - 0.5)
+            total += cv2.remap(
+                self._texture, a * scale + shift, b * scale + shift, cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT, borderValue=self.look.around,
+            )  # fmt: skip
+        total /= len(_JITTER)
         total *= self._vignette
         if self.look.lens_blur_px > 0:
             total = cv2.GaussianBlur(total, (0, 0), self.look.lens_blur_px)

@@ -66,6 +66,8 @@ def test_a_board_is_printed_with_its_file(
                   ["--square-mm", "60"], ["--json", str(tmp_path / "x")]):  # fmt: skip
         refusal(capsys, "board", "--out", out, *wrong)
     assert ".pdf" in refusal(capsys, "board", "--out", tmp_path / "board.png")
+    (tmp_path / "b.toml").write_text("width_px = 640\n")  # a camera's
+    assert "b.toml" in refusal(capsys, "board", "--out", out)
     assert not out.exists()
 
 

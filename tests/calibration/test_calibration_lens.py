@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_views import Waypoints, carried, pose_of
+from scipy.spatial.transform import Rotation
 from sighted import BOARD, gathered, sighted
 
 from ground_station.calibration.calibrate import Result, calibrate
+from ground_station.calibration.certainty import at_corners_px
 from ground_station.calibration.detection import BoardFinder, Sighting
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.lens import NAMES
+from ground_station.calibration.selection import CORNERS
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
 FINDER = BoardFinder(BOARD, BOARD.points_m())
@@ -35,8 +38,19 @@ def refused(sightings: list[Sighting]) -> str:
     return str(error.value)
 
 
+def astray_px(camera: Camera, corner: tuple[int, int]) -> float:
+    """How far from where it should be a corner's ray is seen, the camera turned as fits best."""
+    grid = np.stack(np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 7)), -1).reshape(-1, 2)
+    rays = np.column_stack([STILL.undistort(np.vstack([grid, corner])), np.ones(64)])
+    seen = camera.project(rays)
+    turns = [camera.project(Rotation.from_rotvec(v).apply(rays)) - seen for v in 1e-5 * np.eye(3)]
+    J = np.array(turns)[:, :-1].reshape(3, -1).T
+    by = np.linalg.lstsq(J, (grid - seen[:-1]).ravel(), rcond=None)[0]
+    return float(np.linalg.norm(seen[-1] + np.tensordot(by, np.array(turns)[:, -1], 1) - corner))
+
+
 def test_the_lens_is_right_and_so_are_its_deviations() -> None:
-    off = []
+    off, lens_off = [], []
     for seed in range(4):
         result = solved(many(np.random.default_rng(seed)))
         camera = result.camera
@@ -47,6 +61,9 @@ def test_the_lens_is_right_and_so_are_its_deviations() -> None:
         for name in NAMES:
             sigma = result.fit.deviations[name]
             off.append((getattr(camera, name) - getattr(STILL, name)) / sigma)
+        for name, corner in zip(CORNERS, ((0, 0), (639, 0), (0, 479), (639, 479)), strict=True):
+            lens_off.append(astray_px(camera, corner) / at_corners_px(result.fit, (640, 480))[name])
+    assert 0.3 < np.sqrt(np.mean(np.square(lens_off))) < 2
     # 36 numbers over their deviations: a root mean square near 1 (0.5 to 1.6 in all but 1 of 1000
     # draws if they were independent), none far out.
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.7
