@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from numbered_flight import GOP, encoded, stamped
 from payload_process import Ended
 from scenarios import accounts
 from scenarios.camera import FLIGHT, Camera, Truth
-from scenarios.heard import Told
+from scenarios.heard import Heard, Told
 from scenarios.judge import OFF_M, poses
 from scenarios.link_steps import Loss, Outage
 from scenarios.matrix import BRIEF, MATRIX
@@ -25,7 +26,8 @@ from scenarios.tcp_wire import TcpWire
 from scenarios.walk import DRAWS, WALK_S, drawn, shrunk
 from scenarios.world import combined
 
-from ground_station.service.notes import EstimateNote
+from ground_station.service import notes
+from ground_station.service.notes import EstimateNote, FrameNote
 from pi_firmware.wire.recording import RecordingWriter
 
 COUNTS = {"captured": 100, "gated": 10, "sent": 88, "discarded": 2}
@@ -63,6 +65,20 @@ def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
     assert not run.unborn
     run.ended, run.ended_s = Ended(status, out, "", ended_s), 100.0 + ended_s
     assert run.unborn is unborn
+
+
+@pytest.mark.parametrize("frame_first", [True, False])
+def test_an_estimate_has_its_frame_whichever_is_heard_first(frame_first: bool) -> None:
+    """Two processes tell of them: of a busy machine's pose it stream nobody knew."""
+    heard, ears = Heard(), {}
+    bus: Any = SimpleNamespace(hear=lambda key, kind, take: ears.setdefault(key, take))
+    heard.listen(bus, 1)
+    frame = FrameNote(0, 0, 153, 5, 6, 7, 640, 480, ssrc=99)
+    said = [(notes.FRAME, frame), (notes.ESTIMATE, EstimateNote(153, 5, 6, 8, "TRACKING"))]
+    for key, note in said if frame_first else reversed(said):
+        ears[key]("blimp-1", note)
+    ears[notes.ESTIMATE]("blimp-1", EstimateNote(154, 5, 9, 9, "TRACKING"))
+    assert [(told.at, told.ssrc) for told in heard.estimates()] == [(0, 99), (-1, 0)]
 
 
 def test_what_came_to_the_link_is_what_was_sent() -> None:

@@ -53,13 +53,13 @@ class Heard:
     """Everything since the first start of the service; safe to read from any thread."""
 
     shown: dict[str, list[Shown]] = field(default_factory=dict)
-    told: list[Told] = field(default_factory=list)
     payloads: list[tuple[str, PayloadNote, float]] = field(default_factory=list)
     recording: list[tuple[RecordingNote, float]] = field(default_factory=list)
     events: list[tuple[str, EventNote]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._places: dict[tuple[str, int, int], int] = {}
+        self._told: list[tuple[str, EstimateNote, float, int]] = []
         self._lock = threading.Lock()
 
     def listen(self, bus: Bus, run: int) -> None:
@@ -84,9 +84,17 @@ class Heard:
             return list(self.shown.get(payload_id, ()))
 
     def estimates(self) -> list[Told]:
-        """All estimates so far."""
+        """All estimates so far, each with its frame, whichever of the two was heard first.
+
+        They come from two processes: on a busy machine a frame's note may be the later one.
+        """
         with self._lock:
-            return list(self.told)
+            return [self._with_frame(*told) for told in self._told]
+
+    def _with_frame(self, payload_id: str, note: EstimateNote, at_s: float, run: int) -> Told:
+        at = self._places.get((payload_id, note.sequence, note.clock_ns), -1)
+        ssrc = self.shown[payload_id][at].key[0] if at >= 0 else 0
+        return Told(payload_id, note, at, ssrc, at_s, run)
 
     def payload(self, payload_id: str, since_s: float = 0.0) -> PayloadNote | None:
         """The newest note of a payload, if it was heard since then."""
@@ -105,6 +113,4 @@ class Heard:
 
     def _estimate(self, payload_id: str, note: EstimateNote, run: int) -> None:
         with self._lock:
-            at = self._places.get((payload_id, note.sequence, note.clock_ns), -1)
-            ssrc = self.shown[payload_id][at].key[0] if at >= 0 else 0
-            self.told.append(Told(payload_id, note, at, ssrc, time.monotonic(), run))
+            self._told.append((payload_id, note, time.monotonic(), run))
