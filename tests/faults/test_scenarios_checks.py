@@ -69,7 +69,7 @@ def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
 
 @pytest.mark.parametrize("frame_first", [True, False])
 def test_an_estimate_has_its_frame_whichever_is_heard_first(frame_first: bool) -> None:
-    """Two processes tell of them: of a busy machine's pose it stream nobody knew."""
+    """Two processes tell of them: on a busy machine a pose was of a stream that nobody knew."""
     heard, ears = Heard(), {}
     bus: Any = SimpleNamespace(hear=lambda key, kind, take: ears.setdefault(key, take))
     heard.listen(bus, 1)
