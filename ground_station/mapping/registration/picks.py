@@ -29,6 +29,7 @@ DRAFT = "PICKS.draft.toml"
 FORMAT = 1
 MOST_PICKS = 200
 MOST_LANDMARKS = 300
+_LONGEST_NAME = 40
 MIN_WIDTH = 0.05
 """Second over first extent of picks: a person's clicks on one wall are not on an exact line."""
 _SAME_PX = 1.0
@@ -60,6 +61,7 @@ class Picks:
     scale: PlanScale
     upright: Upright
     plan: str = ""
+    plan_sha256: str = ""
     covariance: F64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 
@@ -74,6 +76,7 @@ class _Pick:
 @dataclass(frozen=True)
 class _Plan:
     image: str
+    sha256: str = config.key("", "of its pixels")
     height_px: int = config.key(0, "rows", unit="px", low=1, high=1 << 20)
     resolution_m: float = config.key(0.0, "of a pixel", unit="m", low=1e-4, high=10.0)
     origin: list[float] = config.key([0.0, 0.0, 0.0], "lower left corner: x, y, yaw")
@@ -134,6 +137,7 @@ def read_picks(path: str | Path) -> Picks:
                 file.up.height_m,
             ),
             file.plan.image,
+            file.plan.sha256,
         )
     except ConfigError as error:
         raise MapError(str(error)) from None
@@ -146,6 +150,7 @@ def write_picks(path: str | Path, picks: Picks) -> None:
         "format": FORMAT,
         "plan": {
             "image": picks.plan,
+            "sha256": picks.plan_sha256,
             "height_px": scale.height_px,
             "resolution_m": scale.resolution_m,
             "origin": list(scale.origin),
@@ -252,6 +257,10 @@ def _pick(item: Any, where: str) -> Pick:
     if not isinstance(item, dict):
         raise MapError(f"{where}: must be a table")
     read = config.from_mapping(item, _Pick, where=where)
+    if not 1 <= len(read.name) <= _LONGEST_NAME:
+        raise MapError(
+            f"{where}: its name has {len(read.name)} letters; allowed: 1 to {_LONGEST_NAME}"
+        )
     if not 1 <= len(read.landmarks) <= MOST_LANDMARKS:
         raise MapError(f"{where}: {len(read.landmarks)} landmarks; allowed: 1 to {MOST_LANDMARKS}")
     if not all(0 <= number < 1 << 63 for number in read.landmarks):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,6 +65,12 @@ class Plan:
     name: str
     image: npt.NDArray[np.uint8]
     scale: PlanScale | None
+
+    @property
+    def sha256(self) -> str:
+        """Of its pixels: a plan is the same under another name or in another file format."""
+        shape = f"{self.image.shape[0]}x{self.image.shape[1]} ".encode()
+        return hashlib.sha256(shape + self.image.tobytes()).hexdigest()
 
     def with_distance(self, one_px: F64, other_px: F64, length_m: float) -> Plan:
         """The plan with the scale that makes two of its pixels (2,) `length_m` apart.

@@ -26,13 +26,14 @@ CLICK_PX = 1.5
 
 @pytest.fixture(scope="module")
 def place():
-    return hall(TRUTH)
+    made = hall(TRUTH)
+    made.up = upright.find_up(made)
+    return made
 
 
 def picks_of(place, pillars=None, seed=0, wrong=None) -> Picks:
     """A person's picks of the hall's pillars; the one called `wrong` is three metres off."""
     rng = np.random.default_rng(seed)
-    up = upright.find_up(place)
     made = []
     for k, pillar in enumerate(place.pillars if pillars is None else pillars, 1):
         rows = np.flatnonzero(np.linalg.norm(place.world[:, :2] - pillar, axis=1) < 0.2)
@@ -41,7 +42,7 @@ def picks_of(place, pillars=None, seed=0, wrong=None) -> Picks:
         pixel = SCALE.to_pixels(at)[0] + CLICK_PX * rng.normal(size=2)
         centroid = place.landmarks.position_m[rows].mean(axis=0)
         made.append(Pick(str(k), place.landmarks.id[rows], centroid, pixel))
-    return Picks(made, SCALE, up.upright, "floorplan.png")
+    return Picks(made, SCALE, place.up.upright, "floorplan.png")
 
 
 @pytest.mark.parametrize("source", ["levels", "cameras"])
@@ -187,6 +188,7 @@ plan_px = [10.0, 20.0]
         ("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]", "finite number"),
         ("[1.0, 2.0, 3.0]", "[1.0, 1e12, 3.0]", "allowed: below 1e9"),
         ("[10.0, 20.0]", "[10.0]", "plan_px has 1 numbers; allowed: 2"),
+        ('"1"', '"' + "9" * 5000 + '"', "pick 1: its name has 5000 letters; allowed: 1 to 40"),
         ("name = ", "nme = ", "unknown key 'nme'"),
         ("[plan]", "plan = 3\n[x]", "the table 'plan' is missing"),
         ("format", "[[[", "not valid TOML"),
@@ -204,7 +206,7 @@ def test_a_file_of_picks_that_is_wrong_is_refused_by_name(tmp_path, old, new, wo
 
 
 def test_a_click_beside_a_pillar_means_the_pillar(place):
-    turn = upright.upright_rotation(upright.find_up(place).upright.direction)
+    turn = upright.upright_rotation(place.up.upright.direction)
     flat = place.landmarks.position_m @ turn.T
     mine = np.flatnonzero(np.linalg.norm(place.world[:, :2] - place.pillars[0], axis=1) < 0.2)
     middle = flat[mine].mean(axis=0)

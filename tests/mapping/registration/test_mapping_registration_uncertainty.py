@@ -112,7 +112,7 @@ def test_corners_of_one_thing_do_not_count_as_many():
     rng = np.random.default_rng(7)
     corners = np.array([[0, -1, 1], [0, 1, 1], [0, 1, -1], [0, -1, -1]]) * 0.1
     covered = []
-    for _ in range(150):
+    for _ in range(120):
         shift = NOISE_M * rng.normal(size=(6, 1, 3))
         world = (SIX[:, None] + corners).reshape(-1, 3)
         told = (SIX[:, None] + corners + shift).reshape(-1, 3)
@@ -126,7 +126,7 @@ def test_a_plans_points_with_the_vertical_are_as_certain_as_they_say():
     rng = np.random.default_rng(8)
     tilt_rad, level_m = np.radians(0.3), 0.03
     errors, radii = [], []
-    for _ in range(200):
+    for _ in range(120):
         told = SIX + NOISE_M * rng.normal(size=SIX.shape)
         told[:, 2] = 0
         up = Rotation.from_rotvec([*(tilt_rad * rng.normal(size=2)), 0]).apply([0, 0, 1])

@@ -271,7 +271,8 @@ class Desk:
             raise MapError(
                 "the floor plan has no scale: click two points of it and type their distance"
             )
-        return Picks(list(self._picks), self.plan.scale, self._up.upright, self.plan.name)
+        plan, up = self.plan, self._up.upright
+        return Picks(list(self._picks), self.plan.scale, up, plan.name, plan.sha256)
 
     def _resume(self) -> list[str]:
         """Begins with the picks of an earlier time, where they are of this map and plan."""
@@ -281,7 +282,7 @@ class Desk:
             return []
         try:
             kept = files.read_picks(path)
-            if (kept.plan, kept.scale.height_px) != (self.plan.name, len(self.plan.image)):
+            if kept.plan_sha256 != self.plan.sha256:
                 return [f"{path.name} is of another plan ('{printable(kept.plan, 40)}')"]
             landmarks = self.map.landmarks
             now = kept if files.unmoved(kept, landmarks) else files.at_present(kept, landmarks)
