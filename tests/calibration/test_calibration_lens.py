@@ -51,7 +51,7 @@ def astray_px(camera: Camera, corner: tuple[int, int]) -> float:
 
 def test_the_lens_is_right_and_so_are_its_deviations() -> None:
     off, lens_off = [], []
-    for seed in range(4):
+    for seed in range(3):
         result = solved(many(np.random.default_rng(seed)))
         camera = result.camera
         assert camera.fx_px == pytest.approx(STILL.fx_px, rel=0.003)
@@ -64,7 +64,7 @@ def test_the_lens_is_right_and_so_are_its_deviations() -> None:
         for name, corner in zip(CORNERS, ((0, 0), (639, 0), (0, 479), (639, 479)), strict=True):
             lens_off.append(astray_px(camera, corner) / at_corners_px(result.fit, (640, 480))[name])
     assert 0.3 < np.sqrt(np.mean(np.square(lens_off))) < 2
-    # 36 numbers over their deviations: a root mean square near 1 (0.5 to 1.6 in all but 1 of 1000
+    # 27 numbers over their deviations: a root mean square near 1 (0.5 to 1.6 in all but 1 of 1000
     # draws if they were independent), none far out.
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.7
     assert np.abs(off).max() < 4.5

@@ -7,7 +7,7 @@ import pytest
 from board_views import Waypoints, carried
 from sighted import BOARD, gathered, sighted
 
-from ground_station.calibration.calibrate import calibrate
+from ground_station.calibration.calibrate import _known_readout_s, calibrate
 from ground_station.calibration.detection import BoardFinder
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.interpolation import lagrange
@@ -83,15 +83,14 @@ def test_the_lens_of_a_moving_board_is_right_once_the_shutter_is_known() -> None
 
 def test_rows_from_last_to_first_are_said_and_not_written() -> None:
     """Pictures turned by half in software: the estimate is negative."""
-    motion = carried(THESIS_CAMERA, BOARD, np.random.default_rng(19), 16)
-    times = np.arange(0.05, motion.duration_s - 0.05, 1 / 20)
-    backwards = replace(THESIS_CAMERA, readout_s=-0.02)
-    sightings = sighted(backwards, motion, times, np.random.default_rng(20))
-    result = calibrate(gathered(sightings), FINDER, [True])
-    assert result.readout is not None
-    assert result.readout.readout_s == pytest.approx(-0.02, rel=0.05)
-    assert result.camera.readout_s == 0
-    assert any("last to the first" in note for note in result.notes)
+    motion = carried(THESIS_CAMERA, BOARD, np.random.default_rng(19), 6)
+    times = np.arange(0.05, motion.duration_s - 0.05, 1 / 30)
+    found = measured(replace(THESIS_CAMERA, readout_s=-0.02), times, motion, 20)
+    assert found is not None and found.determined and found.backwards
+    assert found.readout_s == pytest.approx(-0.02, rel=0.05)
+    notes: list[str] = []
+    assert _known_readout_s(found, notes) == 0
+    assert "last to the first" in notes[0]
 
 
 def test_lagranges_polynomials_pass_through_their_nodes() -> None:
