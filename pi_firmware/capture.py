@@ -178,11 +178,11 @@ class Capture:
         media = self._media
         return media.limit_bitrate(kbps) if media is not None else kbps
 
-    def link_report(self, lost: float, round_trip_s: float) -> None:
-        """What the ground saw of late: the share of packets lost, 0 to 1, and the round trip."""
+    def link_report(self, report: messages.LinkReport) -> None:
+        """What the ground saw of the link of late."""
         media = self._media
         if media is not None:
-            media.link_report(lost, round_trip_s)
+            media.link_report(report)
 
     def answered(self, sequence: int) -> None:
         """The ground is done with this frame and all before it."""

@@ -77,13 +77,12 @@ class Ground:
             if report.wants_idr:
                 wanted = now_s - self._idr_s >= _IDR_GAP_S
                 self._idr_s = now_s if wanted else self._idr_s
-            trip_s = report.round_trip_s
-            self._seen = Seen(report.ground, report.lost, trip_s, now_s)
-        if report.wants_idr:  # no report of its own: those come each second
+            self._seen = Seen(report.ground, report.lost, report.round_trip_s, now_s)
+        if report.wants_idr:  # of an IDR, and not of the link
             if wanted:
                 self._capture.force_idr()
             return
-        self._capture.link_report(report.lost, 0.0 if trip_s is None else trip_s)
+        self._capture.link_report(report)
 
     def _follow(self, report: LinkReport, now_s: float) -> None:
         other = report.ground != self._followed

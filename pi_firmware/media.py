@@ -21,6 +21,7 @@ from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
 from pi_firmware.wire import annexb, sei
 from pi_firmware.wire.errors import StreamError
+from pi_firmware.wire.messages import LinkReport
 from pi_firmware.wire.video import MAX_IDR_INTERVAL_NS
 
 _START_LIMIT_NS = 5_000_000_000
@@ -169,9 +170,9 @@ class Media:
         """Makes the next frame an IDR."""
         self._encoder.force_idr()
 
-    def link_report(self, lost: float, round_trip_s: float) -> None:
-        """What the ground saw of late: the share of packets lost, 0 to 1, and the round trip."""
-        self._encoder.link_report(lost, round_trip_s)
+    def link_report(self, report: LinkReport) -> None:
+        """What the ground saw of the link of late."""
+        self._encoder.link_report(report)
 
     def _build(self) -> Any:
         settings, source = self._settings, self._source
@@ -272,6 +273,7 @@ class Media:
             stamped = annexb.insert_before_slice(access_unit, sei.encode(info))
             self.encoded += 1
             clock_ns = self._pipeline.get_base_time() + running_ns
+            self._encoder.gave(clock_ns)
             if self._leave(Unit(info, stamped, clock_ns, idr)):
                 self.counters.sent += 1
             else:

@@ -68,8 +68,11 @@ class EncoderSettings:
     bitrate_kbps: int = key(2000, "target bit rate", unit="kbit/s", low=100, high=20_000)
     min_bitrate_kbps: int = key(300, "the least it adapts to", unit="kbit/s", low=50, high=20_000)
     adapt: bool = key(True, "bit rate and IDR interval follow what the ground reports")
+    max_queue_s: float = key(
+        0.06, "a longer queue on the link lowers the bit rate", unit="s", low=0.01, high=5
+    )
     max_round_trip_s: float = key(
-        0.3, "a longer round trip lowers the bit rate", unit="s", low=0.01, high=10
+        0.3, "so does this round trip, where no queue is told", unit="s", low=0.01, high=10
     )
     gop_frames: int = key(15, "frames from IDR to IDR, at most 1 s", unit="frames", low=1, high=120)
     min_gop_frames: int = key(10, "the same at 5 % loss and more", unit="frames", low=1, high=120)

@@ -162,6 +162,7 @@ class Supervision:
             version=self.release.version,
             release=self.release.how,
             release_reason=self.release.reason,
+            early_reports=True,
             **asdict(self._board.read()),
         )
 

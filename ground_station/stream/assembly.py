@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
+from ground_station.stream.arrivals import Arrivals
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
 from pi_firmware.wire import sei
@@ -65,6 +66,8 @@ class Assembly:
         self.payload_id = payload_id
         self.last_arrival_ns = 0
         """Monotonic, of the newest packet."""
+        self.arrivals = Arrivals()
+        """How its packets come, for whoever sends them."""
         self._counters = counters
         self._reorderer = rtp.Reorderer(counters)
         self._depacketizer = rtp.Depacketizer(counters)
@@ -83,6 +86,7 @@ class Assembly:
     def push(self, packet: rtp.Packet) -> Iterator[ReceivedFrame]:
         """Takes a packet; the frames that are whole with it."""
         self._counters.packets += 1
+        self.arrivals.add(packet)
         self.last_arrival_ns = packet.arrival_ns
         if self._first_arrival_ns is None:
             self._first_arrival_ns = packet.arrival_ns

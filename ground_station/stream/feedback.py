@@ -1,7 +1,7 @@
 """What the ground station says back of the video: once a second, to each payload that lives.
 
 And at once when a loss keeps frames from being shown: the next IDR then comes after a round trip
-and not at the end of its interval.
+and not at the end of its interval. And five times a second while the link has a queue or overflows.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+from ground_station.stream.arrivals import Flow
 from ground_station.stream.counters import Counters
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import keys, messages
@@ -22,6 +23,10 @@ PERIOD_S = 1.0
 _LOOK_S = 0.02
 _IDR_GAP_S = 0.1
 WINDOW_S = 2.0
+EARLY_S = 0.2
+_EARLY_LOOK_S = 0.04
+_EARLY_QUEUE_S = 0.03
+_EARLY_DROPPED = 0.1
 
 
 class Video(Protocol):
@@ -40,6 +45,10 @@ class Video(Protocol):
     @property
     def counters(self) -> Counters:
         """What came so far."""
+        ...
+
+    def flow(self) -> Flow | None:
+        """How it comes of late; None while there is too little of it."""
         ...
 
 
@@ -103,6 +112,39 @@ class StreamAccount:
         return tally, (tally - since).share_lost
 
 
+class Urgency:
+    """When a payload is to hear of its stream before the second is over; on a clock of seconds.
+
+    While the link has a queue or overflows, and once more when that is over.
+    """
+
+    def __init__(self) -> None:
+        self._told_s = self._looked_s = float("-inf")
+        self._was_urgent = False
+
+    def wants_look(self, now_s: float) -> bool:
+        """Whether the flow is worth looking at again."""
+        if now_s - self._told_s < EARLY_S or now_s - self._looked_s < _EARLY_LOOK_S:
+            return False
+        self._looked_s = now_s
+        return True
+
+    def is_due(self, flow: Flow | None) -> bool:
+        """Whether a report must not wait."""
+        return self._was_urgent or _is_urgent(flow)
+
+    def told(self, report: messages.LinkReport, now_s: float) -> None:
+        """This report went out; a wish for an IDR is none of the link."""
+        if not report.wants_idr:
+            self._told_s, self._was_urgent = now_s, _is_urgent(report)
+
+
+def _is_urgent(seen: Flow | messages.LinkReport | None) -> bool:
+    if seen is None:
+        return False
+    return (seen.queue_s or 0.0) > _EARLY_QUEUE_S or (seen.dropped or 0.0) > _EARLY_DROPPED
+
+
 def _tally(counters: Counters, frames: int) -> Tally:
     return Tally(counters.packets - counters.packets_late, counters.packets_lost, frames)
 
@@ -126,6 +168,7 @@ class Feedback:
         self._period_s = period_s
         self._accounts: dict[str, StreamAccount] = {}
         self._withheld: dict[str, tuple[int, float]] = {}
+        self._urgencies: dict[str, Urgency] = {}
         self._publishers: dict[str, Any] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
@@ -156,13 +199,22 @@ class Feedback:
                 if video is None:
                     continue
                 wants_idr = self._wants_idr(payload_id, video, now_s)
+                is_early = self._is_early(payload_id, video, now_s)
                 # A link that just went takes no report; the next one may be back.
                 with contextlib.suppress(zenoh.ZError):
-                    if is_due:
+                    if is_due or is_early:
                         self._publish(payload_id, self._report(payload_id, video))
                     if wants_idr:
                         wish = replace(self._report(payload_id, video), wants_idr=True)
                         self._publish(payload_id, wish)
+
+    def _is_early(self, payload_id: str, video: Video, now_s: float) -> bool:
+        """Whether a report must not wait, to a payload that does not take it for a second's."""
+        urgency = self._urgencies.setdefault(payload_id, Urgency())
+        if not (urgency.wants_look(now_s) and urgency.is_due(video.flow())):
+            return False
+        state = self._listener.state(payload_id)
+        return state is not None and state.health is not None and state.health.early_reports
 
     def _wants_idr(self, payload_id: str, video: Video, now_s: float) -> bool:
         """Whether frames came since the last look that only an IDR lets be shown again."""
@@ -180,8 +232,9 @@ class Feedback:
         ssrc, counters = video.ssrc, video.counters
         if ssrc is not None and _is_anothers(ssrc, state):
             ssrc = None
-        tally, lost = Tally(), 0.0
+        tally, lost, flow = Tally(), 0.0, None
         if ssrc is not None:
+            flow = video.flow()
             frames = state.frames if state is not None else None
             account = self._accounts.setdefault(payload_id, StreamAccount())
             sent = frames.sent if frames is not None else 0
@@ -195,6 +248,9 @@ class Feedback:
             packets_lost=tally.lost,
             lost=lost,
             round_trip_s=self._listener.round_trip_s(payload_id),
+            received_kbps=flow.received_kbps if flow is not None else None,
+            queue_s=flow.queue_s if flow is not None else None,
+            dropped=flow.dropped if flow is not None else None,
         )
 
     def _publish(self, payload_id: str, report: messages.LinkReport) -> None:
@@ -205,6 +261,7 @@ class Feedback:
                 keys.key(payload_id, keys.LINK), congestion_control=zenoh.CongestionControl.DROP
             )
         self._publishers[payload_id].put(messages.encode(report))
+        self._urgencies.setdefault(payload_id, Urgency()).told(report, time.monotonic())
 
 
 def _is_anothers(ssrc: int, state: PayloadState | None) -> bool:

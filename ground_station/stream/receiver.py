@@ -13,10 +13,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from ground_station.stream import rtp
+from ground_station.stream.arrivals import Flow
 from ground_station.stream.assembly import SETS_TIMEOUT_S, Assembly, ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.srtp import Unprotector
-from ground_station.stream.udp import bind
+from ground_station.stream.udp import bind, read
 from pi_firmware.wire.errors import StreamError
 from pi_firmware.wire.video import PORT
 
@@ -104,6 +105,11 @@ class Receiver:
         """A snapshot of the counters."""
         return replace(self._counters)
 
+    def flow(self) -> Flow | None:
+        """How the stream arrives of late; None before there is one."""
+        stream = self._stream
+        return stream.arrivals.flow(time.monotonic_ns()) if stream else None
+
     @property
     def ssrc(self) -> int | None:
         """The SSRC of the stream being received; None before there is one."""
@@ -135,15 +141,16 @@ class Receiver:
 
     def _receive(self) -> None:
         while not self._closing.is_set():
+            datagram: bytes | None = None
             try:
-                datagram: bytes | None = self._socket.recv(65535)
+                datagram, waited_ns = read(self._socket)
             except TimeoutError:
-                datagram = None
+                pass
             except OSError:
                 continue  # an ICMP error of someone else's datagram
             now_ns = time.monotonic_ns()
             if datagram is not None:
-                packet = self._parse(datagram, now_ns)
+                packet = self._parse(datagram, now_ns, waited_ns)
                 if packet is not None:
                     for own in self._select(packet):
                         assert self._stream is not None
@@ -151,14 +158,14 @@ class Receiver:
             if self._stream is not None:
                 self._watch(self._stream, now_ns)
 
-    def _parse(self, datagram: bytes, arrival_ns: int) -> rtp.Packet | None:
+    def _parse(self, datagram: bytes, arrival_ns: int, waited_ns: int) -> rtp.Packet | None:
         """The packet in a datagram, authentic where that is asked for; if none, it is counted."""
         if self._unprotector is not None:
             plain = self._unprotector.unprotect(datagram)
             if plain is None:
                 return None
             datagram = plain
-        packet = rtp.parse(datagram, arrival_ns)
+        packet = rtp.parse(datagram, arrival_ns, waited_ns)
         if packet is None:
             self._counters.garbage += 1
         return packet

@@ -20,7 +20,10 @@ MAX_ACCESS_UNIT_BYTES = 4 << 20
 
 @dataclass(frozen=True)
 class Packet:
-    """One RTP packet of H.264; `arrival_ns` is on the receiver's monotonic clock."""
+    """One RTP packet of H.264; `arrival_ns` is on the receiver's monotonic clock.
+
+    It is when it was read; before that it lay in the machine for `waited_ns`.
+    """
 
     sequence: int
     timestamp: int
@@ -28,9 +31,15 @@ class Packet:
     marker: bool
     payload: bytes
     arrival_ns: int
+    waited_ns: int = 0
+
+    @property
+    def came_ns(self) -> int:
+        """When it came to the machine, however late its reader was."""
+        return self.arrival_ns - self.waited_ns
 
 
-def parse(datagram: bytes, arrival_ns: int) -> Packet | None:
+def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None:
     """The packet in a datagram; None when it is not RTP version 2 with the video's payload type."""
     if len(datagram) < _HEADER_BYTES:
         return None
@@ -47,7 +56,8 @@ def parse(datagram: bytes, arrival_ns: int) -> Packet | None:
         end -= datagram[-1]
     if start >= end:
         return None
-    return Packet(sequence, timestamp, ssrc, bool(second & 0x80), datagram[start:end], arrival_ns)
+    payload, marker = datagram[start:end], bool(second & 0x80)
+    return Packet(sequence, timestamp, ssrc, marker, payload, arrival_ns, waited_ns)
 
 
 class Reorderer:

@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from ground_station.stream import rtp
+from ground_station.stream.arrivals import Flow
 from ground_station.stream.assembly import Assembly, ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.srtp import Unprotector
-from ground_station.stream.udp import bind
+from ground_station.stream.udp import bind, read
 from pi_firmware.wire.video import PORT
 
 Owner = Callable[[int, str | None, float], str | None]
@@ -73,6 +74,10 @@ class Stream:
     def counters(self) -> Counters:
         """A snapshot of the counters."""
         return replace(self._counters)
+
+    def flow(self) -> Flow | None:
+        """How it arrives of late; None before there is enough of it."""
+        return self._assembly.arrivals.flow(time.monotonic_ns())
 
     @property
     def problem(self) -> str:
@@ -228,26 +233,27 @@ class SeveralReceiver:
     def _receive(self) -> None:
         tidied_ns = 0
         while not self._closing.is_set():
+            datagram: bytes | None = None
             try:
-                datagram: bytes | None = self._socket.recv(65535)
+                datagram, waited_ns = read(self._socket)
             except TimeoutError:
-                datagram = None
+                pass
             except OSError:
                 continue  # an ICMP error of someone else's datagram
             now_ns = time.monotonic_ns()
             if datagram is not None:
-                self._take(datagram, now_ns)
+                self._take(datagram, now_ns, waited_ns)
             if now_ns - tidied_ns >= _ASK_NS:
                 tidied_ns = now_ns
                 self._tidy(now_ns)
 
-    def _take(self, datagram: bytes, now_ns: int) -> None:
+    def _take(self, datagram: bytes, now_ns: int, waited_ns: int) -> None:
         if self._unprotector is not None:
             plain = self._unprotector.unprotect(datagram)
             if plain is None:
                 return
             datagram = plain
-        packet = rtp.parse(datagram, now_ns)
+        packet = rtp.parse(datagram, now_ns, waited_ns)
         if packet is None:
             self._counters.garbage += 1
             return

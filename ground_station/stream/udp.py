@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
+import time
 
 from pi_firmware.wire.errors import StreamError
 
 BUFFER_BYTES = 4 << 20
 """What the receiver asks for: a second of video that a busy machine leaves waiting."""
 _SO_RCVBUFFORCE = 33  # Linux, not in Python's socket module
+_SO_TIMESTAMPNS = 35
+_TIMESPEC = struct.Struct("@ll")
+_LONGEST_WAIT_NS = 5_000_000_000
 
 
 def bind(host: str, port: int, poll_s: float) -> socket.socket:
@@ -26,9 +31,26 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         with contextlib.suppress(OSError):  # beyond the system's limit, where we may
             receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, BUFFER_BYTES)
+        with contextlib.suppress(OSError):
+            receiver.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         receiver.bind(address)
     except OSError as error:
         receiver.close()
         raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
     receiver.settimeout(poll_s)
     return receiver
+
+
+def read(receiver: socket.socket) -> tuple[bytes, int]:
+    """The next datagram and how long the machine has had it, ns; 0 where it does not tell.
+
+    Raises `OSError` like the socket, `TimeoutError` when none comes.
+    """
+    datagram, said, _, _ = receiver.recvmsg(65535, socket.CMSG_SPACE(_TIMESPEC.size))
+    for level, kind, data in said:
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS, _TIMESPEC.size):
+            seconds, ns = _TIMESPEC.unpack(data)
+            waited_ns = time.time_ns() - (seconds * 10**9 + ns)
+            # The stamp is the wall clock's, which may have been set in between.
+            return datagram, waited_ns if 0 <= waited_ns < _LONGEST_WAIT_NS else 0
+    return datagram, 0

@@ -162,7 +162,7 @@ class Health(Message):
     """How payload and board are; None: this board cannot tell, or nothing was heard."""
 
     SCHEMA: ClassVar[str] = "blimp.health"
-    MINOR: ClassVar[int] = 1
+    MINOR: ClassVar[int] = 2
 
     uptime_s: float  # of the program
     captured: int = 0
@@ -195,6 +195,7 @@ class Health(Message):
     version: str = ""  # of the program, with the release's commit; an older writer gave none
     release: str = ""  # how it came: factory, update, fell back; empty: it runs on no card
     release_reason: str = ""  # why an update did not stay
+    early_reports: bool = False  # it takes link reports between those of each second
 
 
 @dataclass(frozen=True)
@@ -202,11 +203,14 @@ class LinkReport(Message):
     """What a ground station sees of a payload's video, once a second; `time_ns` is its own clock.
 
     `packets` and `packets_lost` count since it first saw the stream, `lost` is the share of late.
-    One with `wants_idr` comes between these, at once when frames can't be shown for a loss.
+    One with `wants_idr` comes between these, at once when frames can't be shown for a loss, and so
+    do others while a queue stands or overflows, if the payload's `Health` says `early_reports`.
+    `received_kbps`, `queue_s` and `dropped` are None where an older ground station measures none
+    or has nothing to measure them by.
     """
 
     SCHEMA: ClassVar[str] = "blimp.link"
-    MINOR: ClassVar[int] = 1
+    MINOR: ClassVar[int] = 2
 
     ground: str  # its name
     video_port: int  # where it takes the video
@@ -216,6 +220,9 @@ class LinkReport(Message):
     lost: float = 0.0
     round_trip_s: float | None = None
     wants_idr: bool = False
+    received_kbps: float | None = None  # of the packets' payloads, over the last half second
+    queue_s: float | None = None  # what most frames waited on the way, beyond the least of late
+    dropped: float | None = None  # share of packets lost in the last second while others came
 
 
 @dataclass(frozen=True)

@@ -1,55 +1,57 @@
 """The encoder follows the link within its bounds, and its properties while it runs."""
 
-import math
+import time
 
 import pytest
 
 from pi_firmware import encoder, gstreamer
-from pi_firmware.encoder import Adaptation, Encoder
+from pi_firmware.encoder import Encoder
 from pi_firmware.settings import CameraSettings, EncoderSettings
 from pi_firmware.wire import annexb
-
-LIMITS = EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=300, gop_frames=15, min_gop_frames=10)
-
-
-def test_a_good_link_keeps_the_configured_rate_and_the_longest_interval() -> None:
-    adaptation = Adaptation(LIMITS)
-    for _ in range(20):
-        adaptation.report(0.0, 0.02)
-    assert (adaptation.bitrate_kbps, adaptation.gop_frames) == (2000, 15)
+from pi_firmware.wire.messages import LinkReport
 
 
-def test_loss_lowers_the_rate_to_its_bound_and_a_good_link_raises_it_again() -> None:
-    adaptation = Adaptation(LIMITS)
-    adaptation.report(0.2, 0.02)
-    assert adaptation.bitrate_kbps == pytest.approx(1800)
-    adaptation.report(0.05, 0.02)
-    assert adaptation.bitrate_kbps == pytest.approx(1800)
-    for _ in range(60):
-        adaptation.report(0.5, 0.02)
-    assert adaptation.bitrate_kbps == 300
-    adaptation.report(0.0, 0.02)
-    assert adaptation.bitrate_kbps == pytest.approx(315)
+class Element:
+    """Where GStreamer's element would be."""
+
+    def set_property(self, name: str, value: int) -> None:
+        pass
 
 
-@pytest.mark.parametrize(("lost", "frames"), [(0.0, 15), (0.02, 13), (0.05, 10), (0.9, 10)])
-def test_the_more_is_lost_the_sooner_comes_an_idr(lost: float, frames: int) -> None:
-    adaptation = Adaptation(LIMITS)
-    adaptation.report(lost, 0.02)
-    assert adaptation.gop_frames == frames
+@pytest.mark.parametrize(("own_s", "kbps"), [(0.0, 1140), (0.12, 2000)])
+def test_what_frames_wait_on_a_busy_board_is_no_queue_of_the_link(own_s: float, kbps: int) -> None:
+    made = Encoder(Element(), EncoderSettings(), 30.0)
+    for number in range(30):
+        late_s = own_s if number else 0.0
+        made.gave(time.monotonic_ns() - round((0.01 + late_s) * 1e9))
+    seen = LinkReport(1, "main", 5600, lost=0.0, received_kbps=1500.0, queue_s=0.12, dropped=0.0)
+    made.link_report(seen)
+    assert made.bitrate_kbps == pytest.approx(kbps, rel=0.03)
 
 
-def test_a_long_round_trip_lowers_the_rate_without_any_loss() -> None:
-    adaptation = Adaptation(LIMITS)
-    adaptation.report(0.0, 0.5)
-    assert adaptation.bitrate_kbps == pytest.approx(1700)
+def test_an_encoder_that_must_not_adapt_ignores_all() -> None:
+    made = Encoder(Element(), EncoderSettings(adapt=False), 30.0)
+    seen = LinkReport(1, "main", 5600, lost=0.9, received_kbps=100.0, queue_s=1.0, dropped=0.9)
+    made.link_report(seen)
+    assert made.bitrate_kbps == 2000
 
 
-@pytest.mark.parametrize("report", [(math.nan, 0.1), (-0.1, 0.1), (1.5, 0.1), (0.1, math.nan)])
-def test_a_report_that_cannot_be_changes_nothing(report: tuple[float, float]) -> None:
-    adaptation = Adaptation(LIMITS)
-    adaptation.report(*report)
-    assert (adaptation.bitrate_kbps, adaptation.gop_frames) == (2000, 15)
+def test_no_frame_takes_more_than_a_sixth_of_a_seconds_bits() -> None:
+    """An IDR of more would fill a narrow link's queue by itself."""
+    gst = gstreamer.load()
+    settings = EncoderSettings(bitrate_kbps=600)
+    pipeline = gstreamer.launch(
+        "videotestsrc pattern=zone-plate kx2=20 ky2=20 kt=1 num-buffers=60 "
+        "! video/x-raw,format=I420,width=640,height=480,framerate=30/1 "
+        f"! {encoder.description(settings, CameraSettings(), 30.0)} ! appsink name=units sync=false"
+    )
+    pipeline.set_state(gst.State.PLAYING)
+    sink, sizes = pipeline.get_by_name("units"), []
+    while (sample := sink.emit("try-pull-sample", 5 * gst.SECOND)) is not None:
+        sizes.append(sample.get_buffer().get_size())
+    pipeline.set_state(gst.State.NULL)
+    assert len(sizes) == 60
+    assert max(sizes) * 8 / 1000 < settings.bitrate_kbps / 6
 
 
 def test_bit_rate_and_idr_are_those_asked_for_while_it_runs() -> None:

@@ -21,11 +21,11 @@ class Link:
 
 class Capture:
     def __init__(self) -> None:
-        self.reports: list[tuple[float, float]] = []
+        self.reports: list[LinkReport] = []
         self.idrs = 0
 
-    def link_report(self, lost: float, round_trip_s: float) -> None:
-        self.reports.append((lost, round_trip_s))
+    def link_report(self, report: LinkReport) -> None:
+        self.reports.append(report)
 
     def force_idr(self) -> None:
         self.idrs += 1
@@ -64,8 +64,11 @@ class Following:
 def test_a_report_of_our_stream_adapts_the_encoder() -> None:
     following = Following("127.0.0.1")
     following.report(lost=0.25, round_trip_s=0.01)
-    following.report(lost=0.0)
-    assert following.capture.reports == [(0.25, 0.01), (0.0, 0.0)]
+    following.report(lost=0.0, queue_s=0.2)
+    told = [
+        (report.lost, report.round_trip_s, report.queue_s) for report in following.capture.reports
+    ]
+    assert told == [(0.25, 0.01, None), (0.0, None, 0.2)]
     assert following.link.to == []  # a configured address stays
     seen = following.ground.seen
     assert seen is not None and (seen.ground, seen.lost) == ("main", 0.0)

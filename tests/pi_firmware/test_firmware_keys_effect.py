@@ -91,6 +91,7 @@ SEEN_BY: dict[str, tuple[str, ...]] = {
         "camera.white_balance",
         "camera.focus_m",
         "encoder.name",
+        "encoder.max_queue_s",
         "encoder.max_round_trip_s",
         "encoder.min_gop_frames",
         "battery.capacity_mAh",

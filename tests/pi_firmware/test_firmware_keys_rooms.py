@@ -65,15 +65,27 @@ def encoder_element(settings: Settings) -> str:
     return encoder.description(settings.encoder, settings.camera, 30.0).split()[0]
 
 
+def report(**seen: float) -> messages.LinkReport:
+    return messages.LinkReport(1, "main", 5600, **seen)  # type: ignore[arg-type]
+
+
 def kbps_after_a_round_trip_of_0_2_s(settings: Settings) -> int:
+    """As an older ground station tells it."""
     element = Element()
-    encoder.Encoder(element, settings.encoder, 30.0).link_report(0.0, 0.2)
+    encoder.Encoder(element, settings.encoder, 30.0).link_report(report(round_trip_s=0.2))
+    return element.bitrate
+
+
+def kbps_after_a_queue_of_0_1_s(settings: Settings) -> int:
+    element = Element()
+    made = encoder.Encoder(element, settings.encoder, 30.0)
+    made.link_report(report(received_kbps=2000.0, queue_s=0.1, dropped=0.0))
     return element.bitrate
 
 
 def frames_to_an_idr_at_a_loss_of_5_percent(settings: Settings) -> int:
     made = encoder.Encoder(Element(), settings.encoder, 30.0)
-    made.link_report(0.05, 0.01)
+    made.link_report(report(lost=0.05))
     return next(count for count in range(100) if made.next_is_due())
 
 
@@ -191,6 +203,7 @@ DEGREES_AND_PLACE = [0, 0, 0, 1, -2, -3]
         ("camera.white_balance", "cloudy", set_on_v4l2, {}, {0x0098090C: 0, 0x0098091A: 6500}),
         ("encoder.name", "v4l2h264enc", encoder_element, "x264enc", "v4l2h264enc"),
         ("encoder.max_round_trip_s", 0.1, kbps_after_a_round_trip_of_0_2_s, 2000, 1700),
+        ("encoder.max_queue_s", 0.2, kbps_after_a_queue_of_0_1_s, 1530, 2000),
         ("encoder.min_gop_frames", 4, frames_to_an_idr_at_a_loss_of_5_percent, 10, 4),
         ("battery.capacity_mAh", 1200, design_capacity_ah, 0.6, 1.2),
         ("battery.full_V", 4.35, is_full_at_4_2_volts, True, False),

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from ground_station.stream.arrivals import Flow
 from ground_station.stream.counters import Counters
 from ground_station.stream.feedback import Feedback, StreamAccount
 from ground_station.stream.telemetry import TelemetryListener
@@ -26,6 +27,10 @@ class Video:
     port: int = 5600
     ssrc: int | None = None
     counters: Counters = field(default_factory=Counters)
+    seen: Flow | None = None
+
+    def flow(self) -> Flow | None:
+        return self.seen
 
 
 def test_a_late_packet_stays_lost_and_a_duplicate_counts_once() -> None:
@@ -222,3 +227,32 @@ def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryL
         time.sleep(0.2)
         assert 3 <= len(ear.reports) <= 12  # ten a second at most
     ear.close()
+
+
+def test_a_queue_is_told_at_once_to_who_takes_it_and_once_a_second_to_who_does_not(
+    listener: TelemetryListener,
+) -> None:
+    """An older payload takes each report for a second's, and would adapt five times as much."""
+    ears = {name: Ear(listener, name) for name in ("newer", "older")}
+    videos = {name: Video(ssrc=5, seen=Flow(900.0, 0.01, 0.0)) for name in ears}
+    for name, ear in ears.items():
+        ear.telemetry.health(messages.Health(1, 1.0, early_reports=name == "newer"))
+        assert listener.wait(name, lambda s: s.alive and s.health is not None, LIMIT_S)
+    with Feedback(listener, videos.get, period_s=1000.0):
+        time.sleep(0.3)
+        assert not ears["newer"].reports and not ears["older"].reports
+        for video in videos.values():
+            video.seen = Flow(800.0, 0.25, 0.125)
+        told = ears["newer"].wait(lambda r: r.queue_s == 0.25)
+        assert told is not None
+        assert (told.received_kbps, told.queue_s, told.dropped) == (800.0, 0.25, 0.125)
+        began_s, before = time.monotonic(), len(ears["newer"].reports)
+        ears["newer"].wait(lambda r: len(ears["newer"].reports) >= before + 3)
+        assert time.monotonic() - began_s > 0.45
+        videos["newer"].seen = Flow(850.0, 0.0, 0.0)
+        assert ears["newer"].wait(lambda r: r.queue_s == 0.0)  # and once that it is over
+        time.sleep(0.3)
+        over = [report for report in ears["newer"].reports if report.queue_s == 0.0]
+        assert len(over) == 1 and not ears["older"].reports
+    for ear in ears.values():
+        ear.close()
