@@ -84,7 +84,7 @@ class MapInfo:
     frame: str = "sfm"
     """`sfm` (arbitrary scale and origin) until registered, then `world`."""
     units: str = "arbitrary"
-    """`arbitrary` until registered, then `m`."""
+    """`arbitrary` until registered, then `m`; with the frame `sfm` where only lengths are known."""
     format: int = FORMAT
     built: dict[str, Any] = field(default_factory=dict)
     registration: dict[str, Any] = field(default_factory=dict)
