@@ -53,7 +53,8 @@ uninstall-service:  ## Take the service away; configuration and recordings stay
 test: setup  ## Run the tests of every room
 	@failed=0; \
 	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
-	.venv/bin/python -m pytest -q -m "not beside" tests || failed=1; \
+	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 2 --dist loadfile tests || failed=1; \
+	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
 	exit $$failed
 
 check: setup  ## Lint, formatting and types

@@ -1,6 +1,7 @@
 """For all tests: a change is judged by the same examples each time it is checked (CI is set).
 
-`make test` runs the tests marked `beside` on all cores at once, then the others one by one.
+`make test` runs the tests marked `beside` on all cores at once, then those that fly two at a time,
+and those marked `alone`, which measure or need the machine, one by one.
 """
 
 import os

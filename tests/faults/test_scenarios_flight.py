@@ -17,6 +17,8 @@ from scenarios.step import Scenario
 from scenarios.walk import drawn
 from scenarios.world import shims_there
 
+pytestmark = pytest.mark.alone
+
 WALK_SEED, WALK_S = 1, 8.0
 FAULT_S = 2.0
 

@@ -19,6 +19,8 @@ from ground_station.service import flight_report
 from ground_station.service.cases.outcome import read_outcome
 from ground_station.service.replay import ReplayResult, replay, settings_for
 
+pytestmark = pytest.mark.alone
+
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 BLIMP = Path(sys.executable).with_name("blimp")
 

@@ -11,6 +11,8 @@ from ground_station import cli
 from ground_station.service import bench_callgrind as callgrind
 from ground_station.service import bench_figures, bench_flight
 
+pytestmark = pytest.mark.alone
+
 # Two objects, C's library and code made at run time; names are written once. The lines behind
 # `calls=` are the callees' and no cost of the object's own.
 PROFILE = """\

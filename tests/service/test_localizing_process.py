@@ -40,6 +40,8 @@ from ground_station.service.localizing.process import RESTART, Localizing
 from ground_station.service.notes import EstimateNote
 from ground_station.service.pictures import SLOTS
 
+pytestmark = pytest.mark.alone
+
 FLIGHT = SAMPLE / "flight.mcap"
 TRUTH = trajectory_of(FLIGHT)
 

@@ -30,6 +30,8 @@ from ground_station.geometry.trajectory import read_tum
 from pi_firmware.wire import keys
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, VIDEO_TOPIC, RecordingReader
 
+pytestmark = pytest.mark.alone
+
 NAME = "blimp-1"
 CUT_S = 1.0
 """What a power cut may cost of a recording."""
