@@ -9,6 +9,7 @@ import pytest
 BLIMP = Path(sys.executable).with_name("blimp")
 COMMANDS = [
     ["simulate"],
+    ["calibrate"],
     ["map", "build"],
     ["map", "register"],
     ["map", "info"],
