@@ -23,8 +23,9 @@ from ground_station.errors import GroundStationError
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.geometry.lens import Lens
 from ground_station.localization.localizer import Localizer
-from ground_station.localization.projection import Lens, project
+from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.localization.visibility import LandmarkIndex
 from ground_station.mapping import store

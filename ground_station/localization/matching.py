@@ -10,11 +10,12 @@ import numpy.typing as npt
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens import Lens
 from ground_station.localization.association import associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
 from ground_station.localization.kinematics import Kinematics, Sights
-from ground_station.localization.projection import Lens, project
+from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import DescriptorThresholds
 from ground_station.localization.verification import Witness

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.localization.projection import Lens
+from ground_station.geometry.lens import Lens
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
 from ground_station.localization.verification import Witness

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
-from ground_station.localization.projection import Lens, in_cone
+from ground_station.geometry.lens import Lens
+from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.mapping.store import Landmarks
 

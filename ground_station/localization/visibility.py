@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from ground_station.geometry import poses
-from ground_station.localization.projection import NEAREST_M, Lens
+from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.mapping.store import Keyframes, Landmarks
 

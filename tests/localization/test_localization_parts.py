@@ -14,9 +14,10 @@ import pytest
 from skimage.measure import shannon_entropy
 
 from ground_station.geometry import poses
+from ground_station.geometry.lens import Lens
 from ground_station.localization.association import associate
 from ground_station.localization.motion import MotionModel, constant_velocity
-from ground_station.localization.projection import Lens, project
+from ground_station.localization.projection import project
 from ground_station.localization.settings import (
     PRESETS,
     AssociationSettings,

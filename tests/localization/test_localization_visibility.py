@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ground_station.geometry import poses
-from ground_station.localization.projection import Lens, project
+from ground_station.geometry.lens import Lens
+from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.mapping.store import Keyframes, Landmarks

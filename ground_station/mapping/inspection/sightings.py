@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.mapping.store import Map
 
 F32 = npt.NDArray[np.float32]
@@ -31,40 +32,26 @@ PRIOR = 1.0
 MOST_LANDMARKS, MOST_KEYFRAMES = 20_000, 400
 """Of larger maps one in so many is looked at, which then stands for them."""
 
-_NEAREST_M = 0.05
-"""As of the localizer: nearer, a landmark has no useful projection."""
-
 
 class View:
-    """Which directions are in a camera's image.
+    """What is before a camera and in its image."""
 
-    A distortion polynomial folds back far outside of the image, so that directions that no pixel
-    sees would land inside; what lies beyond the image's corners is not asked.
-    """
-
-    def __init__(self, camera: Camera, nearest: float = _NEAREST_M) -> None:
+    def __init__(self, camera: Camera, nearest: float = NEAREST_M) -> None:
         self.camera, self._nearest = camera, nearest
-        w, h = camera.width_px - 0.5, camera.height_px - 0.5
-        corners = np.array([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]])
-        self._radius = 1.02 * float(np.linalg.norm(camera.undistort(corners), axis=1).max())
+        self._lens = Lens(camera)
 
     @classmethod
     def of(cls, map_: Map) -> View:
         """That of a map's camera; lengths of a map that is not registered say nothing of metres."""
-        return cls(map_.info.camera, _NEAREST_M if map_.info.registered else 0.0)
+        return cls(map_.info.camera, NEAREST_M if map_.info.registered else 0.0)
 
     def inside(self, points_c: F64) -> Mask:
         """Whether points in camera coordinates (..., 3) are in front and in the image; (...)."""
         shape = points_c.shape[:-1]
         points = points_c.reshape(-1, 3)
-        radius2 = points[:, 0] ** 2 + points[:, 1] ** 2
-        near = np.flatnonzero(
-            (points[:, 2] > self._nearest) & (radius2 <= (self._radius * points[:, 2]) ** 2)
-        )
-        pixels = self.camera.project(points[near])
-        low, high = -0.5, np.array([self.camera.width_px, self.camera.height_px]) - 0.5
-        keep = np.zeros(len(points), bool)
-        keep[near] = ((pixels >= low) & (pixels < high)).all(axis=1)
+        keep = points[:, 2] > self._nearest
+        front = points[keep]
+        keep[keep] = self._lens.inside(front[:, :2] / front[:, 2:])
         return keep.reshape(shape)
 
 

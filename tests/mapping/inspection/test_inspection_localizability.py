@@ -13,8 +13,8 @@ from ground_station.errors import InputError, MapError
 from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.geometry.lens import Lens
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.localization.projection import Lens
 from ground_station.localization.settings import load_preset
 from ground_station.mapping.inspection.comparison import compare, spearman
 from ground_station.mapping.inspection.localizability import localizability
