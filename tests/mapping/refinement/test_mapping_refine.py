@@ -225,7 +225,7 @@ def test_a_program_killed_while_it_adjusts_leaves_the_old_map(world, tmp_path):
     save_observations(tmp_path / "f.safetensors", world.flight())
     old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
     script = (
-        "import sys, time; from ground_station.mapping import refine\n"
+        "import sys, time; from ground_station.mapping.refinement import refine\n"
         "def wait(*_): print('writing', flush=True); time.sleep(60)\n"
         "refine.store.save_tables = lambda *_, **__: wait()\n"
         "from ground_station import cli; cli.main(sys.argv[1:])\n"
