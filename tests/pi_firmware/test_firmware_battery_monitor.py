@@ -231,8 +231,9 @@ def test_a_low_battery_holds_the_encoder_down_whatever_the_link_bears() -> None:
     encoder = Encoder(element, EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=200), 30.0)
     encoder.set_bitrate(400)
     assert encoder.limit_bitrate(600) == 400  # a bad link already asked for less
+    good = messages.LinkReport(1, "main", 5600, round_trip_s=0.01)
     for _ in range(50):
-        encoder.link_report(0.0, 0.01)  # and a good one asks for more
+        encoder.link_report(good)  # and a good one asks for more
     assert encoder.bitrate_kbps == element.bitrate == 600
 
 
