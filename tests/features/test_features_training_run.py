@@ -130,12 +130,16 @@ def made(torch, tmp_path_factory) -> tuple[str, Path]:
     return teacher, folder / "corpus"
 
 
-def train(made: tuple[str, Path], out: Path, recipe: Recipe = TINY, **options):
+def train(
+    made: tuple[str, Path], out: Path, recipe: Recipe = TINY, precision: str = "auto", **options
+):
     from ground_station.features.training.loop import Machine
     from ground_station.features.training.loop import train as run
 
     teacher, corpus = made
-    machine = Machine("cpu", threads=1, jobs=0, checkpoint_every=2, validate_every=4)
+    machine = Machine(
+        "cpu", threads=1, jobs=0, precision=precision, checkpoint_every=2, validate_every=4
+    )
     return run(recipe, out=out, corpus_folder=corpus, teacher=teacher, machine=machine, **options)
 
 
@@ -190,6 +194,22 @@ def test_a_killed_run_goes_on_to_the_same_weights(made, straight, tmp_path, monk
         assert array.tobytes() == ours.arrays[name].tobytes(), name
     model = "wren.onnx"
     assert (tmp_path / "run" / model).read_bytes() == (straight / model).read_bytes()
+
+
+def test_arithmetic_of_fewer_bits_trains_the_same_weights_but_for_their_last_digits(
+    made, straight, tmp_path
+):
+    train(made, tmp_path / "run", precision="bfloat16")
+    ours, theirs = last(tmp_path / "run"), last(straight)
+    names = [name for name in theirs.arrays if name.startswith("network.")]
+    assert all(ours.arrays[name].dtype == theirs.arrays[name].dtype for name in names)
+    weights = [name for name in names if theirs.arrays[name].ndim == 4]
+    off = [np.abs(ours.arrays[name] - theirs.arrays[name]).max() for name in weights]
+    assert 0 < max(off) < 2.5 * TINY.rate * TINY.steps  # as far as so many steps can go
+    log = curve.read(tmp_path / "run" / "log.jsonl")
+    assert [line["bfloat16"] for line in log if line["kind"] == "recipe"] == [True]
+    with pytest.raises(TrainingError, match="precision is 'half'; allowed: auto, float32"):
+        train(made, tmp_path / "other", precision="half")
 
 
 def test_another_recipe_does_not_go_on(made, straight):

@@ -48,8 +48,12 @@ class _Steps(Dataset[tuple[Tensor, ...]]):
 
 
 def _start(_: int) -> None:
-    """In a process that makes data: Ctrl-C is for the one that trains."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In a process that makes data: Ctrl-C, or a stop of all, is for the one that trains.
+
+    It writes a checkpoint then, and these end with it.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     cv2.setNumThreads(1)
 
 

@@ -45,6 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=int, help=f"{text} (the recipe's)")
     parser.add_argument("--rate", type=float, help="step size (the recipe's)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu or cuda")
+    parser.add_argument(
+        "--precision", default="auto",
+        help="auto (default: bfloat16 on a GPU), float32 or bfloat16, which some CPUs have",
+    )  # fmt: skip
     parser.add_argument("--threads", type=int, default=0, help="of torch on a CPU (all cores)")
     parser.add_argument("--jobs", type=int, default=0, help="processes that make data (all cores)")
     parser.add_argument("--checkpoint-every", type=int, default=250, metavar="STEPS")
@@ -82,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("out/training") / args.size
     machine = Machine(
         device=args.device,
+        precision=args.precision,
         threads=args.threads or len(os.sched_getaffinity(0)),
         jobs=args.jobs or len(os.sched_getaffinity(0)),
         checkpoint_every=args.checkpoint_every,

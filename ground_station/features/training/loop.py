@@ -49,6 +49,9 @@ class Machine:
     device: str = "auto"
     threads: int = 2
     jobs: int = 2
+    precision: str = "auto"
+    """Of the network's arithmetic: bfloat16 on a GPU, else float32. Processors that have bfloat16,
+    too, train nearly twice as fast in it."""
     checkpoint_every: int = 250
     validate_every: int = 1000
 
@@ -61,6 +64,13 @@ class Machine:
         if self.device == "auto":
             return torch.device("cuda" if torch.cuda.is_available() else "cpu")
         return torch.device(self.device)
+
+    def bfloat16(self) -> bool | None:
+        """What the precision says; None: as the device has it. Raises `TrainingError`."""
+        known = {"auto": None, "float32": False, "bfloat16": True}
+        if self.precision not in known:
+            raise TrainingError(f"precision is '{self.precision:.40}'; allowed: {', '.join(known)}")
+        return known[self.precision]
 
 
 def train(
@@ -96,7 +106,7 @@ def train(
     elif start is not None:
         # A resumed run is as long as it was, whoever asks.
         recipe = recipe.as_long_as(_recipe_of(start))
-    trainer = Trainer(recipe, device)
+    trainer = Trainer(recipe, device, machine.bfloat16())
     step, before_s = 0, 0.0
     if start is not None:
         if other := recipe.differences(_recipe_of(start)):
@@ -152,8 +162,9 @@ class _Run:
         """Notes what goes on from here: a resumed run may have a larger corpus."""
         teacher_sha256 = teacher.load(teacher_name).sha256
         self.note(step).add(
-            "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256
-        )
+            "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256,
+            device=str(self.trainer.device), bfloat16=self.trainer.bfloat16,
+        )  # fmt: skip
 
     def baselines(self, teacher_name: str, step: int) -> None:
         """What others make of the same held-out pairs."""

@@ -26,9 +26,11 @@ _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 class Trainer:
     """Deterministic on a CPU with the same number of threads."""
 
-    def __init__(self, recipe: Recipe, device: torch.device) -> None:
+    def __init__(self, recipe: Recipe, device: torch.device, bfloat16: bool | None = None) -> None:
+        """`bfloat16`: the network computes in it; None: on a GPU it does."""
         torch.manual_seed(recipe.seed)
         self.recipe, self.device = recipe, device
+        self.bfloat16 = device.type == "cuda" if bfloat16 is None else bfloat16
         self.shape = shape_of(recipe.size)
         self.network = FeatureNetwork(self.shape).to(device, memory_format=torch.channels_last)
         self.network.train()
@@ -45,8 +47,8 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = self.recipe.rate_at(number)
         images = batch.images.contiguous(memory_format=torch.channels_last)
-        # bfloat16 has float32's range, so that no loss needs scaling; a CPU stays exact.
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+        # It has float32's range, so that no loss needs scaling.
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             logits, descriptors = self.network(images)
         result = losses(
             logits, descriptors, batch.labels, batch.known, batch.points_px, batch.used,
