@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument(
         "--localizability", action="store_true",
-        help="also say in which share of places and headings a camera would get lost (seconds)",
+        help="also say in which share of places and headings too few are expected (seconds)",
     )  # fmt: skip
     parser.add_argument("--json", metavar="FILE", help="write it as JSON, too")
 

@@ -1,4 +1,4 @@
-"""Before a flight: where, and looking which way, the localizer will get lost in a map.
+"""Before a flight: how well a pose is fixed in a map, by place and by where the camera looks.
 
 After the maps of expected pose uncertainty in planning in belief space (Prentice and Roy, IJRR
 2009): the information that the landmarks in view would give, for a grid of places and headings.

@@ -12,7 +12,7 @@ from ground_station.mapping.table import print_table
 if TYPE_CHECKING:
     from ground_station.geometry.trajectory import Trajectory
 
-HELP = "Shows a map, and where a camera would get lost in it, on one HTML page."
+HELP = "Shows a map, and how well a camera is placed where in it, on one HTML page."
 
 EXAMPLE = """\
 examples:
