@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 import pytest
+from browsing import browser, launch  # noqa: F401 - fixtures
 from hypothesis import settings
 
 settings.register_profile("ci", derandomize=True)

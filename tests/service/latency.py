@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-from conftest import _ARGUMENTS as BROWSER
 from intake_stand import eventually
 from standing import Estimates, Process, Row, Service, Viewer, conclude, process
 
@@ -51,11 +50,13 @@ class Measured:
 @contextlib.contextmanager
 def dashboard(url: str) -> Iterator[Callable[[float], list[float]]]:
     """Chromium on the page; gives a wait of some seconds, in which its reports come, in ms."""
+    sys.path.append(str(Path(__file__).parents[1]))
+    from browsing import ARGUMENTS
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or "/usr/bin/chromium"
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=list(BROWSER))
+        browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         shown: list[float] = []
 

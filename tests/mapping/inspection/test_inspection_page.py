@@ -94,11 +94,6 @@ class Opened:
 
 
 @pytest.fixture(scope="module")
-def browser(launch):
-    return launch()
-
-
-@pytest.fixture(scope="module")
 def desk(browser, pages):
     """The map with a plan on a desk; what it complains of in any test fails that test."""
     opened = Opened(browser, pages / "world.html")

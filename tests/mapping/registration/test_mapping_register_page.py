@@ -31,7 +31,6 @@ from ground_station.mapping.registration.register import register_map
 LIMIT_S = 60.0
 TOKEN = "a-token"
 RESOLUTION_M, MARGIN_M = 0.02, 0.5
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def draw_plan(folder: Path) -> Path:
@@ -136,20 +135,6 @@ def places_to_pick(stand: Stand) -> list[np.ndarray]:
     world = stand.truth.apply(stand.desk.map.landmarks.position_m)
     wanted = [[8.0, 2.6], [8.0, 5.8], [5.0, 6.0], [7.2, 6.0], [8.0, 4.2]]
     return [turned[np.argmin(np.linalg.norm(world[:, :2] - w, axis=1)), :2] for w in wanted]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-    path = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip(f"no browser: none of {', '.join(_BROWSERS)} is installed")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(
-            executable_path=path, args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield started
-        started.close()
 
 
 class Page:
