@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import cv2
@@ -50,16 +51,17 @@ class _Steps(Dataset[tuple[Tensor, ...]]):
 def _start(_: int) -> None:
     """In a process that makes data: Ctrl-C, or a stop of all, is for the one that trains.
 
-    It writes a checkpoint then, and these end with it.
+    It writes a checkpoint then and ends these itself, by SIGTERM at the latest: they keep that, and
+    leave its process group.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.setpgid(0, 0)
     cv2.setNumThreads(1)
 
 
 def batches(
     source: PairSource, batch: int, first: int, last: int, jobs: int, device: torch.device
-) -> Iterator[Batch]:
+) -> Generator[Batch, None, None]:
     """The batches of steps `first` to `last` - 1, in order, on the device."""
     on_gpu = device.type == "cuda"
     loader = DataLoader(

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import FrameType
@@ -192,7 +192,7 @@ class _Run:
         )
         # A log has lines enough of its own.
         bar = Progress("steps", recipe.steps - step) if sys.stderr.isatty() else nullcontext()
-        with _stop_noted() as stopped, bar:
+        with _stop_noted() as stopped, bar, closing(stream):
             for batch in stream:
                 made = self.trainer.step(step, batch)
                 # Read only where it is logged: a GPU would wait for each number.
