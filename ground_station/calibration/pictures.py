@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
-from ground_station.evaluation.plots import Dress
+from ground_station.evaluation.plots import Dress, dressed
 
 WIDTH_IN = 6.6
 _SMALL = 8.5
@@ -59,7 +59,7 @@ def per_view(result: Result, dress: Dress) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained", facecolor=dress.paper)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    _style(axes, dress)
+    dressed(axes, dress, _SMALL)
     order = np.lexsort(
         ([v.seen.index for v in result.views], [v.seen.source for v in result.views])
     )
@@ -81,7 +81,7 @@ def _picture(result: Result, dress: Dress) -> tuple[Figure, Axes]:
     figure.set_facecolor(dress.paper)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    _style(axes, dress)
+    dressed(axes, dress, _SMALL)
     axes.set_aspect("equal")
     axes.set_xlim(-0.01 * w, 1.01 * w)
     axes.set_ylim(1.01 * h, -0.01 * h)
@@ -95,18 +95,6 @@ def _picture(result: Result, dress: Dress) -> tuple[Figure, Axes]:
     axes.set_xlabel("u, px", fontsize=_SMALL)
     axes.set_ylabel("v, px", fontsize=_SMALL)
     return figure, axes
-
-
-def _style(axes: Axes, dress: Dress) -> None:
-    axes.set_facecolor(dress.paper)
-    axes.grid(True, color=dress.grid, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=dress.ink, length=3, labelsize=_SMALL)
-    axes.xaxis.label.set_color(dress.ink)
-    axes.yaxis.label.set_color(dress.ink)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(dress.ink)
 
 
 def _legend(axes: Axes, dress: Dress) -> None:

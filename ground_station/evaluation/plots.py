@@ -155,7 +155,7 @@ def evaluation(result: Evaluation, align: str = "none") -> Figure:
     lower.set_ylabel("rotation, °")
     lower.set_xlabel("time, s")
     for axes in (path, upper, lower):
-        _style(axes, LIGHT)
+        dressed(axes, LIGHT)
     upper.set_ylim(bottom=0)
     lower.set_ylim(bottom=0)
     _legend(path, LIGHT)
@@ -179,15 +179,18 @@ def _figure(rows: int, size_inches: tuple[float, float], dress: Dress) -> tuple[
     FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     for one in axes:
-        _style(one, dress)
+        dressed(one, dress)
     return figure, axes
 
 
-def _style(axes: Axes, dress: Dress) -> None:
+def dressed(axes: Axes, dress: Dress, label_size: float | None = None) -> None:
+    """Gives axes a page's colours and two spines; the numbers' size in points, where given."""
     axes.set_facecolor(dress.paper)
     axes.grid(True, color=dress.grid, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(colors=dress.ink, length=3)
+    if label_size is not None:
+        axes.tick_params(labelsize=label_size)
     axes.xaxis.label.set_color(dress.ink)
     axes.yaxis.label.set_color(dress.ink)
     for name, spine in axes.spines.items():

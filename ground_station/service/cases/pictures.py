@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 
 from ground_station.evaluation import plots
 from ground_station.evaluation.floorplan import FloorPlan
-from ground_station.evaluation.plots import GAP_S, Dress
+from ground_station.evaluation.plots import GAP_S, Dress, dressed
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 
@@ -128,7 +128,7 @@ def over_time(
     figure = _sheet((WIDTH_IN, sum(heights) + 0.7), dress)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (label, series, bound) in zip(grid, panels, strict=False):
-        _dress(axes, dress)
+        dressed(axes, dress, _SMALL)
         # Of what is nothing at all the axis shows a usual span, not the rounding.
         top = max(_LEAST.get(label.rpartition(", ")[2], 1e-6), bound or 0.0)
         for one in series:
@@ -157,7 +157,7 @@ def distributions(
     figure = _sheet((WIDTH_IN, 2.9), dress)
     grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axes, (label, sets) in zip(grid, panels, strict=True):
-        _dress(axes, dress)
+        dressed(axes, dress, _SMALL)
         for k, (name, values) in enumerate(sets):
             known = np.sort(values[np.isfinite(values)])
             if not len(known):
@@ -174,7 +174,7 @@ def distributions(
 
 
 def _draw_strips(axes: Axes, strips: Sequence[Strip], dress: Dress) -> None:
-    _dress(axes, dress)
+    dressed(axes, dress, _SMALL)
     axes.grid(False)
     seen: set[str] = set()
     for row, strip in enumerate(strips):
@@ -211,18 +211,6 @@ def _sheet(size_in: tuple[float, float], dress: Dress) -> Figure:
     figure = Figure(figsize=size_in, layout="constrained", facecolor=dress.paper)
     FigureCanvasAgg(figure)
     return figure
-
-
-def _dress(axes: Axes, dress: Dress) -> None:
-    axes.set_facecolor(dress.paper)
-    axes.grid(True, color=dress.grid, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=dress.ink, length=3, labelsize=_SMALL)
-    axes.xaxis.label.set_color(dress.ink)
-    axes.yaxis.label.set_color(dress.ink)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(dress.ink)
 
 
 def _style(k: int, dress: Dress) -> tuple[str, str]:
