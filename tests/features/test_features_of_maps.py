@@ -14,7 +14,7 @@ from ground_station.features.extractor import FeatureError
 from ground_station.features.settings import FeatureSettings, LearnedSettings
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.extraction import extractor_for
-from ground_station.mapping.construction import build
+from ground_station.mapping.construction import images, verification
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.store import MapInfo
 from ground_station.recording.frames import Frame
@@ -67,7 +67,7 @@ def test_a_map_is_built_with_a_model_by_name_on_several_threads(bird):
     pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(5)]
     frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
     settings = MappingSettings(features="bird", max_features=50)
-    found = build.extract(frames, camera, settings, 2, 5, {})
+    found = images.extract(frames, camera, settings, 2, 5)
     alone = extractors.create("bird", 50)
     for picture, features in zip(pictures, found.features, strict=True):
         assert features.descriptors.shape[1] == 16 and len(features) > 10
@@ -81,14 +81,14 @@ def test_lowes_ratio_is_rootsifts_and_other_features_have_their_own(bird, monkey
         ratios.append(ratio)
         return np.empty((0, 2), np.int32)
 
-    monkeypatch.setattr(build, "mutual_matches", matches)
+    monkeypatch.setattr(verification, "mutual_matches", matches)
     rng = np.random.default_rng(0)
     camera = replace(THESIS_CAMERA, width_px=96, height_px=64)
     pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(2)]
     frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
     for name in ("rootsift", "bird"):
         settings = MappingSettings(features=name, max_features=50)
-        found = build.extract(frames, camera, settings, 1, 2, {})
+        found = images.extract(frames, camera, settings, 1, 2)
         with pytest.raises(MapError, match="no two of the 2 images overlap"):
-            build.match(found, camera, settings, 1, {})
+            verification.match(found, camera, settings, 1)
     assert ratios == [settings.match.ratio, settings.match.ratio_others] == [0.8, 0.95]
