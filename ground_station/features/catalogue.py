@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ground_station import user_folders
 from ground_station.features import model
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model import Model
@@ -17,10 +18,7 @@ def users() -> Path:
     """The user's models: `$BLIMP_MODELS`, else `blimp/models` where XDG keeps a user's data."""
     if chosen := os.environ.get("BLIMP_MODELS"):
         return Path(chosen)
-    data = os.environ.get("XDG_DATA_HOME")
-    # The XDG base directory specification has relative paths ignored.
-    home = Path(data) if data and Path(data).is_absolute() else Path.home() / ".local" / "share"
-    return home / "blimp" / "models"
+    return user_folders.data() / "models"
 
 
 def path_for(name: str) -> Path:
