@@ -5,6 +5,7 @@ and those marked `alone`, which measure or need the machine, one by one.
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,10 +17,18 @@ if os.environ.get("CI"):
     settings.load_profile("ci")
 
 _ROOMS = {
-    "calibration", "cli", "deploy", "evaluation", "features", "fuzz", "geometry", "hw",
+    "calibration", "cli", "deploy", "evaluation", "experiments", "features", "fuzz", "geometry", "hw",
     "localization", "mapping", "maps", "recording", "simulator", "wire",
 }  # fmt: skip
 """Rooms in whose tests nothing flies: no program that another one disturbs by using a core."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No test finds, or leaves, anything in the cache of the person who runs it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BLIMP_CACHE", str(tmp_path_factory.mktemp("blimp-cache")))
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

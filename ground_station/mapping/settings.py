@@ -15,14 +15,24 @@ SHIPPED = Path(__file__).with_name("mapping.toml")
 class MatchSettings:
     """Which images are compared, and which matches count."""
 
+    pairs: str = config.key(
+        "auto", "exhaustive: every pair is compared", choices=("auto", "exhaustive")
+    )
     exhaustive_max: int = config.key(
-        160, "up to so many images, every pair is compared", unit="images", low=2, high=2000
+        160, "auto: up to so many images, every pair is compared", unit="images", low=2, high=2000
     )
     neighbours: int = config.key(
         12, "above that: each image with so many that follow it", unit="images", low=1, high=1000
     )
     similar: int = config.key(
         20, "above that: and with so many that look like it", unit="images", low=0, high=1000
+    )
+    covisible: int = config.key(
+        10,
+        "above that: and with so many that share strong links with it, but were not compared",
+        unit="images",
+        low=0,
+        high=1000,
     )
     preview: int = config.key(
         400,
@@ -141,6 +151,10 @@ class MappingSettings:
     seed: int = config.key(0, "of every random choice", low=0, high=2**31 - 1)
     threads: int = config.key(0, "worker threads, 0: one a core", unit="threads", low=0, high=256)
     quantise: bool = config.key(True, "keep descriptors as one byte a number")
+    cache_gb: float = config.key(
+        4.0, "of features and pairs on disk, the oldest go first; 0: none", unit="GB",
+        low=0.0, high=10000.0,
+    )  # fmt: skip
     learned: LearnedSettings = field(default_factory=LearnedSettings)
     match: MatchSettings = field(default_factory=MatchSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)

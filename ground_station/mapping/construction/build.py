@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,13 @@ import numpy as np
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import landmarks, store
 from ground_station.mapping.construction.assembly import assemble
+from ground_station.mapping.construction.cache import Cache
+from ground_station.mapping.construction.content import structure_key
 from ground_station.mapping.construction.images import extract
 from ground_station.mapping.construction.structure import adjust_and_filter, reconstruct
 from ground_station.mapping.construction.verification import match
+from ground_station.mapping.construction.work import lasting
+from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.folder import replacing
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import colmap
@@ -33,23 +37,37 @@ def build_map(
     *,
     total: int | None = None,
     built: dict[str, Any] | None = None,
+    cache: Cache | None = None,
+    workers: Workers | None = None,
 ) -> store.Map:
     """Builds a map from frames in the folder `out`; a killed build leaves the old map there.
 
-    `total` is the number of frames if known, `built` what map.toml shall say of the inputs. Raises
-    `InputError` when there are fewer than two frames, `MapError` when sizes differ from the
-    camera's, images do not overlap, or structure from motion fails.
+    `total` is the number of frames if known, `built` what map.toml shall say of the inputs. With a
+    `cache`, what an earlier build has made is not made again, one that was killed included.
+    `workers` extract and match, by default threads of this process. Raises `InputError` when there
+    are fewer than two frames, `MapError` when sizes differ from the camera's, images do not overlap,
+    or structure from motion fails.
     """
     out = Path(out)
     threads = settings.threads or os.cpu_count() or 1
+    workers = workers or Threads(threads)
     stage_s: dict[str, float] = {}
-    with replacing(out) as folder:
-        work = folder / "work"
-        work.mkdir()
+    # What lasts is let go of only when the map is in its place.
+    with ExitStack() as held, replacing(out) as folder:
         with _timed(stage_s, "features"):
-            images = extract(frames, camera, settings, threads, total)
+            images = extract(
+                frames, camera, settings, threads, total, cache=cache, workers=workers
+            )
         with _timed(stage_s, "match"):
-            pairs = match(images, camera, settings, threads)
+            pairs = match(images, camera, settings, threads, cache=cache, workers=workers)
+        work = None
+        if cache:
+            print(f"{cache.figures} (cache {cache.folder})", flush=True)
+            key = structure_key(images, pairs, camera, settings)
+            work = held.enter_context(lasting(cache.folder / "work", key))
+        if work is None:
+            work = folder / "work"
+            work.mkdir()
         with _timed(stage_s, "sfm"):
             structure = reconstruct(images, pairs, camera, settings, threads, work)
         with _timed(stage_s, "refine"):
@@ -71,12 +89,14 @@ def build_map(
             "pairs_verified": len(pairs),
             "sparse_camera": "PINHOLE; key points are undistorted, the lens is in [camera]",
             "threads": threads,
+            "workers": workers.name,
+            **({"cache": asdict(cache.figures)} if cache else {}),
             "stage_s": {name: round(value, 3) for name, value in stage_s.items()},
             "settings": asdict(settings),
         }
         colmap.write(colmap.compact(structure.reconstruction), folder / "sparse")
         store.save_tables(folder, map_, quantise=settings.quantise)
-        shutil.rmtree(work)
+        shutil.rmtree(folder / "work", ignore_errors=True)
     map_.folder = out
     return map_
 

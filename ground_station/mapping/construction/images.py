@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,9 @@ from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.construction.workers import parallel
+from ground_station.mapping.construction import content
+from ground_station.mapping.construction.cache import Cache
+from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
@@ -21,15 +24,21 @@ from ground_station.recording.frames import Frame
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
+_LOCAL = threading.local()
+
 
 @dataclass(frozen=True)
 class Images:
-    """What is kept of n frames: names, times (n,), features, their undistorted pixels (N, 2)."""
+    """What is kept of n frames: names, times (n,), features, their undistorted pixels (N, 2).
+
+    `keys` are the hashes by which a cache knows the features, none without a cache.
+    """
 
     names: list[str]
     time_ns: I64
     features: list[Features]
     pinhole_px: list[F64]
+    keys: list[bytes] = field(default_factory=list)
 
 
 def extract(
@@ -38,44 +47,77 @@ def extract(
     settings: MappingSettings,
     threads: int,
     total: int | None,
+    *,
+    cache: Cache | None = None,
+    workers: Workers | None = None,
 ) -> Images:
     """Features of all frames, extracted in parallel while the input is read.
 
-    Raises `InputError` for fewer than two frames, `MapError` for a size other than the camera's.
+    What `cache` holds is not extracted again. Raises `InputError` for fewer than two frames,
+    `MapError` for a size other than the camera's.
     """
-    local = threading.local()
-    size = (camera.height_px, camera.width_px)
+    names: list[str] = []
+    times: list[int] = []
+    found: list[Features | None] = []
+    keys: list[bytes] = []
+    under_way: deque[int] = deque()
+    how = content.extraction(extractor_of(settings), settings) if cache else b""
 
-    def one(frame: Frame) -> tuple[str, int, Features]:
-        if frame.image.shape != size:
-            height, width = frame.image.shape[:2]
-            raise MapError(
-                f"{frame.name}: is {width}x{height} pixels, "
-                f"the camera {camera.width_px}x{camera.height_px}"
-            )
-        if not hasattr(local, "extractor"):  # an extractor of its own for each thread
-            local.extractor = extractor_of(settings)
-        return frame.name, frame.time_ns, local.extractor.extract(frame.image)
+    def missing() -> Iterator[tuple[MappingSettings, npt.NDArray[np.uint8]]]:
+        for frame in frames:
+            _check_size(frame, camera)
+            names.append(frame.name)
+            times.append(frame.time_ns)
+            features = None
+            if cache:
+                keys.append(content.features_key(frame.image, how))
+                features = cache.features(keys[-1])
+            found.append(features)
+            if features is None:
+                under_way.append(len(found) - 1)
+                yield settings, frame.image
+            else:
+                progress.step()
 
-    rows: list[tuple[str, int, Features]] = []
     with Progress("features, images", total) as progress:
-        for row in parallel(one, frames, threads):
-            rows.append(row)
+        for features in (workers or Threads(threads)).map(extract_features, missing()):
+            k = under_way.popleft()
+            found[k] = features
+            if cache:
+                cache.keep_features(keys[k], features)
             progress.step()
-    if len(rows) < 2:
-        raise InputError(f"a map needs at least 2 frames; the input has {len(rows)}")
-    names = [row[0] for row in rows]
+    if len(names) < 2:
+        raise InputError(f"a map needs at least 2 frames; the input has {len(names)}")
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"two frames are named '{twice}'")
+    described = [features for features in found if features is not None]
     return Images(
         names=names,
-        time_ns=np.array([row[1] for row in rows], dtype=np.int64),
-        features=[row[2] for row in rows],
-        pinhole_px=[camera.undistort_to_pinhole(row[2].keypoints_px) for row in rows],
+        time_ns=np.array(times, dtype=np.int64),
+        features=described,
+        pinhole_px=[camera.undistort_to_pinhole(features.keypoints_px) for features in described],
+        keys=keys,
     )
+
+
+def extract_features(settings: MappingSettings, image: npt.NDArray[np.uint8]) -> Features:
+    """The features of a grey image (H, W), by an extractor that each thread has for itself."""
+    if getattr(_LOCAL, "settings", None) != settings:
+        _LOCAL.extractor, _LOCAL.settings = extractor_of(settings), settings
+    extractor: Extractor = _LOCAL.extractor
+    return extractor.extract(image)
 
 
 def extractor_of(settings: MappingSettings) -> Extractor:
     """As the settings say. A network gets one thread: pictures are described beside each other."""
     return extractors.create(settings.features, settings.max_features, learned=settings.learned)
+
+
+def _check_size(frame: Frame, camera: Camera) -> None:
+    if frame.image.shape != (camera.height_px, camera.width_px):
+        height, width = frame.image.shape[:2]
+        raise MapError(
+            f"{frame.name}: is {width}x{height} pixels, "
+            f"the camera {camera.width_px}x{camera.height_px}"
+        )

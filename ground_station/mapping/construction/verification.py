@@ -2,15 +2,63 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
 from ground_station.errors import MapError
 from ground_station.features.rootsift import RootSift
 from ground_station.geometry.camera import Camera
+from ground_station.mapping.construction import content
+from ground_station.mapping.construction import pairs as choice
+from ground_station.mapping.construction.cache import Cache, Known
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView, mutual_matches, verify
-from ground_station.mapping.construction.pairs import choose_pairs
-from ground_station.mapping.construction.workers import parallel
+from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Pair = tuple[int, int]
+Side = tuple[F32, F64]
+"""What a comparison needs of an image: descriptors (N, D) and undistorted pixels (N, 2)."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What counts as a match, and how much two images must share."""
+
+    ratio: float
+    error_px: float
+    planar_ratio: float
+    min_inliers: int
+    min_inlier_ratio: float = 0.0
+    preview: int = 0
+    preview_matches: int = 0
+
+
+def rules_of(settings: MappingSettings, far: bool) -> Rules:
+    """The settings' rules for neighbours in time, or for images far apart."""
+    wanted = settings.match
+    # Lowe's 0.8 is for SIFT. Of ALIKE's matches in the sample's mapping flight it leaves a third:
+    # 47 verified pairs of 32 pictures, where 0.95 leaves 111.
+    ratio = wanted.ratio if settings.features == RootSift.name else wanted.ratio_others
+    if not far:
+        return Rules(ratio, wanted.error_px, wanted.planar_ratio, wanted.min_inliers)
+    return Rules(
+        ratio,
+        wanted.error_px,
+        wanted.planar_ratio,
+        wanted.min_inliers_far,
+        wanted.min_inlier_ratio,
+        wanted.preview,
+        wanted.preview_matches,
+    )
 
 
 def match(
@@ -18,53 +66,147 @@ def match(
     camera: Camera,
     settings: MappingSettings,
     threads: int,
-) -> dict[tuple[int, int], TwoView]:
-    """Verified pairs (i, j) of images; raises `MapError` when no two images overlap."""
+    *,
+    cache: Cache | None = None,
+    workers: Workers | None = None,
+) -> dict[Pair, TwoView]:
+    """Verified pairs (i, j) of images; raises `MapError` when no two images overlap.
+
+    What `cache` holds is not compared again. Where not every pair is compared, a second round
+    tries those that images seen by both bring near each other.
+    """
     descriptors = [features.descriptors for features in images.features]
-    wanted = settings.match
-    # Lowe's 0.8 is for SIFT. Of ALIKE's matches in the sample's mapping flight it leaves a third:
-    # 47 verified pairs of 32 pictures, where 0.95 leaves 111.
-    ratio = wanted.ratio if settings.features == RootSift.name else wanted.ratio_others
-    matrix = camera.matrix
-
-    def one(pair: tuple[int, int]) -> tuple[tuple[int, int], TwoView | None]:
-        i, j = pair
-        far = j - i > wanted.neighbours
-        # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
-        # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
-        if far and wanted.preview:
-            first, second = (descriptors[k][: wanted.preview] for k in pair)
-            if len(mutual_matches(first, second, ratio)) < wanted.preview_matches:
-                return pair, None
-        matches = mutual_matches(descriptors[i], descriptors[j], ratio)
-        least = wanted.min_inliers_far if far else wanted.min_inliers
-        if len(matches) < least:
-            return pair, None
-        view = verify(
-            images.pinhole_px[i],
-            images.pinhole_px[j],
-            matches,
-            matrix,
-            error_px=wanted.error_px,
-            planar_ratio=wanted.planar_ratio,
-        )
-        if view is None or len(view.matches) < least:
-            return pair, None
-        # Repeated patterns look alike without sharing a geometry.
-        if far and len(view.matches) < wanted.min_inlier_ratio * len(matches):
-            return pair, None
-        return pair, view
-
-    pairs = choose_pairs(descriptors, wanted, settings.seed)
-    verified: dict[tuple[int, int], TwoView] = {}
-    with Progress("matching, pairs", len(pairs)) as progress:
-        for pair, view in parallel(one, pairs, threads):
-            if view is not None:
-                verified[pair] = view
-            progress.step()
+    sequence = choice.sequences(images.names, images.time_ns)
+    chosen = choice.choose_pairs(descriptors, settings.match, settings.seed, sequence)
+    workers = workers or Threads(threads)
+    sides = list(zip(descriptors, images.pinhole_px, strict=True))
+    with workers.shared(sides) as shared:
+        run = _Comparison(images, shared, camera, settings, sequence, cache, workers)
+        verified = run.compare(chosen, "matching, pairs")
+        if settings.match.covisible and not choice.is_exhaustive(len(descriptors), settings.match):
+            linked = {pair: len(view.matches) for pair, view in verified.items()}
+            more = choice.covisible_pairs(len(descriptors), chosen, linked, settings.match)
+            verified |= run.compare(more, "matching, pairs seen together")
+    if cache:
+        cache.flush()
     if not verified:
         raise MapError(
             f"no two of the {len(images.names)} images overlap: "
-            f"no pair has {wanted.min_inliers} verified matches"
+            f"no pair has {settings.match.min_inliers} verified matches"
         )
-    return verified
+    return dict(sorted(verified.items()))
+
+
+def verify_pair(first: Side, second: Side, rules: Rules, camera_matrix: F64) -> TwoView | None:
+    """The geometry that two images share by the rules, or None."""
+    # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
+    # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
+    if rules.preview:
+        strongest = (side[0][: rules.preview] for side in (first, second))
+        if len(mutual_matches(*strongest, rules.ratio)) < rules.preview_matches:
+            return None
+    matches = mutual_matches(first[0], second[0], rules.ratio)
+    if len(matches) < rules.min_inliers:
+        return None
+    view = verify(
+        first[1],
+        second[1],
+        matches,
+        camera_matrix,
+        error_px=rules.error_px,
+        planar_ratio=rules.planar_ratio,
+    )
+    if view is None or len(view.matches) < rules.min_inliers:
+        return None
+    # Repeated patterns look alike without sharing a geometry.
+    if len(view.matches) < rules.min_inlier_ratio * len(matches):
+        return None
+    return view
+
+
+def verify_pairs(
+    pairs: Sequence[tuple[int, int, Rules]], camera_matrix: F64, *sides: Side
+) -> list[TwoView | None]:
+    """`verify_pair` of each (i, j, rules), i and j indices into `sides`."""
+    return [verify_pair(sides[i], sides[j], rules, camera_matrix) for i, j, rules in pairs]
+
+
+class _Comparison:
+    """Compares pairs of one build's images: what the cache knows, and the workers for the rest."""
+
+    def __init__(
+        self,
+        images: Images,
+        sides: Sequence[Any],
+        camera: Camera,
+        settings: MappingSettings,
+        sequence: npt.NDArray[np.int64],
+        cache: Cache | None,
+        workers: Workers,
+    ) -> None:
+        self._images, self._sides, self._sequence = images, sides, sequence
+        self._matrix = camera.matrix
+        self._neighbours = settings.match.neighbours
+        self._rules = {far: rules_of(settings, far) for far in (False, True)}
+        self._how = {far: content.comparison(camera, rules) for far, rules in self._rules.items()}
+        self._cache, self._workers = cache, workers
+
+    def compare(self, pairs: Sequence[Pair], label: str) -> dict[Pair, TwoView]:
+        """The pairs that share a geometry."""
+        verified: dict[Pair, TwoView] = {}
+        under_way: deque[list[Pair]] = deque()
+        with Progress(label, len(pairs)) as progress:
+
+            def note(pair: Pair, view: TwoView | None) -> None:
+                if view is not None:
+                    verified[pair] = view
+                progress.step()
+
+            def missing() -> Iterator[list[Pair]]:
+                batch: list[Pair] = []
+                for pair in pairs:
+                    known = self._known(pair)
+                    if known is not None:
+                        note(pair, known.view)
+                        continue
+                    batch.append(pair)
+                    if len(batch) == self._workers.batch:
+                        yield batch
+                        batch = []
+                if batch:
+                    yield batch
+
+            def calls() -> Iterator[tuple[Any, ...]]:
+                for batch in missing():
+                    under_way.append(batch)
+                    yield self._call(batch)
+
+            for views in self._workers.map(verify_pairs, calls()):
+                for pair, view in zip(under_way.popleft(), views, strict=True):
+                    if self._cache:
+                        self._cache.keep_view(self._key(pair), view)
+                    note(pair, view)
+        return verified
+
+    def _is_far(self, pair: Pair) -> bool:
+        i, j = pair
+        return j - i > self._neighbours or bool(self._sequence[i] != self._sequence[j])
+
+    def _key(self, pair: Pair) -> bytes:
+        i, j = pair
+        keys = self._images.keys
+        return content.pair_key(keys[i], keys[j], self._how[self._is_far(pair)])
+
+    def _known(self, pair: Pair) -> Known | None:
+        if not self._cache:
+            return None
+        i, j = pair
+        counts = len(self._images.features[i]), len(self._images.features[j])
+        return self._cache.view(self._key(pair), counts)
+
+    def _call(self, batch: Sequence[Pair]) -> tuple[Any, ...]:
+        """The arguments of `verify_pairs`, with each image once."""
+        used = sorted({k for pair in batch for k in pair})
+        place = {k: n for n, k in enumerate(used)}
+        rows = [(place[i], place[j], self._rules[self._is_far((i, j))]) for i, j in batch]
+        return rows, self._matrix, *(self._sides[k] for k in used)

@@ -1,28 +1,136 @@
-"""Work spread over the cores: results in order, with a bounded number of items in memory."""
+"""Who does a build's work: threads here, or a Dask cluster. Results come in the items' order."""
 
 from __future__ import annotations
 
-import itertools
+import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, Protocol, TypeVar
 
-In = TypeVar("In")
+from ground_station.errors import InputError
+from ground_station.mapping.settings import MappingSettings
+
 Out = TypeVar("Out")
+Sent = TypeVar("Sent")
+
+_MOST_LOCAL = 256
+_ROUNDS_UNDER_WAY = 4
+"""Items under way for each that works at a time: enough that nobody waits, and few in memory."""
 
 
-def parallel(function: Callable[[In], Out], items: Iterable[In], threads: int) -> Iterator[Out]:
-    """`map` on a few threads, results in order, with a bounded number of items in memory."""
-    waiting: deque[Future[Out]] = deque()
+class Workers(Protocol):
+    """Calls functions beside each other.
+
+    `name` is what map.toml says of them; `batch` is how many small things make one call worth
+    sending.
+    """
+
+    name: str
+    batch: int
+
+    def shared(self, values: Sequence[Any]) -> AbstractContextManager[Sequence[Any]]:
+        """Gives, for values that many calls need, what stands for each among their arguments."""
+        ...
+
+    def map(self, function: Callable[..., Out], items: Iterable[Sequence[Any]]) -> Iterator[Out]:
+        """`function(*item)` of each item, in order, with a bounded number in memory.
+
+        When the items end in an error, it is raised after the results of those before it.
+        """
+        ...
+
+
+class Threads:
+    """Threads of this process."""
+
+    batch = 1
+
+    def __init__(self, count: int) -> None:
+        self.name = f"{count} threads"
+        self._count = count
+
+    @contextmanager
+    def shared(self, values: Sequence[Any]) -> Iterator[Sequence[Any]]:
+        """The values themselves: threads see the same memory."""
+        yield values
+
+    def map(self, function: Callable[..., Out], items: Iterable[Sequence[Any]]) -> Iterator[Out]:
+        """As `Workers.map`; a call that raises ends the others."""
+        with ThreadPoolExecutor(self._count) as pool:
+
+            def send(item: Sequence[Any]) -> Future[Out]:
+                return pool.submit(function, *item)
+
+            try:
+                yield from in_order(items, send, Future.result, under_way(self._count))
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+
+def under_way(count: int) -> int:
+    """How many items may be under way where so many are worked on at a time."""
+    return _ROUNDS_UNDER_WAY * count
+
+
+def in_order(
+    items: Iterable[Sequence[Any]],
+    send: Callable[[Sequence[Any]], Sent],
+    receive: Callable[[Sent], Out],
+    most: int,
+) -> Iterator[Out]:
+    """What is received for each item that was sent, in order, with at most `most` under way.
+
+    When the items end in an error, what was sent before it is received first: it can be kept.
+    """
+    waiting: deque[Sent] = deque()
     iterator = iter(items)
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in itertools.islice(iterator, 4 * threads):
-                waiting.append(pool.submit(function, item))
-            while waiting:
-                yield waiting.popleft().result()
-                for item in itertools.islice(iterator, 1):
-                    waiting.append(pool.submit(function, item))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    failure: Exception | None = None
+    more = True
+    while more or waiting:
+        while more and len(waiting) < most:
+            try:
+                item = next(iterator)
+            except StopIteration:
+                more = False
+            except Exception as error:
+                more, failure = False, error
+            else:
+                waiting.append(send(item))
+        if waiting:
+            yield receive(waiting.popleft())
+    if failure is not None:
+        raise failure
+
+
+def parse_cluster(text: str) -> str | int:
+    """What `--dask` says: an address `tcp://…` or `tls://…`, or a number of processes here.
+
+    Raises `InputError` with one line.
+    """
+    if re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", text, re.ASCII):
+        return text
+    if re.fullmatch(r"\d{1,4}", text, re.ASCII) and 1 <= int(text) <= _MOST_LOCAL:
+        return int(text)
+    raise InputError(
+        f"--dask is {text!r:.60}; allowed: tcp://HOST:PORT, tls://HOST:PORT "
+        f"or 1 to {_MOST_LOCAL} processes on this machine"
+    )
+
+
+def open_workers(
+    dask: str | None, threads: int, settings: MappingSettings
+) -> AbstractContextManager[Workers]:
+    """The workers that `--dask` asks for, by default so many threads.
+
+    Raises `InputError` for what it cannot be, `MapError` where no cluster answers or one of its
+    workers has another version than this machine.
+    """
+    if dask is None:
+        return nullcontext(Threads(threads))
+    where = parse_cluster(dask)
+    # Imported only when asked for: it takes a second, and most builds need none.
+    from ground_station.mapping.construction.cluster import connected
+
+    return connected(where, settings)

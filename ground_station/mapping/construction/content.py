@@ -1,0 +1,99 @@
+"""What a build knows its parts by: hashes of exactly what each is made from.
+
+A part that has been made is found again by its hash, under whatever name its image came; a setting
+that changes leads to new hashes of what it touches, and of nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.features.extractor import Extractor
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.settings import MappingSettings
+
+if TYPE_CHECKING:
+    from ground_station.mapping.construction.images import Images
+    from ground_station.mapping.construction.verification import Rules
+
+_FEATURES, _PAIR, _STRUCTURE = b"blimp features 1\n", b"blimp pair 1\n", b"blimp structure 1\n"
+"""Counted on when the same input gives another result: what was made before is then made anew."""
+
+
+def extraction(extractor: Extractor, settings: MappingSettings) -> bytes:
+    """What, besides an image, decides which features come of it; one line for `features_key`."""
+    document: dict[str, Any] = {
+        "extractor": extractor.name,
+        "sha256": extractor.sha256,
+        "max_features": settings.max_features,
+        "opencv": cv2.__version__,
+    }
+    if hasattr(extractor, "threshold"):  # a network's: methods have no such choice
+        import onnxruntime
+
+        document |= {
+            "nms_px": getattr(extractor, "nms_px", None),
+            "threshold": extractor.threshold,
+            "provider": settings.learned.provider,
+            "onnxruntime": onnxruntime.__version__,
+        }
+    return _line(document)
+
+
+def features_key(image: npt.NDArray[np.uint8], how: bytes) -> bytes:
+    """The hash, 32 bytes, of the features of an image (H, W) that come of `extraction`."""
+    size = b"x".join(str(length).encode() for length in image.shape)
+    return hashlib.sha256(_FEATURES + how + size + b"\n" + image.tobytes()).digest()
+
+
+def comparison(camera: Camera, rules: Rules) -> bytes:
+    """What, besides their features, decides a pair's geometry; one line for `pair_key`."""
+    lens = {name: value for name, value in camera.as_dict().items() if name != "readout_s"}
+    return _line({"camera": lens, "rules": asdict(rules), "opencv": cv2.__version__})
+
+
+def pair_key(first: bytes, second: bytes, how: bytes) -> bytes:
+    """The hash, 32 bytes, of the geometry of two images, by their features' and `comparison`."""
+    return hashlib.sha256(_PAIR + how + first + second).digest()
+
+
+def structure_key(
+    images: Images,
+    pairs: Mapping[tuple[int, int], TwoView],
+    camera: Camera,
+    settings: MappingSettings,
+) -> str:
+    """The hash, as text, of all that structure from motion starts from, its seed included."""
+    digest = hashlib.sha256(_STRUCTURE)
+    document = {
+        "names": images.names,
+        "camera": camera.as_dict(),
+        "sfm": asdict(settings.sfm),
+        "match": asdict(settings.match),
+        "seed": settings.seed,
+        "pycolmap": version("pycolmap"),
+        "pairs": [[i, j, len(v.matches), v.degenerate] for (i, j), v in sorted(pairs.items())],
+        "keypoints": [len(pixels) for pixels in images.pinhole_px],
+    }
+    digest.update(_line(document))
+    digest.update(images.time_ns.tobytes())
+    for pixels in images.pinhole_px:
+        digest.update(pixels.tobytes())
+    for _, view in sorted(pairs.items()):
+        for array in (view.matches, view.essential, view.homography):
+            digest.update(b"none" if array is None else array.tobytes())
+    return digest.hexdigest()
+
+
+def _line(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, sort_keys=True, allow_nan=False).encode() + b"\n"
