@@ -71,6 +71,11 @@ class MatchSettings:
 class SfmSettings:
     """Structure from motion and what is kept of it."""
 
+    method: str = config.key(
+        "incremental",
+        "of structure from motion; auto: global, and incremental where that leaves images out",
+        choices=("incremental", "global", "auto"),
+    )
     refine_camera: bool = config.key(False, "refine the focal lengths, too")
     min_tri_angle_deg: float = config.key(
         1.5, "a landmark's largest angle between two sights", unit="deg", low=0.0, high=45.0
