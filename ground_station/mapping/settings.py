@@ -2,13 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ground_station.features.settings import LearnedSettings
 from pi_firmware.wire import config
 
 SHIPPED = Path(__file__).with_name("mapping.toml")
+
+
+@dataclass(frozen=True)
+class KeyframeSettings:
+    """Which frames of a long input become images."""
+
+    choose_above: int = config.key(
+        160, "inputs of together no more frames are used whole", unit="frames", low=0, high=1000000
+    )
+    parallax_deg: float = config.key(
+        2.0, "a keyframe is due when the camera moved so far, seen from what it sees", unit="deg",
+        low=0.1, high=45.0,
+    )  # fmt: skip
+    turn_deg: float = config.key(
+        6.0, "or turned so far, since the last one", unit="deg", low=0.5, high=90.0
+    )
+    lost: float = config.key(
+        0.35, "or so large a share of what it saw is no longer seen", low=0.05, high=0.75
+    )
+    min_sharpness: float = config.key(
+        0.65, "a frame less sharp than this share of those around it is blurred", low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """Which images of a COLMAP model are compared."""
+
+    min_shared: int = config.key(
+        15, "of the model, that two images share which are compared", unit="points",
+        low=1, high=10000,
+    )  # fmt: skip
+    covisible: int = config.key(
+        30, "each with so many that share most", unit="images", low=1, high=1000
+    )
 
 
 @dataclass(frozen=True)
@@ -148,7 +185,7 @@ class MappingSettings:
     )
     max_images: int = config.key(
         160,
-        "without a step in the range, every n-th frame, so that so many are left",
+        "of a longer input the keyframes, at most so many; a step in the range goes before",
         unit="images",
         low=2,
         high=5000,
@@ -161,11 +198,31 @@ class MappingSettings:
         low=0.0, high=10000.0,
     )  # fmt: skip
     learned: LearnedSettings = field(default_factory=LearnedSettings)
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     match: MatchSettings = field(default_factory=MatchSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
+    importing: ImportSettings = field(default_factory=ImportSettings)
 
 
 def load_settings(path: str | Path | None = None) -> MappingSettings:
     """Reads a settings file, the shipped one by default; raises `ConfigError` with one line."""
     return config.load(path or SHIPPED, MappingSettings)
+
+
+def with_changes(
+    settings: MappingSettings, changes: Mapping[str, Any], where: str
+) -> MappingSettings:
+    """The settings with other values for some keys, as `seed` or `match.pairs`; None changes none.
+
+    Raises `ConfigError` with one line that begins with `where`, by the same checks as a file's.
+    """
+    document = asdict(settings)
+    for name, value in changes.items():
+        *tables, key = name.split(".")
+        table = document
+        for inner in tables:
+            table = table[inner]
+        if value is not None:
+            table[key] = value
+    return config.from_mapping(document, MappingSettings, where=where)
