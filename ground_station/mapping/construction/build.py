@@ -45,8 +45,8 @@ def build_map(
     `total` is the number of frames if known, `built` what map.toml shall say of the inputs. With a
     `cache`, what an earlier build has made is not made again, one that was killed included.
     `workers` extract and match, by default threads of this process. Raises `InputError` when there
-    are fewer than two frames, `MapError` when sizes differ from the camera's, images do not overlap,
-    or structure from motion fails.
+    are fewer than two frames, `MapError` when sizes differ from the camera's, images do not
+    overlap, or structure from motion fails.
     """
     out = Path(out)
     threads = settings.threads or os.cpu_count() or 1
@@ -55,9 +55,7 @@ def build_map(
     # What lasts is let go of only when the map is in its place.
     with ExitStack() as held, replacing(out) as folder:
         with _timed(stage_s, "features"):
-            images = extract(
-                frames, camera, settings, threads, total, cache=cache, workers=workers
-            )
+            images = extract(frames, camera, settings, threads, total, cache=cache, workers=workers)
         with _timed(stage_s, "match"):
             pairs = match(images, camera, settings, threads, cache=cache, workers=workers)
         work = None

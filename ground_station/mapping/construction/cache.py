@@ -32,7 +32,7 @@ _FORMAT = 1
 """In the file's name: a program that keeps another layout has a file of its own."""
 _BUSY_S = 30.0
 """Another build writes for milliseconds; one that was stopped in the middle must not stop us."""
-_COMMIT_S, _COMMIT_BYTES = 0.5, 16 << 20
+_COMMIT_S, _COMMIT_BYTES = 0.1, 16 << 20
 """What is made is on disk at the latest so long, or so much, after it was: a kill costs no more."""
 _PRUNED_SHARE = 0.9
 """Of the size allowed, what is left when the oldest entries go: they don't go one by one."""

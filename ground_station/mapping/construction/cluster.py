@@ -66,7 +66,9 @@ def _difference(theirs: Versions, ours: Versions) -> str | None:
     return None
 
 
-def checked(ours: Versions, settings: MappingSettings, function: Callable[..., Out], *args: Any) -> Out:
+def checked(
+    ours: Versions, settings: MappingSettings, function: Callable[..., Out], *args: Any
+) -> Out:
     """Calls a function in a worker, which may have come when the others had been looked at."""
     if difference := _difference(versions(settings), ours):
         raise MapError(f"a worker {difference}; a map is made of one")

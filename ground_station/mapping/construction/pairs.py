@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import cv2
@@ -26,7 +27,7 @@ def sequences(names: Sequence[str], time_ns: I64) -> I64:
     image before is no neighbour then.
     """
     inputs = [name.rpartition("/")[0] for name in names]
-    another = np.array([a != b for a, b in zip(inputs, inputs[1:], strict=False)], dtype=bool)
+    another = np.array([a != b for a, b in itertools.pairwise(inputs)], dtype=bool)
     return np.concatenate([[0], np.cumsum(another | (np.diff(time_ns) < 0))]).astype(np.int64)
 
 

@@ -1,0 +1,99 @@
+"""Neighbours are of one input, look-alikes are found, and a second round closes what links show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ground_station.mapping.construction.pairs import choose_pairs, covisible_pairs, sequences, vlad
+from ground_station.mapping.settings import MatchSettings
+
+RNG = np.random.default_rng(5)
+
+
+def _unit(values):
+    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _images(n):
+    return [_unit(RNG.normal(size=(30, 16))) for _ in range(n)]
+
+
+def test_another_input_or_time_that_falls_back_begins_another_sequence():
+    names = ["a/0", "a/1", "b/0", "b/1", "b/2"]
+    assert sequences(names, np.arange(5) * 100).tolist() == [0, 0, 1, 1, 1]
+    assert sequences(["0", "1", "2"], np.array([0, 5, 5])).tolist() == [0, 0, 0]
+    assert sequences(["0", "1", "2"], np.array([0, 5, 2])).tolist() == [0, 0, 1]
+    # A camera that stood still for an hour is still where it was.
+    assert sequences(["0", "1", "2"], np.array([0, 5, 3_600_000_000_000])).tolist() == [0, 0, 0]
+    assert sequences(["0"], np.array([7])).tolist() == [0]
+
+
+def test_neighbours_are_of_one_sequence():
+    settings = MatchSettings(exhaustive_max=2, neighbours=2, similar=0)
+    pairs = choose_pairs(_images(7), settings, 0, np.array([0, 0, 0, 1, 1, 1, 1]))
+    assert pairs == [(0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5), (4, 6), (5, 6)]
+
+
+def test_images_of_two_inputs_that_look_alike_are_compared():
+    places = _images(6)
+    again = [_unit(p + 0.05 * RNG.normal(size=p.shape)) for p in places]
+    settings = MatchSettings(exhaustive_max=2, neighbours=1, similar=1)
+    pairs = choose_pairs(places + again, settings, 0, np.repeat([0, 1], 6))
+    assert {(k, k + 6) for k in range(6)} <= set(pairs)
+    # The end of one and the beginning of the other are compared only if they look alike.
+    unlike = choose_pairs(_images(4), MatchSettings(exhaustive_max=2, neighbours=1, similar=0), 0,
+                          np.array([0, 0, 1, 1]))  # fmt: skip
+    assert unlike == [(0, 1), (2, 3)]
+
+
+def test_every_pair_is_compared_by_choice():
+    images = _images(9)
+    chosen = choose_pairs(images, MatchSettings(pairs="exhaustive", exhaustive_max=2), 0)
+    assert chosen == [(i, j) for i in range(9) for j in range(i + 1, 9)]
+
+
+def test_images_without_features_are_like_nothing():
+    dark = [np.empty((0, 16), np.float32)] * 5
+    assert not vlad(dark, 0).any()
+    settings = MatchSettings(exhaustive_max=2, neighbours=1, similar=2)
+    assert {(k, k + 1) for k in range(4)} <= set(choose_pairs(dark, settings, 0))
+    some = vlad([*_images(3), *dark], 0)
+    assert np.allclose(np.linalg.norm(some, axis=1), [1, 1, 1, 0, 0, 0, 0, 0], atol=1e-5)
+
+
+def _links(*links):
+    return {(i, j): matches for i, j, matches in links}
+
+
+def test_images_that_a_third_one_has_seen_are_compared_next():
+    settings = MatchSettings(min_inliers_far=30, covisible=5)
+    linked = _links((0, 1, 80), (1, 2, 60), (2, 3, 20))  # the last link is weak
+    assert covisible_pairs(5, [*linked, (0, 4)], linked, settings) == [(0, 2)]
+    # What was tried and failed is not tried again.
+    assert covisible_pairs(5, [*linked, (0, 2)], linked, settings) == []
+    assert covisible_pairs(4, [], {}, settings) == []
+
+
+def test_each_image_takes_those_with_the_strongest_links_in_common():
+    # 0 is linked to 1 and 2; 3 to both, 4 strongly to one, 5 weakly to one.
+    linked = _links((0, 1, 90), (0, 2, 90), (1, 3, 50), (2, 3, 50), (1, 4, 80), (2, 5, 35))
+
+    def of_first(most):
+        settings = MatchSettings(min_inliers_far=30, covisible=most)
+        pairs = covisible_pairs(6, list(linked), linked, settings)
+        assert all(i < j for i, j in pairs) and not set(pairs) & set(linked)
+        return pairs
+
+    assert (0, 3) in of_first(1)  # 50 + 50
+    assert {(0, 3), (0, 4)} <= set(of_first(2))
+    assert {(0, 3), (0, 4), (0, 5)} <= set(of_first(3))
+
+
+def test_the_second_round_is_bounded():
+    # A hub that sees everything would bring every pair.
+    n = 60
+    linked = {(0, j): 50 + j for j in range(1, n)}
+    settings = MatchSettings(min_inliers_far=30, covisible=3)
+    pairs = covisible_pairs(n, list(linked), linked, settings)
+    assert 0 < len(pairs) <= 3 * n
+    assert pairs == sorted(set(pairs))
