@@ -17,8 +17,8 @@ if os.environ.get("CI"):
     settings.load_profile("ci")
 
 _ROOMS = {
-    "calibration", "cli", "deploy", "evaluation", "experiments", "features", "fuzz", "geometry", "hw",
-    "localization", "mapping", "maps", "recording", "simulator", "wire",
+    "calibration", "cli", "deploy", "evaluation", "experiments", "features", "fuzz", "geometry",
+    "hw", "localization", "mapping", "maps", "recording", "simulator", "wire",
 }  # fmt: skip
 """Rooms in whose tests nothing flies: no program that another one disturbs by using a core."""
 
