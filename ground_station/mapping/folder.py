@@ -41,6 +41,13 @@ def kept_name(folder: Path) -> Path:
     return next(path for path in map(folder.with_name, names) if not os.path.lexists(path))
 
 
+def carry_floorplan(source: Path, target: Path) -> None:
+    """Copies a map's floor plan, where it has one, into the folder of a map made from it."""
+    for name in ("floorplan.png", "floorplan.yaml"):
+        if (source / name).is_file():
+            shutil.copy2(source / name, target / name)
+
+
 @contextmanager
 def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
     """Gives an empty folder beside `folder`, which takes its place when the block ends well.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,16 @@ from safetensors.numpy import save
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.mapping import compact
 from ground_station.mapping.descriptors import Descriptors, open_descriptors, quantised
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
 FORMAT = 1
 """Raised when a reader of the older layout would misread a newer map."""
+
+COMPACT = 2
+"""The format of a compressed map: its tables are `compact`'s, and stay so when it is written."""
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -74,7 +79,7 @@ class Keyframes:
 
 @dataclass
 class MapInfo:
-    """What `map.toml` says. `built`, `registration` and `refined` are tables of plain values."""
+    """What `map.toml` says. The tables at the end are of plain values."""
 
     features: str
     features_sha256: str
@@ -89,6 +94,8 @@ class MapInfo:
     built: dict[str, Any] = field(default_factory=dict)
     registration: dict[str, Any] = field(default_factory=dict)
     refined: dict[str, Any] = field(default_factory=dict)
+    compressed: dict[str, Any] = field(default_factory=dict)
+    """What `blimp map compress` did; empty for a map that is whole."""
 
     @property
     def registered(self) -> bool:
@@ -106,9 +113,8 @@ class Map:
     folder: Path | None = None
 
 
-# dtype and shape after the first axis
-_Layout = dict[str, tuple[str, tuple[int, ...]]]
-_LANDMARKS: _Layout = {
+_Arrays = compact.Arrays
+_LANDMARKS: compact.Layout = {
     "id": ("int64", ()),
     "position_m": ("float64", (3,)),
     "covariance_m2": ("float32", (3, 3)),
@@ -118,7 +124,7 @@ _LANDMARKS: _Layout = {
     "distance_m": ("float32", (2,)),
     "observations": ("int32", ()),
 }
-_KEYFRAMES: _Layout = {
+_KEYFRAMES: compact.Layout = {
     "time_ns": ("int64", ()),
     "wTc": ("float64", (4, 4)),
     "offset": ("int64", ()),
@@ -132,19 +138,20 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
 
     Each is written beside and renamed; `map.toml` comes last, so a folder without it is no map.
     """
-    lm, kf = map_.landmarks, map_.keyframes
+    lm, kf, info = map_.landmarks, map_.keyframes, map_.info
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
-    if quantise:
+    sights: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}
+    if info.format == COMPACT:
+        arrays = compact.pack_landmarks(arrays) | quantised(lm.descriptor, coded=True)
+        sights = compact.pack_keyframes(sights)
+    elif quantise:
         arrays |= quantised(lm.descriptor)
     else:
         arrays["descriptor"] = np.asarray(lm.descriptor, np.float32)
-    _save(folder / "landmarks.safetensors", arrays, {"format": str(FORMAT)})
-    _save(
-        folder / "keyframes.safetensors",
-        {name: getattr(kf, name) for name in _KEYFRAMES},
-        {"format": str(FORMAT), "names": "\n".join(kf.names)},
-    )
-    info = map_.info
+    form = str(info.format)
+    _save(folder / "landmarks.safetensors", arrays, {"format": form})
+    names = "\n".join(kf.names)
+    _save(folder / "keyframes.safetensors", sights, {"format": form, "names": names})
     document = {
         "format": info.format,
         "name": info.name,
@@ -160,6 +167,8 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
         "registration": info.registration,
         "refined": info.refined,
     }
+    if info.compressed:
+        document["compressed"] = info.compressed
     path = folder / "map.toml"
     part = folder / "map.toml.part"
     part.write_bytes(tomli_w.dumps(document).encode())
@@ -183,8 +192,11 @@ def load_info(folder: str | Path) -> MapInfo:
         features, camera = document.get("features"), document.get("camera")
         if not isinstance(features, dict) or not isinstance(camera, dict):
             raise MapError(f"{path}: the tables 'features' and 'camera' are needed")
-        if document.get("format") != FORMAT:
-            raise MapError(f"{path}: format {document.get('format')}; this program reads {FORMAT}")
+        if document.get("format") not in (FORMAT, COMPACT):
+            raise MapError(
+                f"{path}: format {document.get('format')}; "
+                f"this program reads {FORMAT} and {COMPACT}"
+            )
         return MapInfo(
             features=str(features.get("name")),
             features_sha256=str(features.get("sha256")),
@@ -196,6 +208,8 @@ def load_info(folder: str | Path) -> MapInfo:
             built=dict(document.get("built", {})),
             registration=dict(document.get("registration", {})),
             refined=dict(document.get("refined", {})),
+            compressed=dict(document.get("compressed", {})),
+            format=int(document["format"]),
         )
     except ConfigError as error:
         raise MapError(str(error)) from None
@@ -208,14 +222,12 @@ def load(folder: str | Path) -> Map:
     folder = Path(folder)
     info = load_info(folder)
     path = folder / "landmarks.safetensors"
-    arrays, _ = _read(path, _LANDMARKS)
+    arrays = _landmarks(path, info.format)
     m = len(arrays["id"])
-    if any(len(value) != m for value in arrays.values()):
-        raise MapError(f"{path}: its arrays differ in length")
     descriptor = open_descriptors(path, m, info.dimension)
     landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
     path = folder / "keyframes.safetensors"
-    arrays, metadata = _read(path, _KEYFRAMES)
+    arrays, metadata = _keyframes(path, info.format)
     names = metadata.get("names", "").split("\n") if metadata.get("names") else []
     keyframes = Keyframes(names=names, **{name: arrays[name] for name in _KEYFRAMES})
     k, o = len(names), len(keyframes.landmark)
@@ -236,12 +248,37 @@ def load(folder: str | Path) -> Map:
 
 def load_positions(folder: str | Path) -> F64:
     """The landmarks' positions (M, 3) and nothing else of a map; raises as `load`."""
-    name = "position_m"
-    arrays, _ = _read(Path(folder) / "landmarks.safetensors", {name: _LANDMARKS[name]})
-    return arrays[name]
+    path, name = Path(folder) / "landmarks.safetensors", "position_m"
+    if load_info(folder).format == COMPACT:
+        return _landmarks(path, COMPACT)[name]
+    return _read(path, {name: _LANDMARKS[name]})[0][name]
 
 
-def _read(path: Path, wanted: _Layout) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
+def _landmarks(path: Path, form: int) -> _Arrays:
+    """The arrays of `_LANDMARKS`, of as many rows each."""
+    layout = compact.LANDMARKS if form == COMPACT else _LANDMARKS
+    arrays, _ = _read(path, layout | (compact.LANDMARK_UNITS if form == COMPACT else {}))
+    if len({len(arrays[name]) for name in layout}) > 1:
+        raise MapError(f"{path}: its arrays differ in length")
+    return _unpacked(path, compact.unpack_landmarks, arrays) if form == COMPACT else arrays
+
+
+def _keyframes(path: Path, form: int) -> tuple[_Arrays, dict[str, str]]:
+    """The arrays of `_KEYFRAMES`, and the file's metadata."""
+    if form != COMPACT:
+        return _read(path, _KEYFRAMES)
+    arrays, metadata = _read(path, compact.KEYFRAMES | compact.KEYFRAME_UNITS)
+    return _unpacked(path, compact.unpack_keyframes, arrays), metadata
+
+
+def _unpacked(path: Path, unpack: Callable[[_Arrays], _Arrays], arrays: _Arrays) -> _Arrays:
+    try:
+        return unpack(arrays)
+    except ValueError as error:
+        raise MapError(f"{path}: {error}") from None
+
+
+def _read(path: Path, wanted: compact.Layout) -> tuple[_Arrays, dict[str, str]]:
     try:
         with safe_open(path, framework="numpy") as file:
             names = [name for name in file.keys() if name in wanted]  # noqa: SIM118
@@ -254,10 +291,11 @@ def _read(path: Path, wanted: _Layout) -> tuple[dict[str, npt.NDArray[Any]], dic
         if name not in arrays:
             raise MapError(f"{path}: the array '{name}' is missing")
         array = arrays[name]
-        if str(array.dtype) != dtype or array.ndim == 0 or array.shape[1:] != shape:
+        if str(array.dtype) not in dtype.split("|") or array.ndim == 0 or array.shape[1:] != shape:
             rows = ", ".join(["N", *map(str, shape)])
             raise MapError(
-                f"{path}: '{name}' must be {dtype} ({rows}), not {array.dtype} {array.shape}"
+                f"{path}: '{name}' must be {dtype.replace('|', ' or ')} ({rows}), "
+                f"not {array.dtype} {array.shape}"
             )
         if not np.isfinite(array).all():
             raise MapError(f"{path}: '{name}' holds a value that is not finite")
