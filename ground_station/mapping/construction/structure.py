@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
@@ -14,46 +15,193 @@ from ground_station.mapping import landmarks
 from ground_station.mapping.construction.consistency import plausible_frames
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair, sequences
+from ground_station.mapping.construction.placing import chains, lookalikes, loops, merging
+from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings, SfmSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import colmap, global_mapping
+from ground_station.mapping.sfm.incremental import Incremental, Wanted
 from ground_station.progress import Progress
+
+_FOLDED = 0.1
+"""Share of images in the wrong place, or without one although their neighbours have one, from which
+on the rest of the model is doubtful, too."""
+_NEARLY_ALL = 0.95
+"""Share of the images that the global method must place for `auto` to be content with it."""
+
+Pairs = Mapping[Pair, TwoView]
 
 
 @dataclass(frozen=True)
 class Structure:
-    """The largest model, `sizes` of all models in images as they came, and the images dropped."""
+    """The largest model, `sizes` of all models in images, and the images dropped.
+
+    `notes`: lines for a person, on models that stay apart and images that changed their place.
+    """
 
     reconstruction: colmap.Reconstruction
     sizes: list[int]
     dropped: list[str]
+    notes: list[str] = field(default_factory=list)
 
 
 def reconstruct(
     images: Images,
-    pairs: Mapping[tuple[int, int], TwoView],
+    pairs: Pairs,
     camera: Camera,
     settings: MappingSettings,
     threads: int,
     work: Path,
 ) -> Structure:
-    """COLMAP's model of the images, in their order; `work` is a folder for its files.
+    """COLMAP's model of the images in the places where the chain of neighbours believes them.
 
-    Raises `MapError` when structure from motion finds none.
+    `work` is a folder for its files. What an earlier, killed run of the same inputs left there is
+    gone on from. Raises `MapError` when structure from motion finds no model.
     """
-    colmap.write_database(work / "database.db", camera, images.names, images.pinhole_px, pairs)
-    with Progress("structure from motion, images", len(images.names)) as progress:
-        models = colmap.incremental(
-            work / "database.db",
-            work / "models",
-            seed=settings.seed,
-            threads=threads,
-            images=len(images.names),
-            refine_camera=settings.sfm.refine_camera,
-            min_tri_angle_deg=settings.sfm.min_tri_angle_deg,
-            on_image=progress.step,
+    return _Reconstruction(images, camera, settings, threads, work).run(pairs)
+
+
+class _Reconstruction:
+    """The steps of one build; each keeps its files in a folder of its own."""
+
+    def __init__(
+        self, images: Images, camera: Camera, settings: MappingSettings, threads: int, work: Path
+    ) -> None:
+        self._images, self._camera, self._sfm, self._work = images, camera, settings.sfm, work
+        self._counts = [len(pixels) for pixels in images.pinhole_px]
+        self._sequence = sequences(images.names, images.time_ns)
+        self._wanted = Wanted(
+            settings.seed,
+            threads,
+            settings.sfm.refine_camera,
+            settings.sfm.min_tri_angle_deg,
+            len(images.names),
         )
-    dropped = _drop_implausible(models[0], images, settings.sfm.max_jump)
-    return Structure(models[0], [model.num_reg_images() for model in models], dropped)
+
+    def run(self, pairs: Pairs) -> Structure:
+        """Models, their judgement, and another try where the chain contradicts them."""
+        ordered = chains.in_order(self._sequence, pairs)
+        links = chains.links(self._counts, self._sequence, ordered, pairs)
+        models, notes = self._solve("all", pairs)
+        wrong = self._misplaced(models[0], links, pairs)
+        moved, placed = len(wrong), set(models[0].reg_image_ids())
+        missing = {k for link in links for k in link} - {image_id - 1 for image_id in placed}
+        doubtful = len(wrong) + len(missing) > _FOLDED * len(self._counts)
+        if doubtful and links and pairs.keys() - links:
+            trusted = self._trusted(links, pairs)
+            again, said = self._solve("trusted", trusted)
+            still = self._misplaced(again[0], links, trusted)
+            if again[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
+                models, notes, wrong, pairs = again, said, still, trusted
+        if wrong:
+            model = self._placed(models[0])
+            lies = lookalikes.refuted(model, wrong, links, pairs, self._images.pinhole_px)
+            colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
+            pairs = loops.among(pairs, pairs.keys() - lies)
+            models, notes = self._solve("replaced", pairs, start=models[0])
+            wrong = self._misplaced(models[0], links, pairs)
+            colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
+        self._drop_implausible(models[0], ordered)
+        gone = sorted(placed - set(models[0].reg_image_ids()))
+        if moved:
+            notes.append(
+                f"{moved} images stood where the images beside them do not see the same; "
+                f"{len(gone)} are left out, the others have other places now"
+            )
+        return Structure(
+            models[0],
+            [model.num_reg_images() for model in models],
+            [self._images.names[image_id - 1] for image_id in gone],
+            notes,
+        )
+
+    def _trusted(self, links: set[Pair], pairs: Pairs) -> Pairs:
+        """The pairs that agree with a model made of links alone."""
+        models, _ = self._solve("chain", loops.among(pairs, links), joining=pairs)
+        parts = [self._placed(model) for model in models]
+        return loops.among(pairs, loops.believed(parts, self._sequence, links, pairs))
+
+    def _solve(
+        self,
+        name: str,
+        pairs: Pairs,
+        *,
+        joining: Pairs | None = None,
+        start: colmap.Reconstruction | None = None,
+    ) -> tuple[list[colmap.Reconstruction], list[str]]:
+        """The models that pairs give, the largest first, and what is to say of the others.
+
+        Models are merged by the pairs `joining`, the same ones if none are given; the first one
+        goes on from `start`.
+        """
+        folder = self._work / name
+        folder.mkdir(parents=True, exist_ok=True)
+        database = folder / "database.db"
+        if not database.exists():
+            pixels = self._images.pinhole_px
+            colmap.write_database(database, self._camera, self._images.names, pixels, pairs)
+        count = len(self._images.names)
+        with Progress("structure from motion, images", count) as progress:
+            mapping = Incremental(database, folder, self._wanted, progress.step)
+            models: list[colmap.Reconstruction] = []
+            if self._sfm.method != "incremental" and start is None:
+                models = global_mapping.reconstruct(database, folder / "global", self._wanted)
+                most = max((model.num_reg_images() for model in models), default=0)
+                if self._sfm.method == "auto" and most < _NEARLY_ALL * count:
+                    models = []
+            models = models or mapping.run(start)
+        if not models:
+            raise MapError(
+                "structure from motion found no pair of images to start from: the camera must move "
+                "sideways between images that see the same things"
+            )
+        return self._merged(mapping, models, pairs if joining is None else joining)
+
+    def _merged(
+        self, mapping: Incremental, models: list[colmap.Reconstruction], pairs: Pairs
+    ) -> tuple[list[colmap.Reconstruction], list[str]]:
+        largest, *others = sorted(models, key=lambda model: -model.num_reg_images())
+        notes = []
+        again = True
+        while again and others:
+            again, apart, missing = False, [], []
+            for other in others:
+                source, target = self._placed(other), self._placed(largest)
+                if source.wTc.keys() <= target.wTc.keys():
+                    continue
+                junction = merging.junction(target, source, pairs, self._wanted.seed)
+                if junction.similarity is None:
+                    apart.append(other)
+                    missing.append(merging.describe(other, self._images.names, junction.missing))
+                    continue
+                new = merging.poses_in(source, junction.similarity, set(target.wTc))
+                largest = mapping.with_images(largest, new)
+                notes.append(f"a model of {len(source.wTc)} images joined to the largest")
+                again = True
+            others = apart
+        return [largest, *others], notes + (missing if others else [])
+
+    def _placed(self, model: colmap.Reconstruction) -> Placed:
+        return Placed.of(colmap.to_arrays(model), self._counts)
+
+    def _misplaced(self, model: colmap.Reconstruction, links: set[Pair], pairs: Pairs) -> set[int]:
+        return lookalikes.misplaced(self._placed(model), links, pairs, self._images.pinhole_px)
+
+    def _drop_implausible(
+        self, reconstruction: colmap.Reconstruction, ordered: npt.NDArray[np.bool_]
+    ) -> None:
+        """Drops images that are further off than the camera moves; of those in order only."""
+        model = colmap.to_arrays(reconstruction)
+        rays = model.position[model.point] - model.wTc[model.image, :3, 3]
+        depth = float(np.median(np.linalg.norm(rays, axis=1))) if len(rays) else 0.0
+        judged = np.flatnonzero(ordered[model.image_id - 1])
+        keep = plausible_frames(
+            self._images.time_ns[model.image_id[judged] - 1],
+            model.wTc[judged, :3, 3],
+            depth,
+            self._sfm.max_jump,
+        )
+        colmap.drop_images(reconstruction, model.image_id[judged[~keep]])
 
 
 def adjust_and_filter(
@@ -75,7 +223,9 @@ def adjust_and_filter(
             reconstruction, model.image_id[model.image[bad]], model.feature[bad]
         )
         model = colmap.to_arrays(reconstruction)
-        weak = (np.bincount(model.point, minlength=len(model.position)) < sfm.min_track) | (
+        # Tracks that were merged may have two key points of one image.
+        seen = np.unique(np.stack([model.point, model.image]), axis=1)[0]
+        weak = (np.bincount(seen, minlength=len(model.position)) < sfm.min_track) | (
             landmarks.largest_angles_deg(model) < sfm.min_tri_angle_deg
         )
         colmap.drop_points(reconstruction, model.point_id[weak])
@@ -86,16 +236,3 @@ def adjust_and_filter(
             "the camera must move more between images"
         )
     return model
-
-
-def _drop_implausible(
-    reconstruction: colmap.Reconstruction, images: Images, max_jump: float
-) -> list[str]:
-    model = colmap.to_arrays(reconstruction)
-    rays = model.position[model.point] - model.wTc[model.image, :3, 3]
-    depth = float(np.median(np.linalg.norm(rays, axis=1))) if len(rays) else 0.0
-    keep = plausible_frames(
-        images.time_ns[model.image_id - 1], model.wTc[:, :3, 3], depth, max_jump
-    )
-    colmap.drop_images(reconstruction, model.image_id[~keep].tolist())
-    return [name for name, kept in zip(model.names, keep, strict=True) if not kept]

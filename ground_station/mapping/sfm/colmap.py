@@ -1,7 +1,7 @@
-"""The border to COLMAP: its database, its structure from motion, its models on disk.
+"""The border to COLMAP: its database, its models in memory and on disk.
 
-The only module that imports pycolmap, and the only one that knows that COLMAP's pixels count from
-the corner of the top-left pixel: half a pixel more than ours. Key points go in undistorted, so the
+This room alone imports pycolmap, and this module alone knows that COLMAP's pixels count from the
+corner of the top-left pixel: half a pixel more than ours. Key points go in undistorted, so the
 camera in there is a plain pinhole, whatever the lens.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib  # noqa: F401  # isort: skip
 import cv2  # noqa: F401  # isort: skip
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy.typing as npt
 import pycolmap
 
 from ground_station.errors import MapError
+from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.sfm import colmap_files
@@ -55,7 +56,8 @@ class Model:
     pinhole: F64
 
 
-def _quiet() -> None:
+def quiet() -> None:
+    """Silences COLMAP's own log."""
     # Progress and errors are ours to tell; COLMAP's own log goes to standard error by default.
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
 
@@ -85,10 +87,14 @@ def write_database(
 ) -> None:
     """Writes a COLMAP database: one pinhole camera, images with id = index + 1, verified pairs.
 
-    `keypoints_px[i]` (N, 2) are image i's undistorted pixels; `pairs[i, j]` with i < j.
+    `keypoints_px[i]` (N, 2) are image i's undistorted pixels; `pairs[i, j]` with i < j. It is
+    written beside and renamed.
     """
-    _quiet()
-    with pycolmap.Database.open(path) as database:
+    quiet()
+    part = path.with_name(path.name + ".part")
+    for left in part.parent.glob(part.name + "*"):  # SQLite's journals, too
+        left.unlink()
+    with pycolmap.Database.open(part) as database:
         pinhole = _pinhole(camera)
         database.write_camera(pinhole, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -115,64 +121,7 @@ def write_database(
                 geometry.H = shift @ view.homography @ np.linalg.inv(shift)
             database.write_matches(i + 1, j + 1, view.matches.astype(np.uint32))
             database.write_two_view_geometry(i + 1, j + 1, geometry)
-
-
-def incremental(
-    database: Path,
-    out: Path,
-    *,
-    seed: int,
-    threads: int,
-    images: int,
-    refine_camera: bool,
-    min_tri_angle_deg: float,
-    on_image: Callable[[], None],
-) -> list[Reconstruction]:
-    """COLMAP's incremental structure from motion; the models, the largest first.
-
-    Schönberger and Frahm, CVPR 2016. `on_image` is called for each image registered. `threads` 0
-    takes one a core. Raises `MapError` when no model comes of it.
-    """
-    _quiet()
-    pycolmap.set_random_seed(seed)  # else a second run in one process goes on where the first ended
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
-    options.num_threads = threads or -1
-    options.extract_colors = False
-    options.min_model_size = min(10, max(2, images // 2))
-    options.max_num_models = 5
-    options.ba_refine_focal_length = refine_camera
-    options.ba_refine_principal_point = False
-    options.ba_refine_extra_params = False
-    # Constant intrinsics let the global adjustment run more rarely without drift.
-    options.ba_global_frames_ratio = 1.3
-    options.ba_global_points_ratio = 1.3
-    options.ba_global_max_refinements = 3
-    options.mapper.abs_pose_refine_focal_length = False
-    options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.abs_pose_max_error = 6.0
-    options.mapper.filter_min_tri_angle = min_tri_angle_deg
-    options.triangulation.min_angle = min_tri_angle_deg
-    out.mkdir(parents=True, exist_ok=True)
-
-    def on_pair() -> None:
-        on_image()
-        on_image()
-
-    models = pycolmap.incremental_mapping(
-        database,
-        out,  # where images would be; without colours none is opened
-        out,
-        options,
-        initial_image_pair_callback=on_pair,
-        next_image_callback=on_image,
-    )
-    if not models:
-        raise MapError(
-            "structure from motion found no pair of images to start from: the camera must move "
-            "sideways between images that see the same things"
-        )
-    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+    part.replace(path)
 
 
 def adjust(
@@ -294,6 +243,19 @@ def to_arrays(model: Reconstruction) -> Model:
     )
 
 
+def similarity(source: F64, target: F64, error: float, seed: int) -> Alignment | None:
+    """The similarity by which most of source (N, 3) reach target (N, 3) within `error`, or None.
+
+    LO-RANSAC: Chum, Matas and Kittler, "Locally optimized RANSAC", DAGM 2003.
+    """
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = error, seed
+    found = pycolmap.estimate_sim3d_robust(source, target, options)
+    if found is None:
+        return None
+    return Alignment(found.rotation.matrix(), np.array(found.translation), float(found.scale))
+
+
 def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
     """Takes images out of a model, with their sights."""
     for image_id in np.asarray(image_ids).tolist():
@@ -354,19 +316,30 @@ def transform(model: Reconstruction, scale: float, rotation: F64, translation: F
 
 
 def write(model: Reconstruction, folder: Path) -> None:
-    """Writes the binary files of a model into a folder."""
-    _quiet()
+    """Writes the binary files of a model into a folder; raises `MapError` when the disk is full."""
+    quiet()
     folder.mkdir(parents=True, exist_ok=True)
     model.update_point_3d_errors()
     model.write(folder)
+    # COLMAP does not look whether the disk took it. By its format a point has 51 bytes, and 8 for
+    # each of its sights, behind the count of points.
+    points = folder / "points3D.bin"
+    wanted = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
+    if points.stat().st_size != wanted:
+        raise MapError(f"{points}: was not written whole; is the disk full?")
+
+
+def reread(folder: Path) -> Reconstruction:
+    """Reads a model that this program has written or checked."""
+    quiet()
+    return pycolmap.Reconstruction(folder)
 
 
 def read(folder: Path) -> Reconstruction:
     """Reads a model; raises `MapError` with one line."""
     colmap_files.check(folder)
-    _quiet()
     try:
-        return pycolmap.Reconstruction(folder)
+        return reread(folder)
     except (ValueError, RuntimeError, OSError, IndexError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{folder}: not a COLMAP model: {reason}") from None

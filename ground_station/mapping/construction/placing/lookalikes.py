@@ -1,0 +1,85 @@
+"""Images that structure from motion put into a place which only looks like theirs.
+
+Two doors of one kind give pairs of images that a two-view geometry explains well; only it is that
+of another place. What gives them away is the way between: an image's landmarks must be where the
+image beside it saw them. Images for which that holds from one to the next are a piece; a piece that
+the chain contradicts where it meets a larger one is in the wrong place. Heinly, Dunn and Frahm,
+"Correcting for duplicate scene structure in sparse 3D reconstruction", ECCV 2014, judge by the
+landmarks that an image should see and does not. Where there is a chain, it says it with less doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.placing.chains import components
+from ground_station.mapping.construction.placing.placed import Placed
+
+F64 = npt.NDArray[np.float64]
+
+_SPEAKS = 15
+"""Fewer landmarks in common say nothing about two images."""
+_HOLDS, _BREAKS = 0.5, 0.2
+"""Shares of the landmarks in common that are in their place: of a link that holds, and of one that
+does not. Between the two a link says nothing."""
+
+
+def misplaced(
+    model: Placed,
+    links: Iterable[Pair],
+    pairs: Mapping[Pair, TwoView],
+    pixels: Sequence[F64],
+) -> set[int]:
+    """The images, by index, that the chain says are in the wrong place; empty where none is.
+
+    From the largest piece to the smallest, each is believed unless a link breaks between it and a
+    piece that is believed already. `pixels` (N, 2) are each image's undistorted key points.
+    """
+    holding: list[Pair] = []
+    broken: list[Pair] = []
+    for pair in sorted(links):
+        if {*pair} <= model.wTc.keys():
+            good, total = model.in_place(pair, pairs[pair], pixels)
+            if total >= _SPEAKS and good >= _HOLDS * total:
+                holding.append(pair)
+            elif total >= _SPEAKS and good <= _BREAKS * total:
+                broken.append(pair)
+    edges = np.array(holding, dtype=np.int64).reshape(-1, 2)
+    piece = components([edges], len(model.landmark))
+    against: dict[int, set[int]] = {}
+    for i, j in broken:
+        one, other = int(piece[i]), int(piece[j])
+        if one != other:
+            against.setdefault(one, set()).add(other)
+            against.setdefault(other, set()).add(one)
+    placed = np.array(sorted(model.wTc), dtype=np.int64)
+    size = np.bincount(piece[placed], minlength=len(model.landmark))
+    believed: set[int] = set()
+    for number in np.argsort(-size, kind="stable").tolist():
+        if not against.get(number, set()) & believed:
+            believed.add(number)
+    return {int(k) for k in placed if int(piece[k]) not in believed}
+
+
+def refuted(
+    model: Placed,
+    wrong: set[int],
+    links: set[Pair],
+    pairs: Mapping[Pair, TwoView],
+    pixels: Sequence[F64],
+) -> set[Pair]:
+    """The pairs that put the misplaced where they are; what they say is not so."""
+    found = set()
+    for pair, view in pairs.items():
+        i, j = pair
+        if (i in wrong) == (j in wrong) or pair in links or not {i, j} <= model.wTc.keys():
+            continue
+        good, total = model.in_place(pair, view, pixels)
+        if total and good >= _HOLDS * total:
+            found.add(pair)
+    return found

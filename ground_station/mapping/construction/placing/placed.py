@@ -1,0 +1,78 @@
+"""A model as those look at it who judge where its images are: by index of image and key point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.sfm.colmap import Model
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+_IN_PLACE_PX = 8.0
+"""A landmark seen so near to where it should be is in its place; neighbours fit within 1 px."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Which landmark each key point of each image sees (N,), -1 for none, and where things are.
+
+    `wTc` (4, 4) of the images that have a place; `position` (M, 3) of the landmarks; `pinhole`:
+    fx, fy, cx, cy.
+    """
+
+    landmark: list[I64]
+    wTc: dict[int, F64]
+    position: F64
+    pinhole: F64
+
+    @staticmethod
+    def of(model: Model, features: Sequence[int]) -> Placed:
+        """`features`, the number of key points of each image of the build."""
+        landmark = [np.full(count, -1, dtype=np.int64) for count in features]
+        index = (model.image_id - 1).tolist()
+        order = np.argsort(model.image, kind="stable")
+        ends = np.searchsorted(model.image[order], np.arange(len(index) + 1))
+        for k, i in enumerate(index):
+            mine = order[ends[k] : ends[k + 1]]
+            landmark[i][model.feature[mine]] = model.point[mine]
+        places = dict(zip(index, model.wTc, strict=True))
+        return Placed(landmark, places, model.position, model.pinhole)
+
+    @cached_property
+    def depth(self) -> float:
+        """The median distance at which landmarks are seen."""
+        seen = {k: of[of >= 0] for k, of in enumerate(self.landmark)}
+        distances = [
+            np.median(np.linalg.norm(self.position[seen[k]] - wTc[:3, 3], axis=1))
+            for k, wTc in self.wTc.items()
+            if len(seen[k])
+        ]
+        return float(np.median(distances)) if distances else 0.0
+
+    def in_place(self, pair: Pair, view: TwoView, pixels: Sequence[F64]) -> tuple[int, int]:
+        """How many landmarks of one image are where the other saw them, and of how many.
+
+        Of a verified pair, both ways; `pixels` (N, 2) of each image, undistorted.
+        """
+        i, j = pair
+        good = total = 0
+        for one, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
+            landmark = self.landmark[one][matches[:, 0]]
+            known = landmark >= 0
+            cTw = poses.inverse(self.wTc[other])
+            local = poses.transform(cTw, self.position[landmark[known]])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at = local[:, :2] / local[:, 2:] * self.pinhole[:2] + self.pinhole[2:]
+            error = np.linalg.norm(at - pixels[other][matches[known, 1]], axis=1)
+            good += int(np.count_nonzero((local[:, 2] > 0) & (error < _IN_PLACE_PX)))
+            total += int(np.count_nonzero(known))
+        return good, total
