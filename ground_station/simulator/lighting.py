@@ -286,5 +286,6 @@ def surface_albedo(bank: TextureBank, scene: Scene, index: int) -> Image:
     """The texture of one surface: the same for every light and flight."""
     s = scene.surfaces[index]
     columns, rows = s.size_texels
-    rng = np.random.default_rng([scene.texture_seed, index])
+    # Prints of one plate are equal: the option `print` numbers the plates.
+    rng = np.random.default_rng([scene.texture_seed, s.options.get("print", index)])
     return MATERIALS[s.material](bank, rows, columns, s.texels_per_m, rng, **s.options)

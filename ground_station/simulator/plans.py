@@ -83,6 +83,7 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
         "loop": _loop,
         "small-circle": _small_circle,
         "fast": _fast,
+        "corridor": _corridor,
     }
     if name not in plans:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
@@ -143,3 +144,28 @@ def _fast(centre: tuple[float, float], shift: Array) -> Plan:
         return _ellipse(angle, (centre[0], centre[1] - 0.15), 4.75, 4.75, z), yaw
 
     return Plan("fast", shape, 1.0, 4.0, True, 30.0)
+
+
+def _corridor(centre: tuple[float, float], shift: Array) -> Plan:
+    """There and back along a corridor, flown sideways, the camera on its north wall."""
+    half, r = centre[0] - 3.0, 0.5
+    straight, arc = 2 * half, np.pi * r
+    lap = 2 * (straight + arc)
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        d = (np.asarray(s) % 1.0) * lap
+        east, west = (d - straight) / r, (d - 2 * straight - arc) / r  # angles around the ends
+        legs = [d < straight, east < np.pi, d < 2 * straight + arc]
+        x = np.select(
+            legs,
+            [d - half, half + r * np.sin(east), half - (d - straight - arc)],
+            -half - r * np.sin(west),
+        )
+        y = np.select(legs, [np.full_like(d, -r), -r * np.cos(east), np.full_like(d, r)],
+                      r * np.cos(west))  # fmt: skip
+        turn = 2 * np.pi * np.asarray(s)
+        z = 1.95 + 0.12 * np.sin(3 * turn + shift[0])
+        yaw = np.pi / 2 - 0.35 * np.sin(turn) + 0.1 * np.sin(5 * turn + shift[1])
+        return np.stack([centre[0] + x, centre[1] - 0.6 + y, z], axis=1), yaw
+
+    return Plan("corridor", shape, 1.0, 0.45, False, 105.0)
