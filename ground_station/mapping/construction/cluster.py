@@ -142,12 +142,14 @@ class Cluster:
                 f"{self._place}: one task ended every worker that tried it; they may have too "
                 "little memory"
             ) from None
-        except (ImportError, AttributeError) as error:
-            raise MapError(f"{self._place}: a worker has another program: {_line(error)}") from None
-        except (OSError, ValueError) as error:
-            if self._client.status == "running" and isinstance(error, ValueError):
-                raise
-            raise MapError(f"{self._place}: the cluster is gone ({_line(error)})") from None
+        except Exception as error:
+            if self._client.status != "running" or isinstance(error, OSError):
+                raise MapError(f"{self._place}: the cluster is gone ({_line(error)})") from None
+            if isinstance(error, ImportError | AttributeError):
+                raise MapError(
+                    f"{self._place}: a worker has another program: {_line(error)}"
+                ) from None
+            raise
 
     def _send(self, call: _Call) -> None:
         args = [self._sent(arg) if isinstance(arg, _Shared) else arg for arg in call.args]
@@ -157,7 +159,8 @@ class Cluster:
         )
 
     def _sent(self, value: _Shared) -> Any:
-        if value.future is None:
+        # What was shared goes with the worker that had it: Dask makes anew only what it has made.
+        if value.future is None or value.future.status != "finished":
             (value.future,) = self._client.scatter([value.value], hash=False)
         return value.future
 
@@ -167,21 +170,30 @@ class Cluster:
             try:
                 return call.future.result(timeout=_LOOK_S)
             except _CANCELLED as error:
-                # What was shared is gone with the worker that had it: Dask makes only anew what it
-                # has made itself.
-                if self._client.status != "running" or call.sent >= _TRIES:
-                    raise MapError(f"{self._place}: the cluster is gone ({_line(error)})") from None
-                for arg in call.args:
-                    if isinstance(arg, _Shared) and arg.future.status != "finished":
-                        arg.future = None
-                self._send(call)
+                self._again(call, _line(error))
             except TimeoutError:
+                if any(future.status == "lost" for future in _futures(call)):
+                    self._again(call, "what was sent to it is lost")
                 if self._client.nthreads():
                     heard_s = time.monotonic()
                 elif time.monotonic() - heard_s > _ALONE_S:
                     raise MapError(
                         f"{self._place}: has had no worker for {_ALONE_S:.0f} s"
                     ) from None
+
+    def _again(self, call: _Call, reason: str) -> None:
+        # Where the network stutters, Dask connects again by itself, or gives up.
+        end_s = time.monotonic() + 2 * _CONNECT_S
+        while self._client.status == "connecting" and time.monotonic() < end_s:
+            time.sleep(0.1)
+        if self._client.status != "running" or call.sent >= _TRIES:
+            raise MapError(f"{self._place}: the cluster is gone ({reason})")
+        self._send(call)
+
+
+def _futures(call: _Call) -> list[Any]:
+    shared = [arg.future for arg in call.args if isinstance(arg, _Shared)]
+    return [future for future in shared if future is not None]
 
 
 @contextmanager
