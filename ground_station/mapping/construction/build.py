@@ -19,7 +19,7 @@ from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.content import structure_key
 from ground_station.mapping.construction.images import extract
-from ground_station.mapping.construction.structure import adjust_and_filter, reconstruct
+from ground_station.mapping.construction.structure import Structure, adjust_and_filter, reconstruct
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
@@ -70,7 +70,7 @@ def build_map(
             structure = reconstruct(images, pairs, camera, settings, threads, work)
         with _timed(stage_s, "refine"):
             model = adjust_and_filter(structure.reconstruction, settings.sfm, threads)
-        notes = _notes(len(images.names), len(model.names), structure.sizes, structure.dropped)
+        notes = _notes(len(images.names), len(model.names), structure)
         for note in notes:
             print(note, flush=True)
         map_ = assemble(model, images, camera, settings, out.name)
@@ -106,10 +106,11 @@ def _timed(stage_s: dict[str, float], name: str) -> Iterator[None]:
     stage_s[name] = time.monotonic() - start_s
 
 
-def _notes(images: int, registered: int, sizes: list[int], dropped: list[str]) -> list[str]:
+def _notes(images: int, registered: int, structure: Structure) -> list[str]:
+    sizes, dropped = structure.sizes, structure.dropped
     others = f", models of sizes {[registered, *sizes[1:]]}" if sizes[1:] else ", one model"
     notes = [f"{registered} of {images} images registered{others}"]
     if dropped:
         shown = ", ".join(dropped[:5]) + (", …" if len(dropped) > 5 else "")
         notes.append(f"{len(dropped)} images dropped, far off their neighbours: {shown}")
-    return notes
+    return notes + structure.notes
