@@ -14,6 +14,7 @@ import cv2  # noqa: F401  # isort: skip
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -250,10 +251,11 @@ def similarity(source: F64, target: F64, error: float, seed: int) -> Alignment |
     """
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = error, seed
-    found = pycolmap.estimate_sim3d_robust(source, target, options)
+    found: Any = pycolmap.estimate_sim3d_robust(source, target, options)  # a dict, or None
     if found is None:
         return None
-    return Alignment(found.rotation.matrix(), np.array(found.translation), float(found.scale))
+    motion = found["tgt_from_src"]
+    return Alignment(motion.rotation.matrix(), np.array(motion.translation), float(motion.scale))
 
 
 def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:

@@ -30,12 +30,16 @@ _NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 @dataclass
 class Corridor:
-    """Frames of a way along the wall: true poses (K, 4, 4), what they see, and verified pairs."""
+    """Frames of a way along the wall: true poses (K, 4, 4), what they see, and verified pairs.
+
+    `misled`: the pairs whose geometry is that of two places which are not the images'.
+    """
 
     camera: Camera
     wTc: npt.NDArray[np.float64]
     images: Images
     pairs: dict[tuple[int, int], TwoView]
+    misled: set[tuple[int, int]]
 
 
 def there_and_back(frames: int, length_m: float, rng: np.random.Generator) -> npt.NDArray:
@@ -85,33 +89,34 @@ def make_corridor(
     ]
     names = [f"frame-{k:06d}" for k in range(frames)]
     images = Images(names, np.arange(frames) * STEP_NS, nothing, pixels)
-    pairs = {}
+    pairs, misled = {}, set()
     for i in range(frames):
         for j in range(i + 1, frames):
-            view = _verified(wTc[i], wTc[j], seen[i], seen[j], kinds, bay_of)
+            view, bays_off = _verified(wTc[i], wTc[j], seen[i], seen[j], kinds, bay_of)
             if view is not None:
                 pairs[i, j] = view
-    return Corridor(camera, wTc, images, pairs)
+                misled |= {(i, j)} if bays_off else set()
+    return Corridor(camera, wTc, images, pairs, misled)
 
 
-def _verified(wTa, wTb, first, second, kinds, bay_of) -> TwoView | None:
-    """What a matcher and a verification would make of two images."""
+def _verified(wTa, wTb, first, second, kinds, bay_of) -> tuple[TwoView | None, int]:
+    """What a matcher and a verification make of two images, and how many bays it is off."""
     a, b = _once(kinds[first]), _once(kinds[second])
     matches = np.array([(a[kind], b[kind]) for kind in a if kind in b], np.int32).reshape(-1, 2)
     if len(matches) < 20:
-        return None
+        return None, 0
     shift = bay_of[second[matches[:, 1]]] - bay_of[first[matches[:, 0]]]
     strongest = max(set(shift.tolist()), key=lambda k: (np.count_nonzero(shift == k), -abs(k)))
     kept = matches[shift == strongest]
     if len(kept) < 20 or len(kept) < 0.4 * len(matches):
-        return None
+        return None, 0
     # As if the second image stood so many bays further back, where it would see the first's.
     moved = wTb.copy()
     moved[0, 3] -= strongest * BAY_M
     bTa = poses.inverse(moved) @ wTa
     x, y, z = bTa[:3, 3] / max(np.linalg.norm(bTa[:3, 3]), 1e-9)
     E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ bTa[:3, :3]
-    return TwoView(kept, E, None, False)
+    return TwoView(kept, E, None, False), int(strongest)
 
 
 def _once(kinds: npt.NDArray) -> dict[int, int]:

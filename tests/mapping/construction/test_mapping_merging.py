@@ -1,0 +1,129 @@
+"""Models that split are joined where landmarks say how, and only where they say one way."""
+
+from __future__ import annotations
+
+import corridor_geometry as geometry
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ground_station.geometry.alignment import Alignment
+from ground_station.mapping.construction import structure
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.placing import loops, merging
+from ground_station.mapping.construction.placing.placed import Placed
+from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm import colmap
+
+PINHOLE = np.array([500.0, 500.0, 320.0, 240.0])
+LANDMARKS = 120
+MOTION = Alignment(
+    Rotation.from_rotvec([0.2, -0.4, 1.1]).as_matrix(), np.array([3.0, -1.0, 0.5]), 2.5
+)
+
+
+def _two_models(shift=None, noise=0.0):
+    """Two models of one place: image 0 in the first, image 1 in the second, matched one to one.
+
+    A share of the second's landmarks is moved by `shift` (its number, a vector).
+    """
+    rng = np.random.default_rng(3)
+    source = rng.uniform([-2, -1, 3], [2, 1, 6], (LANDMARKS, 3))
+    target = MOTION.apply(source) + noise * rng.normal(size=source.shape)
+    if shift is not None:
+        target[: shift[0]] += shift[1]
+    every = np.arange(LANDMARKS)
+    nothing = np.full(LANDMARKS, -1)
+    wTc = np.eye(4)
+    moved = MOTION.apply_poses(wTc[None])[0]
+    first = Placed([every, nothing], {0: moved}, target, PINHOLE)
+    second = Placed([nothing, every], {1: wTc}, source, PINHOLE)
+    matches = np.stack([every, every], axis=1).astype(np.int32)
+    return first, second, {(0, 1): TwoView(matches, np.eye(3), None, False)}
+
+
+def test_landmarks_of_a_pair_between_two_models_give_the_similarity():
+    target, source, pairs = _two_models(shift=(30, [9.0, 0.0, 4.0]), noise=0.02)
+    found = merging.junction(target, source, pairs, seed=0).similarity
+    assert found is not None
+    assert found.scale == pytest.approx(MOTION.scale, rel=0.01)
+    poses = merging.poses_in(source, found, set(target.wTc))
+    assert list(poses) == [2]  # COLMAP's id
+    assert np.abs(poses[2] - MOTION.apply_poses(np.eye(4)[None])[0]).max() < 0.05
+
+
+def test_two_places_that_fit_nearly_as_well_are_none():
+    target, source, pairs = _two_models(shift=(50, [8.0, 0.0, 0.0]))
+    junction = merging.junction(target, source, pairs, seed=0)
+    assert junction.similarity is None
+    assert junction.missing == (
+        "they fit the largest in two places: 70 landmarks say one, 50 another"
+    )
+
+
+def test_what_is_missing_between_models_is_said():
+    target, source, pairs = _two_models()
+    assert merging.junction(target, source, {}, 0).missing == "no pair links them to the largest"
+    few = {(0, 1): TwoView(pairs[0, 1].matches[:20], np.eye(3), None, False)}
+    junction = merging.junction(target, source, few, 0)
+    assert junction.similarity is None
+    assert junction.missing == (
+        "1 pairs or images link them to the largest, but 0 of 20 landmarks in common fit together, "
+        "30 must"
+    )
+
+
+@pytest.fixture(scope="module")
+def corridor() -> geometry.Corridor:
+    return geometry.make_corridor(frames=40, bays=3, own=110, alike=0)
+
+
+def _reconstruction(corridor, work) -> structure._Reconstruction:
+    return structure._Reconstruction(
+        corridor.images, corridor.camera, MappingSettings(), threads=1, work=work
+    )
+
+
+def _halves(corridor) -> set[tuple[int, int]]:
+    """The pairs within the first half of the images and within the second."""
+    middle = len(corridor.images.names) // 2
+    return {pair for pair in corridor.pairs if (pair[0] < middle) == (pair[1] < middle)}
+
+
+def test_models_that_split_become_one_by_the_pairs_between_them(corridor, tmp_path):
+    apart = loops.among(corridor.pairs, _halves(corridor))
+    run = _reconstruction(corridor, tmp_path)
+    models, notes = run._solve("apart", apart, joining=corridor.pairs)
+    assert notes == ["a model of 20 images joined to the largest"]
+    assert [model.num_reg_images() for model in models] == [40]
+    assert geometry.error_m(corridor, models[0]).max() < 0.03
+    found = structure.adjust_and_filter(models[0], MappingSettings().sfm, 1)
+    assert found.names == corridor.images.names
+    assert np.bincount(found.point).min() >= MappingSettings().sfm.min_track
+
+
+def test_models_without_a_pair_between_them_are_reported_by_name(corridor, tmp_path):
+    apart = loops.among(corridor.pairs, _halves(corridor))
+    found = structure.reconstruct(
+        corridor.images, apart, corridor.camera, MappingSettings(), 1, tmp_path
+    )
+    assert sorted(found.sizes) == [20, 20]
+    assert found.notes in (
+        [f"{a} to {b}: 20 images form a model of their own: no pair links them to the largest"]
+        for a, b in (("frame-000000", "frame-000019"), ("frame-000020", "frame-000039"))
+    )
+    assert found.dropped == []
+
+
+def test_ranges_of_names_are_few(corridor, tmp_path):
+    names = [f"{k}.png" for k in range(12)]
+    model = colmap.from_arrays(
+        colmap.Model(
+            names[::2], np.arange(1, 13, 2), np.tile(np.eye(4), (6, 1, 1)), np.empty(0, np.int64),
+            np.empty((0, 3)), *[np.empty(0, np.int64)] * 3, np.empty((0, 2)), PINHOLE,
+        ),
+        corridor.camera,
+    )  # fmt: skip
+    assert merging.describe(model, names, "why").startswith(
+        "0.png, 2.png, 4.png, 6.png, 2 more: 6 images form a model of their own: why"
+    )
