@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ground_station.simulator.atrium import build_atrium
+from ground_station.simulator.corridor import build_corridor
 from ground_station.simulator.office import build_office
 from ground_station.simulator.scene import Scene, SimulatorError
 
-_SCENES: dict[str, Callable[[float], Scene]] = {"atrium": build_atrium, "office": build_office}
+_SCENES: dict[str, Callable[[float], Scene]] = {
+    "atrium": build_atrium,
+    "office": build_office,
+    "corridor": build_corridor,
+}
 
 
 def names() -> tuple[str, ...]:
