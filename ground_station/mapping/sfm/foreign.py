@@ -1,0 +1,137 @@
+"""Models that COLMAP or hloc made: their poses and camera in our conventions.
+
+The half pixel between COLMAP's corner of the picture and our first pixel's centre goes here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from ground_station.errors import CameraError, MapError
+from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.sfm import colmap_files, colmap_text
+from ground_station.mapping.sfm.colmap import HALF_PIXEL
+from ground_station.mapping.sfm.colmap_files import NO_POINT, CameraEntry, ImageEntry
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+_ORDER = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
+"""COLMAP's parameters; the lens is OpenCV's polynomial in all of them."""
+
+
+@dataclass(frozen=True)
+class ForeignModel:
+    """A COLMAP model as others made it, in our conventions.
+
+    `names`, K images, sorted; `wTc` (K, 4, 4) in the model's own units; `camera`, the one that took
+    them all; `points`, K arrays of the numbers of the points that each image sees, sorted.
+    """
+
+    names: list[str]
+    wTc: F64
+    camera: Camera
+    points: list[npt.NDArray[np.uint64]]
+
+    def shared_points(self) -> npt.NDArray[np.int64]:
+        """How many points two images both see (K, K); on the diagonal, how many one sees."""
+        count = [len(numbers) for numbers in self.points]
+        everything = np.concatenate([*self.points, np.empty(0, np.uint64)])
+        _, column = np.unique(everything, return_inverse=True)
+        row = np.repeat(np.arange(len(count)), count)
+        width = int(column.max(initial=-1)) + 1
+        sees = csr_array(
+            (np.ones(len(row), np.int64), (row, column.ravel())), shape=(len(count), max(width, 1))
+        )
+        return np.asarray((sees @ sees.T).toarray(), np.int64)
+
+
+def read(folder: str | Path) -> ForeignModel:
+    """Reads a COLMAP model, binary or text; raises `MapError` with one line naming what is wrong.
+
+    Refused are lenses that OpenCV's five parameters do not hold, and images of several cameras.
+    """
+    folder = Path(folder)
+    if (folder / "cameras.bin").exists():
+        cameras, images = colmap_files.read(folder)
+    elif (folder / "cameras.txt").exists():
+        cameras, images = colmap_text.read(folder)
+    else:
+        raise MapError(f"{folder}: not a COLMAP model: no cameras.bin or cameras.txt in it")
+    if not images:
+        raise MapError(f"{folder}: the model has no images")
+    _check_names(folder, images)
+    entries = sorted(images.values(), key=lambda image: image.name)
+    values = np.array([entry.pose for entry in entries])
+    cRw = Rotation.from_quat(np.roll(values[:, :4], -1, axis=1)).as_matrix()
+    seen = [np.unique(entry.points[entry.points != NO_POINT]) for entry in entries]
+    return ForeignModel(
+        names=[entry.name for entry in entries],
+        wTc=poses.inverse(poses.pose(cRw, values[:, 4:])),
+        camera=_only_camera(folder, cameras, entries),
+        points=seen,
+    )
+
+
+def _check_names(folder: Path, images: dict[int, ImageEntry]) -> None:
+    times = Counter(image.name for image in images.values())
+    for name, count in times.items():
+        if count > 1:
+            raise MapError(f"{folder}: the model has two images named {name!r:.80}")
+        parts = Path(name).parts
+        if not name.isprintable() or not parts or Path(name).is_absolute() or ".." in parts:
+            raise MapError(f"{folder}: the model has an image named {name!r:.80}")
+
+
+def _only_camera(folder: Path, cameras: dict[int, CameraEntry], images: list[ImageEntry]) -> Camera:
+    """Also that of a model that repeats it for every image."""
+    used = sorted({image.camera for image in images})
+    first = cameras[used[0]]
+    for number in used[1:]:
+        if cameras[number] != first:
+            raise MapError(
+                f"{folder}: the model's images are of {len(used)} cameras ({used[0]} and {number} "
+                "differ); a map is of one: let COLMAP take one camera for all images"
+            )
+    try:
+        return camera_of(first)
+    except (CameraError, ConfigError) as error:
+        raise MapError(f"{folder}: camera {used[0]}: {error}") from None
+
+
+def camera_of(entry: CameraEntry) -> Camera:
+    """COLMAP's camera as ours; raises `CameraError` or `ConfigError` for what ours cannot be."""
+    given = dict(zip(_ORDER[entry.model].split(), entry.params, strict=True))
+    rational = {name: given.pop(name) for name in ("k4", "k5", "k6") if name in given}
+    if any(rational.values()):
+        numbers = ", ".join(f"{name} {value:.3g}" for name, value in rational.items())
+        raise CameraError(f"{entry.model} with {numbers}; only 0 can be taken over")
+    if "f" in given:
+        given["fx"] = given["fy"] = given.pop("f")
+    lens = {name: given[name] for name in ("k1", "k2", "p1", "p2", "k3") if name in given}
+    values = {
+        "width_px": entry.width,
+        "height_px": entry.height,
+        "fx_px": given["fx"],
+        "fy_px": given["fy"],
+        "cx_px": given["cx"] - HALF_PIXEL,
+        "cy_px": given["cy"] - HALF_PIXEL,
+    }
+    return config.from_mapping(values | lens, Camera, where=entry.model)
