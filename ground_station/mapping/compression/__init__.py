@@ -1,0 +1,1 @@
+"""A smaller map that localizes nearly as well."""
