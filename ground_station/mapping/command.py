@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ground_station.mapping.construction import command as build
+from ground_station.mapping.importing import command as importing
 from ground_station.mapping.inspection import command as info
 from ground_station.mapping.inspection import export_command as export
 from ground_station.mapping.inspection import view_command as view
@@ -13,6 +14,7 @@ from ground_station.mapping.registration import command as register
 
 _COMMANDS = {
     "build": build,
+    "import": importing,
     "register": register,
     "refine": refine,
     "info": info,

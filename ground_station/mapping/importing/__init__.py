@@ -1,0 +1,1 @@
+"""COLMAP models of others become maps: `blimp map import`."""

@@ -1,0 +1,97 @@
+"""`blimp map import`: its arguments and what it prints. Heavy modules are imported when it runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ground_station.files import write_json
+from ground_station.mapping.table import print_table
+
+if TYPE_CHECKING:
+    from ground_station.geometry.camera import Camera
+
+HELP = "Makes a map of a COLMAP model and its pictures."
+
+EXAMPLE = """\
+examples:
+  blimp map import sparse/0 --images images/ --out maps/hall
+  blimp map import outputs/sfm --images walk.mcap --features superpoint --out maps/hall
+
+MODEL is a folder with cameras, images and points3D, binary or text, from COLMAP or hloc, whatever
+its features were. Poses and camera are taken over; landmarks are made anew of the pictures. The
+map is in the model's coordinates, which have no units: blimp map register follows."""
+
+_DIFFER_PX = 2.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of `blimp map import`."""
+    parser.add_argument("model", metavar="MODEL", help="folder of the COLMAP model")
+    parser.add_argument(
+        "--images", required=True, metavar="INPUT",
+        help="folder that the model's image names are in, or the recording or video",
+    )  # fmt: skip
+    parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map")
+    parser.add_argument("--features", help="extractor or model by name (default: the settings')")
+    parser.add_argument(
+        "--camera", metavar="TOML",
+        help="of the pictures, where the model's is of undistorted ones (default: the model's)",
+    )  # fmt: skip
+    parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
+    parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
+    parser.add_argument("--seed", type=int, help="of every random choice (default: the settings')")
+    parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Imports; raises `BlimpError` for what a person can mend."""
+    from ground_station.geometry.camera import load_camera
+    from ground_station.mapping.folder import check_target
+    from ground_station.mapping.importing.build import import_model
+    from ground_station.mapping.importing.pictures import open_pictures
+    from ground_station.mapping.inspection.summary import describe
+    from ground_station.mapping.settings import load_settings, with_changes
+    from ground_station.mapping.sfm.foreign import read
+
+    check_target(Path(args.out))
+    changes = {"features": args.features, "seed": args.seed}
+    settings = with_changes(load_settings(args.settings), changes, "blimp map import")
+    model = read(args.model)
+    pictures = open_pictures(args.images, model.names, args.rate_hz)
+    camera = load_camera(args.camera) if args.camera else model.camera
+    carried = None if isinstance(pictures.source, Path) else pictures.source.camera
+    if carried is not None and not args.camera:
+        _compare(args.images, carried, camera)
+    built: dict[str, Any] = {
+        "source": "COLMAP model",
+        "model": Path(args.model).resolve().name,
+        "inputs": [Path(args.images).name],
+        "range": "::",
+        "rate_hz": args.rate_hz,
+    }
+    map_ = import_model(model, pictures, camera, settings, args.out, built=built)
+    if not isinstance(pictures.source, Path):
+        for note in pictures.source.notes:
+            print(f"note: {note}", file=sys.stderr)
+    print_table(describe(map_))
+    if args.json:
+        write_json(args.json, describe(map_))
+    return 0
+
+
+def _compare(path: str, carried: Camera, taken: Camera) -> None:
+    """A note where the input's own camera sees another picture than the model's."""
+    import numpy as np
+
+    v, u = np.mgrid[0 : taken.height_px : 16, 0 : taken.width_px : 16]
+    grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+    off_px = np.linalg.norm(carried.distort(taken.undistort(grid)) - grid, axis=1).max()
+    if off_px > _DIFFER_PX:
+        print(
+            f"note: {path} carries a camera that is up to {off_px:.1f} px off the model's, "
+            "which is taken; --camera takes another",
+            file=sys.stderr,
+        )

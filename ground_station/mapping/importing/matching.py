@@ -1,0 +1,100 @@
+"""Matches between images whose poses are known: which pairs, and which matches fit the poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import MapError
+from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.construction.images import Images
+from ground_station.mapping.construction.matching import TwoView, mutual_matches
+from ground_station.mapping.construction.verification import rules_of
+from ground_station.mapping.construction.workers import Threads
+from ground_station.mapping.settings import MappingSettings
+from ground_station.progress import Progress
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+
+def covisible_pairs(shared: I64, *, least: int, most: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, sorted, of the `most` images each that share most points with it.
+
+    `shared` (K, K), points that two images both see; pairs with fewer than `least` are left out.
+    """
+    counts = shared.copy()
+    np.fill_diagonal(counts, 0)
+    pairs = set()
+    for i, row in enumerate(counts):
+        for j in np.argsort(-row, kind="stable")[:most].tolist():
+            if row[j] >= least:
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
+def essential(first_wTc: F64, second_wTc: F64) -> F64:
+    """E (3, 3) with x₂ᵀ E x₁ = 0 on the planes z = 1 of two cameras with these poses (4, 4)."""
+    T = poses.inverse(second_wTc) @ first_wTc
+    x, y, z = T[:3, 3]
+    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3])
+
+
+def epipolar_px(first_px: F64, second_px: F64, E: F64, camera_matrix: F64) -> F64:
+    """How far matched undistorted pixels (N, 2) lie off each other's epipolar lines (N,), px.
+
+    The larger of the two distances; NaN where the cameras stand at one place. Hartley and
+    Zisserman, "Multiple View Geometry", section 11.4.3.
+    """
+    K_inv = np.linalg.inv(camera_matrix)
+    F = K_inv.T @ E @ K_inv
+    p, q = (np.column_stack([px, np.ones(len(px))]) for px in (first_px, second_px))
+    in_second, in_first = p @ F.T, q @ F
+    off = np.abs(np.sum(q * in_second, axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        nearer = np.minimum(
+            np.linalg.norm(in_second[:, :2], axis=1), np.linalg.norm(in_first[:, :2], axis=1)
+        )
+        return np.asarray(off / nearer)
+
+
+def match(
+    images: Images,
+    wTc: F64,
+    pairs: Sequence[tuple[int, int]],
+    camera: Camera,
+    settings: MappingSettings,
+    threads: int,
+) -> dict[tuple[int, int], TwoView]:
+    """Matches of the pairs that fit the images' poses (K, 4, 4), where they are enough.
+
+    A match is kept up to `sfm.max_error_px` off its epipolar lines: a sight further off would not
+    stay in the map. Raises `MapError` when no pair has enough.
+    """
+    rules, matrix = rules_of(settings, far=False), camera.matrix
+
+    def one(i: int, j: int) -> TwoView | None:
+        first, second = images.features[i].descriptors, images.features[j].descriptors
+        matches = mutual_matches(first, second, rules.ratio)
+        E = essential(wTc[i], wTc[j])
+        pixels = images.pinhole_px[i][matches[:, 0]], images.pinhole_px[j][matches[:, 1]]
+        fits = epipolar_px(*pixels, E, matrix) <= settings.sfm.max_error_px
+        if fits.sum() < rules.min_inliers:
+            return None
+        return TwoView(matches[fits], E / np.linalg.norm(E), None, False)
+
+    found: dict[tuple[int, int], TwoView] = {}
+    with Progress("matching, pairs", len(pairs)) as progress:
+        for pair, view in zip(pairs, Threads(threads).map(one, pairs), strict=True):
+            if view is not None:
+                found[pair] = view
+            progress.step()
+    if not found:
+        raise MapError(
+            f"no two of the {len(images.names)} images have {rules.min_inliers} matches that fit "
+            "the model's poses: are these the pictures that it was made of?"
+        )
+    return found
