@@ -1,0 +1,113 @@
+"""Measures keyframes against every n-th frame of a 30 Hz flight. Minutes; not a test.
+
+How many, how sharp against the frames around them, what choosing costs a frame, and what a map of
+either is worth: images registered, and camera centres against the true poses after Sim(3).
+
+    .venv/bin/python tests/mapping/construction/measure_keyframes.py FLIGHT.mcap --json out/k.json
+
+Without a flight, the sample's. The limit of `max_images` is swept, so that thinning shows, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground_station.evaluation.text import columns
+from ground_station.files import write_json
+from ground_station.geometry.alignment import align
+from ground_station.mapping.construction import keyframes
+from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.construction.inputs import ChosenFrames
+from ground_station.mapping.settings import MappingSettings
+from ground_station.recording.flight import FlightRecording, trajectory_of
+
+ROOT = Path(__file__).parents[3]
+
+
+def build(flight: Path, indices: list[int], settings: MappingSettings) -> dict[str, Any]:
+    """A map of these frames, and how far its camera centres are off."""
+    truth = trajectory_of(flight)
+    source = FlightRecording(flight, ChosenFrames(indices=frozenset(indices)))
+    folder = Path(tempfile.mkdtemp())
+    began_s = time.monotonic()
+    try:
+        assert source.camera is not None
+        map_ = build_map(source, source.camera, settings, folder / "map", total=len(indices))
+    finally:
+        shutil.rmtree(folder)
+    kf = map_.keyframes
+    at = [truth.nearest(int(t)) for t in kf.time_ns]
+    fit = align(kf.wTc[:, :3, 3], truth.position_m[at], True)
+    off = np.linalg.norm(fit.apply(kf.wTc[:, :3, 3]) - truth.position_m[at], axis=1)
+    return {
+        "registered": len(kf),
+        "landmarks": len(map_.landmarks),
+        "rmse_m": float(np.sqrt(np.mean(off**2))),
+        "max_m": float(off.max()),
+        "build_s": time.monotonic() - began_s,
+    }
+
+
+def main() -> int:
+    """One table, one row a way of choosing."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("flight", type=Path, nargs="?", default=ROOT / "maps/atrium/flight.mcap")
+    parser.add_argument("--most", type=int, nargs="+", default=[1000, 60])
+    parser.add_argument("--no-maps", action="store_true", help="choose only")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    settings = MappingSettings()
+    source = FlightRecording(args.flight)
+    assert source.camera is not None
+    began_s, cpu_s = time.monotonic(), time.process_time()
+    figures = keyframes.measure(source, source.camera, settings.keyframes)
+    took_s, cpu_s = time.monotonic() - began_s, time.process_time() - cpu_s
+    read_s = time.process_time()
+    decoded = sum(1 for _ in source)
+    read_s = time.process_time() - read_s
+    print(
+        f"{len(figures)} frames: {1e3 * took_s / len(figures):.2f} ms a frame, "
+        f"{1e3 * cpu_s / len(figures):.2f} ms of CPU, {1e3 * read_s / decoded:.2f} reading; "
+        f"{figures.motion[-1]:.1f} keyframes' motion, {figures.segment[-1]} cuts, "
+        f"{int((~figures.followed).sum())} frames not followed"
+    )
+    sharp = keyframes.relative_sharpness(figures)
+    rows: list[dict[str, Any]] = []
+    for most in args.most:
+        chosen = keyframes.choose([figures], most, settings.keyframes)
+        place = np.searchsorted(figures.index, chosen.index[0])
+        step = len(figures) / len(place)
+        every = np.floor(np.arange(len(place)) * step).astype(int)
+        for name, at in (("keyframes", place), ("every n-th", every)):
+            row = {
+                "chosen": name,
+                "most": most,
+                "images": len(at),
+                "due": chosen.due,
+                "blurred": int((sharp[at] < settings.keyframes.min_sharpness).sum()),
+                "sharp_median": float(np.median(sharp[at])),
+                "sharp_p5": float(np.percentile(sharp[at], 5)),
+                "longest_motion": float(np.diff(figures.motion[at]).max(initial=0.0)),
+            }
+            if not args.no_maps:
+                plain = dataclasses.replace(settings, max_images=5000)
+                row |= build(args.flight, figures.index[at].tolist(), plain)
+            rows.append(row)
+    shown = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    print("\n".join(columns([list(rows[0]), *shown])))
+    if args.json:
+        write_json(args.json, {"flight": args.flight.name, "rows": rows})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
