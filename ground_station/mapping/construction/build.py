@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import landmarks, store
 from ground_station.mapping.construction.assembly import assemble
@@ -25,7 +26,7 @@ from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.folder import replacing
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import colmap, colmap_files
 from ground_station.recording.frames import Frame
 
 
@@ -66,7 +67,7 @@ def build_map(
         if work is None:
             work = folder / "work"
             work.mkdir()
-        with _timed(stage_s, "sfm"):
+        with _timed(stage_s, "sfm"), _colmap_in(work):
             structure = reconstruct(images, pairs, camera, settings, threads, work)
         with _timed(stage_s, "refine"):
             model = adjust_and_filter(structure.reconstruction, settings.sfm, threads)
@@ -93,6 +94,7 @@ def build_map(
             "settings": asdict(settings),
         }
         colmap.write(colmap.compact(structure.reconstruction), folder / "sparse")
+        colmap_files.check(folder / "sparse")  # COLMAP does not say when the disk is full
         store.save_tables(folder, map_, quantise=settings.quantise)
         shutil.rmtree(folder / "work", ignore_errors=True)
     map_.folder = out
@@ -104,6 +106,19 @@ def _timed(stage_s: dict[str, float], name: str) -> Iterator[None]:
     start_s = time.monotonic()
     yield
     stage_s[name] = time.monotonic() - start_s
+
+
+@contextmanager
+def _colmap_in(work: Path) -> Iterator[None]:
+    """Says in one line what COLMAP could not do: most likely, write its database there."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        free_mb = shutil.disk_usage(work).free // 1_000_000
+        raise MapError(
+            f"{work}: structure from motion failed there, with {free_mb} MB free: {reason:.200}"
+        ) from error
 
 
 def _notes(images: int, registered: int, structure: Structure) -> list[str]:
