@@ -187,8 +187,9 @@ class Cache:
         # SQLite keeps a value of any type in any column.
         if [type(value) for value in row] != [int, int, int, bytes, bytes]:
             raise EntryError("not an entry")
-        entry = Entry(*row[:3], row[4])
-        if _digest(key, entry) != row[3]:
+        kind, rows, columns, digest, data = row
+        entry = Entry(kind, rows, columns, data)
+        if _digest(key, entry) != digest:
             raise EntryError("its digest is another")
         return entry
 

@@ -102,8 +102,8 @@ def verify_pair(first: Side, second: Side, rules: Rules, camera_matrix: F64) -> 
     # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
     # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
     if rules.preview:
-        strongest = (side[0][: rules.preview] for side in (first, second))
-        if len(mutual_matches(*strongest, rules.ratio)) < rules.preview_matches:
+        few, others = first[0][: rules.preview], second[0][: rules.preview]
+        if len(mutual_matches(few, others, rules.ratio)) < rules.preview_matches:
             return None
     matches = mutual_matches(first[0], second[0], rules.ratio)
     if len(matches) < rules.min_inliers:
