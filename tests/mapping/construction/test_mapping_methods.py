@@ -1,0 +1,58 @@
+"""Every method of structure from motion gives the map, and what is finished is not done again."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import corridor_geometry as geometry
+import numpy as np
+import pytest
+
+from ground_station.mapping.construction import structure
+from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm import colmap, global_mapping
+from ground_station.mapping.sfm.incremental import Incremental
+
+SHIPPED = MappingSettings()
+
+
+def _settings(method: str) -> MappingSettings:
+    return dataclasses.replace(SHIPPED, sfm=dataclasses.replace(SHIPPED.sfm, method=method))
+
+
+@pytest.fixture(scope="module")
+def corridor() -> geometry.Corridor:
+    return geometry.make_corridor(frames=30, bays=3, own=110, alike=0)
+
+
+def _reconstruct(corridor, method, work) -> structure.Structure:
+    return structure.reconstruct(
+        corridor.images, corridor.pairs, corridor.camera, _settings(method), 1, work
+    )
+
+
+@pytest.mark.parametrize("method", ["incremental", "global", "auto"])
+def test_each_method_places_every_image_and_does_it_once(corridor, method, tmp_path, monkeypatch):
+    found = _reconstruct(corridor, method, tmp_path)
+    off = geometry.error_m(corridor, found.reconstruction)
+    assert len(off) == 30 and off.max() < 0.03
+    before = colmap.to_arrays(found.reconstruction).wTc
+
+    def never(*_, **__):
+        raise AssertionError("what was finished ran again")
+
+    monkeypatch.setattr(colmap.pycolmap, "global_mapping", never)
+    monkeypatch.setattr(Incremental, "_batch", never)
+    again = _reconstruct(corridor, method, tmp_path)
+    assert np.abs(colmap.to_arrays(again.reconstruction).wTc - before).max() < 1e-9
+
+
+def test_auto_falls_back_where_the_global_method_leaves_images_out(corridor, tmp_path, monkeypatch):
+    monkeypatch.setattr(global_mapping, "reconstruct", lambda *_: [])
+    assert _reconstruct(corridor, "auto", tmp_path / "auto").sizes == [30]
+    with pytest.raises(structure.MapError, match="found no pair of images to start from"):
+        _reconstruct(
+            dataclasses.replace(corridor, pairs=dict(list(corridor.pairs.items())[:1])),
+            "auto",
+            tmp_path / "nothing",
+        )
