@@ -7,6 +7,8 @@ import operator
 import os
 import signal
 import threading
+from concurrent.futures import CancelledError
+from pathlib import Path
 
 import pytest
 
@@ -140,6 +142,52 @@ def test_workers_with_another_program_are_refused_by_name():
         dask.checked(ours | {"blimp": "9"}, SETTINGS, operator.add, 1, 2)
 
 
+class _Failing(_Client):
+    """A client whose every call fails in one way."""
+
+    def __init__(self, error, status="running"):
+        self.error, self.status, self.sent = error, status, 0
+
+    def nthreads(self):
+        return {"tcp://one": 1}
+
+    def submit(self, *_, **__):
+        self.sent += 1
+        return self
+
+    def result(self, timeout):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words", "sent"),
+    [
+        (
+            dask.distributed.KilledWorker("task", None, 3),
+            "running",
+            "one task ended every worker",
+            1,
+        ),
+        (CancelledError("lost"), "running", r"the cluster is gone \(lost\)", 4),
+        (CancelledError("lost"), "closed", r"the cluster is gone \(lost\)", 1),
+        (OSError("closed"), "running", r"the cluster is gone \(closed\)", 1),
+        (ModuleNotFoundError("no ground_station"), "running", "another program: no ground_st", 1),
+        (MapError("a worker has blimp 9"), "running", "^a worker has blimp 9$", 1),
+    ],
+)
+def test_what_stops_a_cluster_is_said_in_one_line(error, status, words, sent):
+    client = _Failing(error, status)
+    workers = dask.Cluster(client, "tls://hall:8786", SETTINGS)
+    with pytest.raises(MapError, match=words) as caught:
+        list(workers.map(abs, [(1,)]))
+    assert "\n" not in str(caught.value) and client.sent == sent
+
+
+def test_a_mistake_of_ours_in_a_worker_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        list(dask.Cluster(_Failing(ZeroDivisionError()), "x", SETTINGS).map(abs, [(1,)]))
+
+
 def _lost_while_under_way(workers, died):
     """Sums with a shared value that dies, with every worker that has it, when a third are sent."""
     with workers.shared([1000]) as (value,):
@@ -178,8 +226,6 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames):
 @pytest.fixture
 def sample_frames():
     """A few frames of the sample's mapping flight, and its camera."""
-    from pathlib import Path
-
     source = open_input(
         Path(__file__).parents[3] / "maps/atrium/mapping.mcap", 30.0, parse_range("0:6")
     )
