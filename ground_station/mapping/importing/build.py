@@ -55,13 +55,14 @@ def import_model(
         place = {name: k for k, name in enumerate(model.names)}
         rows = [place[name] for name in images.names]
         wTc = model.wTc[rows]
-        shared = model.shared_points()[np.ix_(rows, rows)]
         limits = settings.importing
-        pairs = covisible_pairs(shared, least=limits.min_shared, most=limits.covisible)
+        pairs = covisible_pairs(
+            [model.points[row] for row in rows], least=limits.min_shared, most=limits.covisible
+        )
         if not pairs:
             raise InputError(
-                f"no two of the model's images share {limits.min_shared} points: which of them "
-                "see the same is not known"
+                f"no two of the {len(rows)} images share {limits.min_shared} points of the model: "
+                "which of them see the same is not known"
             )
         verified = match(images, wTc, pairs, camera, settings, threads)
         work = folder / "work"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from ground_station.errors import MapError
 from ground_station.geometry import poses
@@ -18,21 +19,31 @@ from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 
 F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
+
+_ROWS = 256
 
 
-def covisible_pairs(shared: I64, *, least: int, most: int) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, sorted, of the `most` images each that share most points with it.
+def covisible_pairs(
+    points: Sequence[npt.NDArray[np.uint64]], *, least: int, most: int
+) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, sorted: each image with the `most` that share most points with it.
 
-    `shared` (K, K), points that two images both see; pairs with fewer than `least` are left out.
+    `points`, K arrays, are the different points that each image sees; pairs that share fewer than
+    `least` are left out.
     """
-    counts = shared.copy()
-    np.fill_diagonal(counts, 0)
+    offset = np.cumsum([0, *map(len, points)])
+    _, column = np.unique(np.concatenate([*points, np.empty(0, np.uint64)]), return_inverse=True)
+    width = int(column.max(initial=0)) + 1
+    ones = np.ones(len(column), np.int32)
+    sees = csr_array((ones, column.ravel(), offset), shape=(len(points), width))
     pairs = set()
-    for i, row in enumerate(counts):
-        for j in np.argsort(-row, kind="stable")[:most].tolist():
-            if row[j] >= least:
-                pairs.add((min(i, j), max(i, j)))
+    for start in range(0, len(points), _ROWS):  # of a large model, all pairs fill the memory
+        shared = (sees[start : start + _ROWS] @ sees.T).toarray()
+        for i, row in enumerate(shared, start=start):
+            row[i] = 0
+            for j in np.argsort(-row, kind="stable")[:most].tolist():
+                if row[j] >= least:
+                    pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from ground_station.errors import CameraError, MapError
@@ -24,7 +23,6 @@ from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
 F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _ORDER = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -49,18 +47,6 @@ class ForeignModel:
     wTc: F64
     camera: Camera
     points: list[npt.NDArray[np.uint64]]
-
-    def shared_points(self) -> npt.NDArray[np.int64]:
-        """How many points two images both see (K, K); on the diagonal, how many one sees."""
-        count = [len(numbers) for numbers in self.points]
-        everything = np.concatenate([*self.points, np.empty(0, np.uint64)])
-        _, column = np.unique(everything, return_inverse=True)
-        row = np.repeat(np.arange(len(count)), count)
-        width = int(column.max(initial=-1)) + 1
-        sees = csr_array(
-            (np.ones(len(row), np.int64), (row, column.ravel())), shape=(len(count), max(width, 1))
-        )
-        return np.asarray((sees @ sees.T).toarray(), np.int64)
 
 
 def read(folder: str | Path) -> ForeignModel:

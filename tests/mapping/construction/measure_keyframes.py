@@ -27,6 +27,7 @@ from ground_station.geometry.alignment import align
 from ground_station.mapping.construction import keyframes
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import ChosenFrames
+from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.flight import FlightRecording, trajectory_of
 
@@ -41,7 +42,8 @@ def build(flight: Path, indices: list[int], settings: MappingSettings) -> dict[s
     began_s = time.monotonic()
     try:
         assert source.camera is not None
-        map_ = build_map(source, source.camera, settings, folder / "map", total=len(indices))
+        build_map(source, source.camera, settings, folder / "map", total=len(indices))
+        map_ = straighten(folder / "map", settings)
     finally:
         shutil.rmtree(folder)
     kf = map_.keyframes

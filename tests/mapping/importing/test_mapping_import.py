@@ -141,7 +141,7 @@ def test_pictures_of_another_place_are_refused(
     ("changes", "error", "words"),
     [
         ({"names": []}, InputError, "at least 2 frames; the input has 0"),
-        ({"points": 16 * [np.empty(0, np.uint64)]}, InputError, "share 15 points"),
+        ({"points": 16 * [np.empty(0, np.uint64)]}, InputError, "share 15 points of the model"),
     ],
 )
 def test_a_model_without_pictures_or_points_is_refused(
@@ -208,6 +208,12 @@ def test_epipolar_distances_are_those_of_the_geometry(scene):
 
 
 def test_pairs_are_those_that_share_most():
-    shared = np.array([[99, 30, 5, 20], [30, 99, 40, 0], [5, 40, 99, 0], [20, 0, 0, 99]])
-    assert covisible_pairs(shared, least=10, most=1) == [(0, 1), (0, 3), (1, 2)]
-    assert covisible_pairs(shared, least=25, most=9) == [(0, 1), (1, 2)]
+    shared = {(0, 1): 30, (0, 2): 5, (0, 3): 20, (1, 2): 40}
+    points = [[], [], [], []]
+    for number, (pair, count) in enumerate(shared.items()):
+        for image in pair:
+            points[image] += range(100 * number, 100 * number + count)
+    arrays = [np.array(numbers, np.uint64) for numbers in points]
+    assert covisible_pairs(arrays, least=10, most=1) == [(0, 1), (0, 3), (1, 2)]
+    assert covisible_pairs(arrays, least=25, most=9) == [(0, 1), (1, 2)]
+    assert covisible_pairs([np.empty(0, np.uint64)] * 3, least=1, most=9) == []
