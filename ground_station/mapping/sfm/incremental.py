@@ -33,6 +33,8 @@ _LEVELS = 5
 """How often the demands on the first pair are halved, in turn its matches and its angle."""
 _STUBBORN = 30
 """After so many images in a row that do not fit, a small model is given up."""
+_GIVEN_UP = 20
+"""After so many further models that stayed small, what is left is in pieces."""
 _DONE = "done"
 
 
@@ -102,6 +104,8 @@ class Incremental:
         if (self._work / _DONE).exists() and models:
             return models
         while len(models) < self._options.max_num_models:
+            if models and self._total(models) >= self._cache.num_images() - 1:
+                break
             found = self._next_model(models, level, None if models else start)
             if found is None:
                 break
@@ -109,8 +113,6 @@ class Incremental:
             self._finished.save(f"{len(models):02d}", model, level=level)
             self._snapshots.sweep("", kept=0)
             models.append(model)
-            if self._total(models) >= self._cache.num_images() - 1:
-                break
         (self._work / _DONE).touch()
         return models
 
@@ -180,15 +182,15 @@ class Incremental:
             level, batch, more = state["level"], state["batch"], bool(state["more"])
         if start is not None:
             self._count(start)
-        searching = self._mapper(models)
-        while level < _LEVELS:
+        searching, small = self._mapper(models), 0
+        while level < _LEVELS and not (models and small >= _GIVEN_UP):
             model = start if start is not None else self._first_pair(searching, level)
             if model is None:
                 level += 1
                 searching.reset_initialization_stats()
                 continue
             model = self._grow(model, models, level, batch, more)
-            start, batch, more = None, 0, True
+            start, batch, more, small = None, 0, True, small + 1
             if model.num_reg_images() >= self._options.min_model_size or (
                 not models and model.num_reg_images() > 1
             ):
@@ -229,7 +231,7 @@ class Incremental:
         """All batches that are left; each ends on disk and the next begins there."""
         while more:
             more = self._batch(model, models)
-            if model.num_reg_images() < 2:
+            if model.num_reg_images() < self._options.min_model_size:
                 return model
             batch += 1
             name = f"{len(models):02d}-{batch:06d}"
