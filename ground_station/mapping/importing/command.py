@@ -5,13 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ground_station.files import write_json
 from ground_station.mapping.table import print_table
-
-if TYPE_CHECKING:
-    from ground_station.geometry.camera import Camera
 
 HELP = "Makes a map of a COLMAP model and its pictures."
 
@@ -23,8 +20,6 @@ examples:
 MODEL is a folder with cameras, images and points3D, binary or text, from COLMAP or hloc, whatever
 its features were. Poses and camera are taken over; landmarks are made anew of the pictures. The
 map is in the model's coordinates, which have no units: blimp map register follows."""
-
-_DIFFER_PX = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--features", help="extractor or model by name (default: the settings')")
     parser.add_argument(
         "--camera", metavar="TOML",
-        help="of the pictures, where the model's is of undistorted ones (default: the model's)",
+        help="of the pictures, where the model is of undistorted ones (default: the model's)",
     )  # fmt: skip
     parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
     parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
@@ -51,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.geometry.camera import load_camera
     from ground_station.mapping.folder import check_target
     from ground_station.mapping.importing.build import import_model
-    from ground_station.mapping.importing.pictures import open_pictures
+    from ground_station.mapping.importing.pictures import open_pictures, taken_by
     from ground_station.mapping.inspection.summary import describe
     from ground_station.mapping.settings import load_settings, with_changes
     from ground_station.mapping.sfm.foreign import read
@@ -62,9 +57,10 @@ def run(args: argparse.Namespace) -> int:
     model = read(args.model)
     pictures = open_pictures(args.images, model.names, args.rate_hz)
     camera = load_camera(args.camera) if args.camera else model.camera
-    carried = None if isinstance(pictures.source, Path) else pictures.source.camera
-    if carried is not None and not args.camera:
-        _compare(args.images, carried, camera)
+    if not args.camera and pictures.camera is not None:
+        camera, note = taken_by(model.camera, pictures.camera)
+        if note:
+            print(f"note: {args.images}: {note}; --camera takes another", file=sys.stderr)
     built: dict[str, Any] = {
         "source": "COLMAP model",
         "model": Path(args.model).resolve().name,
@@ -73,25 +69,9 @@ def run(args: argparse.Namespace) -> int:
         "rate_hz": args.rate_hz,
     }
     map_ = import_model(model, pictures, camera, settings, args.out, built=built)
-    if not isinstance(pictures.source, Path):
-        for note in pictures.source.notes:
-            print(f"note: {note}", file=sys.stderr)
+    for note in pictures.notes:
+        print(f"note: {note}", file=sys.stderr)
     print_table(describe(map_))
     if args.json:
         write_json(args.json, describe(map_))
     return 0
-
-
-def _compare(path: str, carried: Camera, taken: Camera) -> None:
-    """A note where the input's own camera sees another picture than the model's."""
-    import numpy as np
-
-    v, u = np.mgrid[0 : taken.height_px : 16, 0 : taken.width_px : 16]
-    grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
-    off_px = np.linalg.norm(carried.distort(taken.undistort(grid)) - grid, axis=1).max()
-    if off_px > _DIFFER_PX:
-        print(
-            f"note: {path} carries a camera that is up to {off_px:.1f} px off the model's, "
-            "which is taken; --camera takes another",
-            file=sys.stderr,
-        )

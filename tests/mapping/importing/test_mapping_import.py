@@ -18,7 +18,7 @@ from ground_station.localization.settings import load_preset
 from ground_station.mapping import command, store
 from ground_station.mapping.importing.build import import_model
 from ground_station.mapping.importing.matching import covisible_pairs, epipolar_px, essential
-from ground_station.mapping.importing.pictures import open_pictures
+from ground_station.mapping.importing.pictures import open_pictures, taken_by
 from ground_station.mapping.sfm import colmap, foreign
 
 
@@ -187,6 +187,19 @@ def test_frames_of_a_recording_are_found_by_their_numbers():
     ]  # fmt: skip
     with pytest.raises(InputError, match="would be the same frame"):
         list(Pictures(["frame-000001.png", "frame-000001.jpg"], Source(), 30.0, "walk"))
+
+
+def test_a_recordings_camera_counts_where_the_model_is_of_undistorted_pictures(scene):
+    ours = scene.camera
+    flat = dataclasses.replace(ours, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, readout_s=0.0)
+    camera, note = taken_by(flat, ours)
+    assert camera == ours and "undistorted" in note
+    assert taken_by(flat, flat) == (flat, "")
+    near = dataclasses.replace(ours, fx_px=ours.fx_px + 0.5)
+    assert taken_by(near, ours) == (near, "")
+    far = dataclasses.replace(ours, k1=0.0)
+    camera, note = taken_by(far, ours)
+    assert camera == far and "px off the model's, which is taken" in note
 
 
 def test_epipolar_distances_are_those_of_the_geometry(scene):
