@@ -1,6 +1,6 @@
 """The corridor: 28 x 4 x 3 m, seven bays of one kind, to tell whether a map knows them apart.
 
-Doors and posters hang at the same places in every bay and are equal prints, to the last pixel.
+Doors, posters, pilasters and benches are in the same places of every bay and equal prints.
 What differs is what differs in a building, too: the paint and the dirt on it, the floor. x runs
 along the corridor, z up; the origin is the south-west corner on the floor. Plan: `corridor`.
 """
@@ -32,6 +32,9 @@ def _bay(b: SceneBuilder, x: float, known: list[KnownPoint], number: int) -> Non
     for k, a in enumerate((x + 0.42, x + 1.5)):
         b.rectangle([a, north - 0.05, 0], [0.08, 0, 0], [0, 0, 2.18], "wood", upright=True,
                     print=_FRAME + k)  # fmt: skip
+    b.box([x - 0.15, north - 0.22, 0], [x + 0.15, north, HEIGHT_M], "concrete", rgb=_GREY,
+          faces=("-y", "-x", "+x"), print=_FRAME + 10)  # fmt: skip
+    b.box([x + 2.0, north - 0.5, 0.4], [x + 3.8, north - 0.08, 0.5], "wood", print=_FRAME + 20)
     sign = b.rectangle([x + 1.8, north - 0.02, 0.9], [0.85, 0, 0], [0, 0, 1.2], "poster",
                        text="SAFETY", detail=1.6, print=_LEFT)  # fmt: skip
     b.rectangle([x + 2.85, north - 0.02, 0.7], [1.0, 0, 0], [0, 0, 1.6], "poster", text="NEWS",
