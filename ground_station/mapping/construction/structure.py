@@ -161,25 +161,26 @@ class _Reconstruction:
         self, mapping: Incremental, models: list[colmap.Reconstruction], pairs: Pairs
     ) -> tuple[list[colmap.Reconstruction], list[str]]:
         largest, *others = sorted(models, key=lambda model: -model.num_reg_images())
-        notes = []
-        again = True
-        while again and others:
-            again, apart, missing = False, [], []
-            for other in others:
+        notes: list[str] = []
+        missing: list[str] = []
+        joined = True
+        while joined and others:
+            joined = False
+            waiting, others, missing = others, [], []
+            for other in waiting:
                 source, target = self._placed(other), self._placed(largest)
                 if source.wTc.keys() <= target.wTc.keys():
                     continue
                 junction = merging.junction(target, source, pairs, self._wanted.seed)
                 if junction.similarity is None:
-                    apart.append(other)
+                    others.append(other)
                     missing.append(merging.describe(other, self._images.names, junction.missing))
                     continue
                 new = merging.poses_in(source, junction.similarity, set(target.wTc))
                 largest = mapping.with_images(largest, new)
                 notes.append(f"a model of {len(source.wTc)} images joined to the largest")
-                again = True
-            others = apart
-        return [largest, *others], notes + (missing if others else [])
+                joined = True
+        return [largest, *others], notes + missing
 
     def _placed(self, model: colmap.Reconstruction) -> Placed:
         return Placed.of(colmap.to_arrays(model), self._counts)

@@ -48,7 +48,8 @@ def believed(
     home = {k: number for number, model in enumerate(models) for k in model.wTc}
     kept = {pair for pair in pairs if pair in links or not {*pair} <= home.keys()}
     for number, model in enumerate(models):
-        loops, moved = [], []
+        loops: list[Pair] = []
+        moved: list[F64] = []
         for pair in sorted(pairs.keys() - kept):
             if home[pair[0]] == home[pair[1]] == number:
                 by = _moved(model, pair, pairs[pair])
