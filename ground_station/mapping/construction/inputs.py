@@ -18,7 +18,7 @@ from typing import Any
 from ground_station.errors import CameraError, InputError
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.mapping.construction import keyframes
-from ground_station.mapping.construction.keyframes import Keyframes
+from ground_station.mapping.construction.keyframes import Choice
 from ground_station.mapping.construction.motion import Figures
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
@@ -153,7 +153,7 @@ def _measured(
         return [keyframes.measure(counted(s), camera, settings.keyframes) for s in sources]
 
 
-def _said(total: int, chosen: Keyframes, settings: MappingSettings) -> list[str]:
+def _said(total: int, chosen: Choice, settings: MappingSettings) -> list[str]:
     lines = [f"{total} frames; {len(chosen)} keyframes are used"]
     if chosen.due > len(chosen):
         lines[0] += (

@@ -31,11 +31,11 @@ _SHARP_QUANTILE = 75.0
 """Of the frames around: half of them may be blurred, and the others still tell what sharp is."""
 _BRIDGED = 3.0
 """Sharp keyframes no further apart than this still link without a blurred one between them."""
-_HALVINGS = 40
+_HALVINGS = 24
 
 
 @dataclass(frozen=True)
-class Keyframes:
+class Choice:
     """The chosen frames of each input, as their indices in it (K,), increasing.
 
     `due` is how many there would be without a limit, `spacing` how far apart they are, 1 where the
@@ -65,7 +65,7 @@ def measure(frames: Iterable[Frame], camera: Camera, settings: KeyframeSettings)
     return motion.figures()
 
 
-def choose(figures: Sequence[Figures], most: int, settings: KeyframeSettings) -> Keyframes:
+def choose(figures: Sequence[Figures], most: int, settings: KeyframeSettings) -> Choice:
     """At most `most` keyframes of all inputs, each input judged by itself.
 
     A frame much less sharp than those around it (`min_sharpness`) is taken only where no other
@@ -75,13 +75,13 @@ def choose(figures: Sequence[Figures], most: int, settings: KeyframeSettings) ->
     """
     sharp = [relative_sharpness(f) for f in figures]
 
-    def at(spacing: float) -> Keyframes:
+    def at(spacing: float) -> Choice:
         parts = [
             _spaced(f, s, spacing, settings.min_sharpness)
             for f, s in zip(figures, sharp, strict=True)
         ]
         index = [f.index[rows] for f, (rows, _) in zip(figures, parts, strict=True)]
-        return Keyframes(index, 0, spacing, sum(blurred for _, blurred in parts))
+        return Choice(index, 0, spacing, sum(blurred for _, blurred in parts))
 
     wanted = at(1.0)
     due = len(wanted)
@@ -95,7 +95,7 @@ def choose(figures: Sequence[Figures], most: int, settings: KeyframeSettings) ->
                 near = middle
             else:
                 far, wanted = middle, tried
-    return Keyframes(wanted.index, due, wanted.spacing, wanted.blurred)
+    return Choice(wanted.index, due, wanted.spacing, wanted.blurred)
 
 
 def relative_sharpness(figures: Figures) -> F64:

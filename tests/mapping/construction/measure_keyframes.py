@@ -28,7 +28,7 @@ from ground_station.mapping.construction import keyframes
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import ChosenFrames
 from ground_station.mapping.refinement.refine import straighten
-from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.settings import MappingSettings, load_settings
 from ground_station.recording.flight import FlightRecording, trajectory_of
 
 ROOT = Path(__file__).parents[3]
@@ -64,10 +64,11 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("flight", type=Path, nargs="?", default=ROOT / "maps/atrium/flight.mcap")
     parser.add_argument("--most", type=int, nargs="+", default=[1000, 60])
+    parser.add_argument("--settings", type=Path, help="settings file (default: the shipped)")
     parser.add_argument("--no-maps", action="store_true", help="choose only")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    settings = MappingSettings()
+    settings = load_settings(args.settings)
     source = FlightRecording(args.flight)
     assert source.camera is not None
     began_s, cpu_s = time.monotonic(), time.process_time()
