@@ -126,6 +126,17 @@ class CodedDescriptors(Descriptors):
         return {CODES: np.asarray(self._kept), CODEBOOK: np.asarray(self.codebook, np.float16)}
 
 
+def joined(first: F32 | Descriptors, second: F32 | Descriptors) -> F32 | Descriptors:
+    """The rows of both, one after the other; where the first are bytes, they stay as they are."""
+    if not len(second):
+        return first
+    if isinstance(first, Descriptors):
+        values, more = first.values, next(iter(quantised(second).values()))
+        if values.dtype == more.dtype:
+            return Descriptors(np.concatenate([values, more]))
+    return np.concatenate([first[:], second[:]])
+
+
 def quantised(
     descriptors: F32 | Descriptors, *, coded: bool = False
 ) -> dict[str, npt.NDArray[Any]]:
@@ -155,28 +166,30 @@ def _unit(rows: F32) -> F32:
     return rows
 
 
-def open_descriptors(path: Path, count: int, dimension: int) -> Descriptors:
+def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -> Descriptors:
     """Maps the descriptors (count, dimension) of a map's file into memory without reading them.
 
-    The rest of the file has been checked by safetensors' own reader. Raises `MapError` when they
-    are missing, of another size or type, not finite, or codes of no word. The file may be replaced
-    by renaming while it is mapped, but not be written to.
+    The prefix stands before their arrays' names. The rest of the file has been checked by
+    safetensors' own reader. Raises `MapError` when they are missing, of another size or type, not
+    finite, or codes of no word. The file may be replaced by renaming while it is mapped, but not be
+    written to.
     """
     try:
         with path.open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
             header = json.loads(file.read(length))
-            name = next((name for name in (*NAMES, CODES) if name in header), None)
-            if name is None:
-                raise MapError(f"{path}: it holds no descriptors")
-            if name == CODES:
-                codes = _mapped(file, path, header, length, CODES, "U8")
-                codebook = _mapped(file, path, header, length, CODEBOOK, "F16")
+            found = next((name for name in (*NAMES, CODES) if prefix + name in header), None)
+            if found is None:
+                raise MapError(f"{path}: it holds no {prefix}descriptors")
+            if found == CODES:
+                codes = _mapped(file, path, header, length, prefix + CODES, "U8")
+                codebook = _mapped(file, path, header, length, prefix + CODEBOOK, "F16")
                 return _coded(path, codes, codebook, (count, dimension))
+            name = prefix + found
             shape = tuple(header[name]["shape"])
             if shape != (count, dimension):
                 raise MapError(f"{path}: descriptors are {shape}, not ({count}, {dimension})")
-            kind = next(k for k, dtype in _SAFETENSORS_TYPES.items() if dtype == NAMES[name])
+            kind = next(k for k, dtype in _SAFETENSORS_TYPES.items() if dtype == NAMES[found])
             values = _mapped(file, path, header, length, name, kind)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

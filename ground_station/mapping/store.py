@@ -17,6 +17,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import compact
 from ground_station.mapping.descriptors import Descriptors, open_descriptors, quantised
+from ground_station.mapping.modes import MOST, Modes
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
@@ -94,6 +95,8 @@ class MapInfo:
     built: dict[str, Any] = field(default_factory=dict)
     registration: dict[str, Any] = field(default_factory=dict)
     refined: dict[str, Any] = field(default_factory=dict)
+    extended: dict[str, Any] = field(default_factory=dict)
+    """What `blimp map extend` added; empty for a map that never was."""
     compressed: dict[str, Any] = field(default_factory=dict)
     """What `blimp map compress` did; empty for a map that is whole."""
 
@@ -105,12 +108,16 @@ class MapInfo:
 
 @dataclass
 class Map:
-    """A map in memory; `folder` is where it was read from or goes to."""
+    """A map in memory; `folder` is where it was read from or goes to.
+
+    `modes` are further descriptors of its landmarks, where it has any.
+    """
 
     info: MapInfo
     landmarks: Landmarks
     keyframes: Keyframes
     folder: Path | None = None
+    modes: Modes | None = None
 
 
 _Arrays = compact.Arrays
@@ -124,6 +131,9 @@ _LANDMARKS: compact.Layout = {
     "distance_m": ("float32", (2,)),
     "observations": ("int32", ()),
 }
+_MODES: compact.Layout = {"mode_landmark": ("int32", ())}
+_OF_MODES = "mode_"
+"""Stands before the names of the modes' descriptors, which are called as the landmarks' own."""
 _KEYFRAMES: compact.Layout = {
     "time_ns": ("int64", ()),
     "wTc": ("float64", (4, 4)),
@@ -148,10 +158,21 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
         arrays |= quantised(lm.descriptor)
     else:
         arrays["descriptor"] = np.asarray(lm.descriptor, np.float32)
+    if map_.modes is not None and len(map_.modes):
+        rows = {"descriptor": np.asarray(map_.modes.descriptor, np.float32)}
+        if quantise or info.format == COMPACT:
+            rows = quantised(map_.modes.descriptor)
+        arrays["mode_landmark"] = map_.modes.landmark
+        arrays |= {_OF_MODES + name: array for name, array in rows.items()}
     form = str(info.format)
     _save(folder / "landmarks.safetensors", arrays, {"format": form})
     names = "\n".join(kf.names)
     _save(folder / "keyframes.safetensors", sights, {"format": form, "names": names})
+    save_info(folder, info)
+
+
+def save_info(folder: Path, info: MapInfo) -> None:
+    """Writes `map.toml` alone, beside and renamed."""
     document = {
         "format": info.format,
         "name": info.name,
@@ -167,6 +188,8 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
         "registration": info.registration,
         "refined": info.refined,
     }
+    if info.extended:
+        document["extended"] = info.extended
     if info.compressed:
         document["compressed"] = info.compressed
     path = folder / "map.toml"
@@ -208,6 +231,7 @@ def load_info(folder: str | Path) -> MapInfo:
             built=dict(document.get("built", {})),
             registration=dict(document.get("registration", {})),
             refined=dict(document.get("refined", {})),
+            extended=dict(document.get("extended", {})),
             compressed=dict(document.get("compressed", {})),
             format=int(document["format"]),
         )
@@ -225,6 +249,7 @@ def load(folder: str | Path) -> Map:
     arrays = _landmarks(path, info.format)
     m = len(arrays["id"])
     descriptor = open_descriptors(path, m, info.dimension)
+    modes = _modes(path, m, info.dimension)
     landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
     path = folder / "keyframes.safetensors"
     arrays, metadata = _keyframes(path, info.format)
@@ -243,7 +268,21 @@ def load(folder: str | Path) -> Map:
         or (o and (keyframes.landmark.min() < 0 or keyframes.landmark.max() >= m))
     ):
         raise MapError(f"{path}: its arrays do not fit each other")
-    return Map(info, landmarks, keyframes, folder)
+    return Map(info, landmarks, keyframes, folder, modes)
+
+
+def _modes(path: Path, count: int, dimension: int) -> Modes | None:
+    """The modes of a file of `count` landmarks, where it has any."""
+    arrays, _ = _read(path, {}, _MODES)
+    landmark = arrays.get("mode_landmark")
+    if landmark is None:
+        return None
+    if (landmark < 0).any() or (landmark >= count).any() or (np.diff(landmark) < 0).any():
+        raise MapError(f"{path}: 'mode_landmark' does not name its landmarks in order")
+    if len(landmark) and np.bincount(landmark).max() > MOST:
+        raise MapError(f"{path}: a landmark has more than {MOST} modes")
+    descriptor = open_descriptors(path, len(landmark), dimension, _OF_MODES)
+    return Modes(landmark, descriptor) if len(landmark) else None
 
 
 def load_positions(folder: str | Path) -> F64:
@@ -278,17 +317,22 @@ def _unpacked(path: Path, unpack: Callable[[_Arrays], _Arrays], arrays: _Arrays)
         raise MapError(f"{path}: {error}") from None
 
 
-def _read(path: Path, wanted: compact.Layout) -> tuple[_Arrays, dict[str, str]]:
+def _read(
+    path: Path, wanted: compact.Layout, optional: compact.Layout | None = None
+) -> tuple[_Arrays, dict[str, str]]:
+    every = wanted | (optional or {})
     try:
         with safe_open(path, framework="numpy") as file:
-            names = [name for name in file.keys() if name in wanted]  # noqa: SIM118
+            names = [name for name in file.keys() if name in every]  # noqa: SIM118
             arrays = {name: file.get_tensor(name) for name in names}
             metadata = file.metadata() or {}
     except (SafetensorError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{path}: {reason}") from None
-    for name, (dtype, shape) in wanted.items():
+    for name, (dtype, shape) in every.items():
         if name not in arrays:
+            if name not in wanted:
+                continue
             raise MapError(f"{path}: the array '{name}' is missing")
         array = arrays[name]
         if str(array.dtype) not in dtype.split("|") or array.ndim == 0 or array.shape[1:] != shape:
