@@ -56,6 +56,7 @@ def associate(
     radius_px: float | Array | None = None,
     max_distance: Array | F32 | None = None,
     innovation_px2: Array | None = None,
+    shows: Indices | None = None,
 ) -> Associations:
     """Pairs features (F, 2), (F, D) with expected landmarks (L, 2), (L, D), all unit descriptors.
 
@@ -68,6 +69,10 @@ def associate(
     rival either. `innovation_px2` (L, 2, 2), the covariance of a feature about each landmark's
     projection, also drops pairs beyond its 99 % ellipse. A landmark whose radius, limit or
     covariance is not finite is not paired.
+
+    `shows` (L,) says which landmark, below L, each row describes, where some are described more
+    than once: rows of one landmark are no rivals, the nearest counts, and `candidate` is then the
+    landmark.
     """
     radius = np.asarray(settings.radius_px if radius_px is None else radius_px, np.float64)
     limit = np.asarray(settings.max_descriptor_distance, np.float32)
@@ -103,6 +108,12 @@ def associate(
     order = _by_feature_and_distance(feature, distance, candidate)
     feature, candidate, distance = feature[order], candidate[order], distance[order]
     limit = limit[order] if limit.ndim else limit
+    if shows is not None:
+        candidate = shows[candidate]
+        key = feature.astype(np.int64) * len(candidate_px) + candidate
+        first = np.sort(np.unique(key, return_index=True)[1])
+        feature, candidate, distance = feature[first], candidate[first], distance[first]
+        limit = limit[first] if limit.ndim else limit
     new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
     wins = new & (distance < limit)
     if settings.max_ratio < 1.0:

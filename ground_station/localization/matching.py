@@ -20,6 +20,7 @@ from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import DescriptorThresholds
 from ground_station.localization.verification import Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
+from ground_station.mapping.modes import described
 from ground_station.mapping.store import Map
 
 Array = npt.NDArray[np.float64]
@@ -78,6 +79,7 @@ class Matcher:
 
     def __init__(self, map_: Map, camera: Camera, settings: LocalizerSettings) -> None:
         self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
+        self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
         self._lens = Lens(camera)
         self._index = LandmarkIndex(landmarks)
@@ -114,14 +116,23 @@ class Matcher:
             if radius_px is None:
                 radius = self._radius_px(points, expected)
         watch.lap("projection")
+        limits = self.thresholds.limits(projected.landmark) if self.thresholds else None
+        rows, mode = described(landmarks.descriptor, self._modes, projected.landmark)
+        shows = None
+        if mode is not None:  # a landmark's modes are looked for where it is itself
+            shows = np.concatenate([np.arange(len(where)), mode])
+            where = where[shows]
+            radius = radius[shows] if isinstance(radius, np.ndarray) else radius
+            limits = limits if limits is None else limits[shows]
         pairs = associate(
             seen.pinhole_px,
             seen.features.descriptors,
             where,
-            landmarks.descriptor[projected.landmark],
+            rows,
             settings.association,
             radius,
-            self.thresholds.limits(projected.landmark) if self.thresholds else None,
+            limits,
+            shows=shows,
         )
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
         watch.lap("association")
@@ -140,7 +151,7 @@ class Matcher:
         looked for. Landmarks shifted aside tell how many do so by chance.
         """
         among = self._index.near(wTc, self._lens, self.settings.projection)
-        witness = Witness(seen.features, seen.pinhole_px, self._lens)
+        witness = Witness(seen.features, seen.pinhole_px, self._lens, self._modes)
         return witness.support(wTc, self.landmarks, among).significance
 
     def sights(

@@ -19,6 +19,7 @@ from ground_station.geometry.lens import Lens
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
 from ground_station.localization.verification import Witness
+from ground_station.mapping.modes import Modes, described
 from ground_station.mapping.store import Landmarks, Map
 
 Array = npt.NDArray[np.float64]
@@ -38,20 +39,27 @@ class Relocalization:
     landmark: Indices
 
 
-def match_all(descriptors: F32, landmarks: F32, max_ratio: float) -> tuple[Indices, Indices]:
+def match_all(
+    descriptors: F32, landmarks: F32, max_ratio: float, mode: Indices | None = None
+) -> tuple[Indices, Indices]:
     """Mutual nearest neighbours of unit descriptors (F, D) and (L, D) that pass the ratio test.
 
     Returns indices (N,) and (N,). The ratio is of L2 distances, over each feature's two nearest.
+    The last Q of L rows may be `mode` (Q,), ascending: further descriptors of landmarks before
+    them. A landmark is then as near as the nearest of its descriptors.
     """
-    count, total = len(descriptors), len(landmarks)
+    modes = 0 if mode is None else len(mode)
+    count, total = len(descriptors), len(landmarks) - modes
     if count == 0 or total < 2:
         return np.empty(0, np.intp), np.empty(0, np.intp)
     best, best_cos = np.empty(count, np.intp), np.empty(count, np.float32)
     second_cos = np.empty(count, np.float32)
     back, back_cos = np.zeros(total, np.intp), np.full(total, -np.inf, np.float32)
-    rows = max(1, _BLOCK // total)
+    rows = max(1, _BLOCK // (total + modes))
     for start in range(0, count, rows):
         cosine = descriptors[start : start + rows] @ landmarks.T
+        if mode is not None:
+            cosine = _nearest_of_each(cosine, total, mode)
         here = np.arange(len(cosine))
         nearest = cosine.argmax(axis=1)
         column = cosine.argmax(axis=0)
@@ -66,6 +74,16 @@ def match_all(descriptors: F32, landmarks: F32, max_ratio: float) -> tuple[Indic
     return feature, best[feature]
 
 
+def _nearest_of_each(cosine: F32, total: int, mode: Indices) -> F32:
+    """Products (F, total) with the nearest of each landmark's rows, from those with all rows."""
+    nearest = cosine[:, :total]
+    turn = np.arange(len(mode)) - np.searchsorted(mode, mode)
+    for k in range(int(turn.max(initial=-1)) + 1):  # a landmark's modes one after the other
+        rows = np.flatnonzero(turn == k)
+        nearest[:, mode[rows]] = np.maximum(nearest[:, mode[rows]], cosine[:, total + rows])
+    return nearest
+
+
 def spread(pixel_px: npt.ArrayLike, camera: Camera) -> float:
     """RMS distance of pixels (N, 2) from their centre, over the image's diagonal; 0 when none."""
     pixels = np.asarray(pixel_px, dtype=np.float64)
@@ -74,6 +92,35 @@ def spread(pixel_px: npt.ArrayLike, camera: Camera) -> float:
     offset = pixels - pixels.mean(axis=0)
     rms = np.sqrt((offset * offset).sum(axis=1).mean())
     return float(rms / np.hypot(camera.width_px, camera.height_px))
+
+
+def pose_from_matches(
+    points_m: Array, pinhole_px: Array, camera: Camera, settings: RecoverySettings, seed: int
+) -> tuple[Array, Indices] | None:
+    """wTc (4, 4) that most points (N, 3) at undistorted pixels (N, 2) agree with, and which do.
+
+    P3P in RANSAC with MAGSAC's score and local optimisation; None where nothing is found.
+    """
+    params = cv2.UsacParams()
+    params.threshold = settings.max_reprojection_px
+    params.maxIterations = settings.max_iterations
+    params.confidence = 0.9999
+    params.randomGeneratorState = seed
+    params.sampler = cv2.SAMPLING_UNIFORM
+    params.score = cv2.SCORE_METHOD_MAGSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params.loIterations = 10
+    params.loSampleSize = 30
+    try:
+        found, _, rvec, tvec, inliers = cv2.solvePnPRansac(
+            points_m, pinhole_px, camera.matrix, None, params=params
+        )
+    except cv2.error:
+        return None
+    if not found or inliers is None or not np.isfinite(np.r_[rvec.ravel(), tvec.ravel()]).all():
+        return None
+    wTc = poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], tvec.ravel()))
+    return wTc, np.asarray(inliers.ravel(), np.intp)
 
 
 _RETRIEVED, _PLACES, _MIN_SHARED = 24, 3, 0.15
@@ -101,45 +148,36 @@ class _Search:
         lens: Lens,
         settings: RecoverySettings,
         seed: int,
+        modes: Modes | None,
     ) -> None:
         camera = lens.camera
+        self.modes = modes
         self.camera, self.landmarks, self.settings, self.seed = camera, landmarks, settings, seed
         self.features = features
         focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
         self.pinhole_px = normalized * focal + centre
-        self.witness = Witness(features, self.pinhole_px, lens)
+        self.witness = Witness(features, self.pinhole_px, lens, modes)
 
     def propose(self, candidates: Indices) -> Array | str:
         """wTc from matches with some landmarks (M,), or why there is none."""
         settings, lm = self.settings, self.landmarks
-        feature, row = match_all(
-            self.features.descriptors, lm.descriptor[candidates], settings.max_ratio
-        )
+        rows, mode = described(lm.descriptor, self.modes, candidates)
+        feature, row = match_all(self.features.descriptors, rows, settings.max_ratio, mode)
         if len(feature) < _MIN_MATCHED:
             return f"{len(feature)} matches"
-        landmark = candidates[row]
-        params = cv2.UsacParams()
-        params.threshold = settings.max_reprojection_px
-        params.maxIterations = settings.max_iterations
-        params.confidence = 0.9999
-        params.randomGeneratorState = self.seed
-        params.sampler = cv2.SAMPLING_UNIFORM
-        params.score = cv2.SCORE_METHOD_MAGSAC
-        params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-        params.loIterations = 10
-        params.loSampleSize = 30
-        try:
-            found, _, rvec, tvec, inliers = cv2.solvePnPRansac(
-                lm.position_m[landmark], self.pinhole_px[feature], self.camera.matrix, None,
-                params=params,
-            )  # fmt: skip
-        except cv2.error:
+        found = pose_from_matches(
+            lm.position_m[candidates[row]],
+            self.pinhole_px[feature],
+            self.camera,
+            settings,
+            self.seed,
+        )
+        if found is None:
             return "no pose explains the matches"
-        if not found or inliers is None or not np.isfinite(np.r_[rvec.ravel(), tvec.ravel()]).all():
-            return "no pose explains the matches"
+        wTc, inliers = found
         if len(inliers) < max(_MIN_MATCHED, settings.min_inlier_share * len(feature)):
             return f"{len(inliers)} inliers of {len(feature)} matches"
-        return poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], tvec.ravel()))
+        return wTc
 
     def confirm(self, wTc: Array, expected: Indices) -> Relocalization | str:
         """The pose refined over all landmarks that should be seen, or why it is refused."""
@@ -199,11 +237,11 @@ class Relocalizer:
     """Finds frames in one map, whose keyframes are indexed once."""
 
     def __init__(self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int) -> None:
-        self._landmarks, self._keyframes = map_.landmarks, map_.keyframes
+        self._landmarks, self._keyframes, self._modes = map_.landmarks, map_.keyframes, map_.modes
         self._lens, self._settings, self._seed = Lens(camera), settings, seed
         self._index: PlaceIndex | None = None
         if len(map_.keyframes):
-            self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed)
+            self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed, map_.modes)
 
     def find(self, features: Features, normalized: Array) -> Relocalization | str:
         """The pose of a frame anywhere in the map, or the reason why there is none.
@@ -217,7 +255,13 @@ class Relocalizer:
         if not len(features):
             return "no features"
         search = _Search(
-            features, normalized, self._landmarks, self._lens, self._settings, self._seed
+            features,
+            normalized,
+            self._landmarks,
+            self._lens,
+            self._settings,
+            self._seed,
+            self._modes,
         )
         if self._index is None:
             return _only_place(search)

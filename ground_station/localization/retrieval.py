@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from ground_station.mapping.descriptors import Descriptors
+from ground_station.mapping.descriptors import Descriptors, joined
+from ground_station.mapping.modes import Modes
 from ground_station.mapping.store import Keyframes, Landmarks
 
 F32 = npt.NDArray[np.float32]
@@ -70,17 +71,24 @@ class PlaceIndex:
 
     The cost of a query grows with the root of the landmarks until there are two million, beyond
     with a two-hundredth of them. Holds a copy of the descriptors in the order of their words,
-    quantised as they are.
+    quantised as they are. A landmark's modes lie by their own words and speak for it.
     """
 
-    def __init__(self, landmarks: Landmarks, keyframes: Keyframes, seed: int) -> None:
+    def __init__(
+        self, landmarks: Landmarks, keyframes: Keyframes, seed: int, modes: Modes | None = None
+    ) -> None:
         self._keyframes = keyframes
-        self.words = learn_words(landmarks.descriptor, seed)
-        word = nearest_words(landmarks.descriptor, self.words)[:, 0]
-        self._landmark = np.argsort(word, kind="stable")
-        self._offset = np.searchsorted(word[self._landmark], np.arange(len(self.words) + 1))
-        every = landmarks.descriptor
-        self._rows = (every.values if isinstance(every, Descriptors) else every)[self._landmark]
+        every, self._landmark, self._most = landmarks.descriptor, np.arange(len(landmarks)), 1
+        if modes is not None:
+            every = joined(every, modes.descriptor)
+            self._landmark = np.concatenate([self._landmark, modes.landmark])
+            self._most += int(np.bincount(modes.landmark).max())
+        self.words = learn_words(every, seed)
+        word = nearest_words(every, self.words)[:, 0]
+        order = np.argsort(word, kind="stable")
+        self._landmark = self._landmark[order]
+        self._offset = np.searchsorted(word[order], np.arange(len(self.words) + 1))
+        self._rows = (every.values if isinstance(every, Descriptors) else every)[order]
         # Products with rows as they lie, divided by their lengths: cheaper than unit rows.
         self._length = np.empty(len(every), np.float32)
         block = max(1, _BLOCK // max(self._rows.shape[1], 1))
@@ -121,11 +129,16 @@ class PlaceIndex:
             product = descriptors[rows] @ self._rows[start:stop].astype(np.float32).T
             product /= self._length[start:stop]
             here = np.arange(len(rows))
-            for _ in range(2):
+            for _ in range(1 + self._most):
                 top = product.argmax(axis=1)
                 value, landmark = product[here, top], self._landmark[start + top]
                 product[here, top] = -1
                 first, second = value > cosine[rows, 0], value > cosine[rows, 1]
+                if self._most > 1:  # no landmark is its own second
+                    again = landmark == best[rows, 0]
+                    nearer = rows[first & again]
+                    cosine[nearer, 0] = value[first & again]
+                    first, second = first & ~again, second & ~again
                 moved, placed = rows[first], rows[second & ~first]
                 best[moved, 1], cosine[moved, 1] = best[moved, 0], cosine[moved, 0]
                 best[moved, 0], cosine[moved, 0] = landmark[first], value[first]

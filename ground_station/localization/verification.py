@@ -13,6 +13,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.lens import Lens
 from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import ProjectionSettings
+from ground_station.mapping.modes import Modes, described
 from ground_station.mapping.store import Landmarks
 
 Array = npt.NDArray[np.float64]
@@ -55,9 +56,12 @@ class Support:
 class Witness:
     """A frame's features as a place to look landmarks up in."""
 
-    def __init__(self, features: Features, pinhole_px: Array, lens: Lens) -> None:
-        """`pinhole_px` (F, 2): the features without the lens."""
+    def __init__(
+        self, features: Features, pinhole_px: Array, lens: Lens, modes: Modes | None = None
+    ) -> None:
+        """`pinhole_px` (F, 2): the features without the lens; `modes` of the map's landmarks."""
         self.features, self.pinhole_px, self.lens = features, pinhole_px, lens
+        self._modes = modes
         self._tree = cKDTree(pinhole_px)
 
     def support(self, wTc: Array, landmarks: Landmarks, index: Indices) -> Support:
@@ -75,11 +79,14 @@ class Witness:
         if not len(index):
             return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
         pixel = flat * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-        descriptors = landmarks.descriptor[index]
-        feature, distance = self._near(pixel, descriptors)
+        descriptors, mode = described(landmarks.descriptor, self._modes, index)
+        feature, distance = self._near(pixel, descriptors, mode)
         found = distance < _MAX_DISTANCE
         chance = np.mean(
-            [(self._near(pixel + s, descriptors)[1] < _MAX_DISTANCE).mean() for s in _SHIFTS_PX]
+            [
+                (self._near(pixel + s, descriptors, mode)[1] < _MAX_DISTANCE).mean()
+                for s in _SHIFTS_PX
+            ]
         )
         # A feature is one landmark: the one it looks most like.
         rows = np.flatnonzero(found)
@@ -87,9 +94,16 @@ class Witness:
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
         return Support(feature[rows], index[rows], len(index), float(found.mean()), float(chance))
 
-    def _near(self, pixel_px: Array, descriptors: npt.NDArray[np.float32]) -> tuple[Indices, Array]:
-        """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf)."""
+    def _near(
+        self, pixel_px: Array, descriptors: npt.NDArray[np.float32], mode: Indices | None
+    ) -> tuple[Indices, Array]:
+        """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).
+
+        Descriptors are a row each and then one for each pixel of `mode` (Q,), ascending.
+        """
         _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_PX)
+        if mode is not None:
+            near = np.concatenate([near, near[mode]])
         there = near < len(self.pinhole_px)
         own = self.features.descriptors[np.where(there, near, 0)]
         cosine = np.where(there, np.einsum("nkd,nd->nk", own, descriptors), -np.inf)
@@ -97,4 +111,10 @@ class Witness:
         row = np.arange(len(best))
         value = cosine[row, best]
         distance = np.sqrt(np.maximum(2 - 2 * value, 0))
-        return np.asarray(near[row, best], np.intp), np.asarray(distance, np.float64)
+        feature = np.asarray(near[row, best], np.intp)
+        if mode is not None:
+            pixel = np.concatenate([np.arange(len(pixel_px)), mode])
+            order = np.lexsort((distance, pixel))
+            nearest = order[np.searchsorted(pixel[order], np.arange(len(pixel_px)))]
+            feature, distance = feature[nearest], distance[nearest]
+        return feature, np.asarray(distance, np.float64)
