@@ -12,7 +12,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.mapping import landmarks
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.refinement.chosen import Chosen
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import colmap, models
 from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
@@ -110,36 +110,18 @@ def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
 
 def drop(graph: Graph, bad: Flags) -> Graph:
     """The graph without some sights (O,)."""
-    model, keep = graph.model, ~bad
-    rows = {name: getattr(model, name)[keep] for name in ("image", "feature", "point", "pixel_px")}
-    return replace(graph, model=replace(model, **rows))
+    return replace(graph, model=models.without_sights(graph.model, bad))
 
 
 def drop_points(graph: Graph, bad: Flags) -> Graph:
     """The graph without some points (M,) and their sights."""
-    graph, kept = drop(graph, bad[graph.model.point]), ~bad
-    model, new = graph.model, np.cumsum(kept) - 1
-    points = replace(
-        model,
-        point_id=model.point_id[kept],
-        position=model.position[kept],
-        point=new[model.point],
-    )
-    return replace(graph, model=points)
+    return replace(graph, model=models.without_points(graph.model, bad))
 
 
 def drop_images(graph: Graph, bad: Flags) -> Graph:
     """The graph without some images (K,) and their sights."""
-    graph, kept = drop(graph, bad[graph.model.image]), ~bad
-    model, new = graph.model, np.cumsum(kept) - 1
-    images = replace(
-        model,
-        names=[name for name, gone in zip(model.names, bad.tolist(), strict=True) if not gone],
-        image_id=model.image_id[kept],
-        wTc=model.wTc[kept],
-        image=new[model.image],
-    )
-    return replace(graph, group=graph.group[kept], time_ns=graph.time_ns[kept], model=images)
+    model = models.without_images(graph.model, bad)
+    return replace(graph, group=graph.group[~bad], time_ns=graph.time_ns[~bad], model=model)
 
 
 def spread_px(graph: Graph) -> F64:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.mapping import landmarks, store
-from ground_station.mapping.folder import kept_name, replacing
+from ground_station.mapping.folder import carry_floorplan, kept_name, replacing
 from ground_station.mapping.refinement import graph as graphs
 from ground_station.mapping.refinement.adjust import adjust
 from ground_station.mapping.refinement.chosen import Chosen, choose_frames, thin
@@ -30,8 +29,6 @@ F64 = npt.NDArray[np.float64]
 
 _MOST_WORSE = 1.02
 """A larger deviation of the sights without the readout's shift says that there was none."""
-
-_FLOORPLAN = ("floorplan.png", "floorplan.yaml")
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ def refine_map(
         refined.info.refined = _table(map_, past, graph, report)
         if out is not None:
             refined.info.name = target.absolute().name
-            _carry_floorplan(folder, part)
+            carry_floorplan(folder, part)
         colmap.write(colmap.from_arrays(graph.model, map_.info.camera), part / "sparse")
         quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
         store.save_tables(part, refined, quantise=quantise)
@@ -214,7 +211,8 @@ def _assemble(map_: store.Map, graph: Graph) -> store.Map:
         landmark=model.point[order].astype(np.int32),
         pixel_px=camera.distort(rays).astype(np.float32),
     )
-    return store.Map(store.MapInfo(**vars(map_.info)), lm, keyframes)
+    modes = map_.modes.among(kept) if map_.modes is not None else None
+    return store.Map(store.MapInfo(**vars(map_.info)), lm, keyframes, modes=modes)
 
 
 def _unit_weight(graph: Graph) -> float:
@@ -288,9 +286,3 @@ def _table(map_: store.Map, past: Refined, graph: Graph, report: dict[str, Any])
         landmarks_sha256=list(dict.fromkeys(hashes)),
         last=last,
     ).as_dict()
-
-
-def _carry_floorplan(folder: Path, part: Path) -> None:
-    for name in _FLOORPLAN:
-        if (folder / name).is_file():
-            shutil.copy2(folder / name, part / name)

@@ -1,0 +1,44 @@
+"""Parts of a model: without some of its sights, points or images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.mapping.sfm.colmap import Model
+
+Flags = npt.NDArray[np.bool_]
+
+
+def without_sights(model: Model, bad: Flags) -> Model:
+    """The model without some sights (O,)."""
+    keep = ~bad
+    rows = {name: getattr(model, name)[keep] for name in ("image", "feature", "point", "pixel_px")}
+    return replace(model, **rows)
+
+
+def without_points(model: Model, bad: Flags) -> Model:
+    """The model without some points (M,) and their sights."""
+    model, kept = without_sights(model, bad[model.point]), ~bad
+    new = np.cumsum(kept) - 1
+    return replace(
+        model,
+        point_id=model.point_id[kept],
+        position=model.position[kept],
+        point=new[model.point],
+    )
+
+
+def without_images(model: Model, bad: Flags) -> Model:
+    """The model without some images (K,) and their sights."""
+    model, kept = without_sights(model, bad[model.image]), ~bad
+    new = np.cumsum(kept) - 1
+    return replace(
+        model,
+        names=[name for name, gone in zip(model.names, bad.tolist(), strict=True) if not gone],
+        image_id=model.image_id[kept],
+        wTc=model.wTc[kept],
+        image=new[model.image],
+    )
