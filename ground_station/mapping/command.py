@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ground_station.mapping.construction import command as build
+from ground_station.mapping.extension import command as extend
 from ground_station.mapping.importing import command as importing
 from ground_station.mapping.inspection import command as info
 from ground_station.mapping.inspection import export_command as export
@@ -17,6 +18,7 @@ _COMMANDS = {
     "import": importing,
     "register": register,
     "refine": refine,
+    "extend": extend,
     "info": info,
     "view": view,
     "export": export,

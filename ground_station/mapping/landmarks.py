@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -105,4 +107,43 @@ def make_landmarks(model: Model, descriptors: F32) -> Landmarks:
         view_cos=view_cos.astype(np.float32),
         distance_m=np.stack([near, far], axis=1).astype(np.float32),
         observations=n.astype(np.int32),
+    )
+
+
+def seen_again(lm: Landmarks, landmark: npt.NDArray[np.int64], position: F64) -> Landmarks:
+    """The landmarks after O further sights: of `landmark` (O,), from camera positions (O, 3).
+
+    Cones and distances hold the old sights and the new ones, and the sights are counted; positions,
+    covariances and descriptors stay. The old sights themselves are not needed.
+    """
+    shown, group = np.unique(landmark, return_inverse=True)
+    group, count = group.ravel(), len(shown)
+    rays = position - lm.position_m[landmark]
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= np.maximum(distance[:, None], 1e-12)
+    before = lm.view_direction[shown].astype(np.float64)
+    direction = before * lm.observations[shown, None]
+    np.add.at(direction, group, rays)
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = np.where(length > 1e-9, direction / np.maximum(length, 1e-12), before)
+    # A cone about the new direction holds the old one turned by what the direction turned.
+    turned = np.arccos(np.clip(np.sum(direction * before, axis=1), -1, 1))
+    half = np.arccos(np.clip(lm.view_cos[shown].astype(np.float64), -1, 1)) + turned
+    aside = np.arccos(np.clip(np.sum(rays * direction[group], axis=1), -1, 1))
+    np.maximum.at(half, group, aside)
+    near, far = lm.distance_m[shown].astype(np.float64).T.copy()
+    np.minimum.at(near, group, distance)
+    np.maximum.at(far, group, distance)
+    view_direction, view_cos = lm.view_direction.copy(), lm.view_cos.copy()
+    distance_m, observations = lm.distance_m.copy(), lm.observations.copy()
+    view_direction[shown] = direction
+    view_cos[shown] = np.cos(np.minimum(half, np.pi))
+    distance_m[shown] = np.stack([near, far], axis=1)
+    observations[shown] += np.bincount(group, minlength=count).astype(np.int32)
+    return replace(
+        lm,
+        view_direction=view_direction,
+        view_cos=view_cos,
+        distance_m=distance_m,
+        observations=observations,
     )

@@ -176,6 +176,44 @@ class RefineSettings:
 
 
 @dataclass(frozen=True)
+class ExtendSettings:
+    """Which frames of a flight `blimp map extend` adds, and what it makes of their sights."""
+
+    lost_interval_s: float = config.key(
+        0.4, "of a stretch that is not localized, a frame is tried so often", unit="s",
+        low=0.0, high=60.0,
+    )  # fmt: skip
+    min_moved_px: float = config.key(
+        10.0, "and only when its features moved so far since the one before", unit="px",
+        low=0.0, high=1000.0,
+    )  # fmt: skip
+    max_frames: int = config.key(
+        400, "of all flights together; more are thinned evenly", unit="frames", low=2, high=5000
+    )
+    neighbours: int = config.key(
+        8, "each frame is compared with so many that follow it", unit="frames", low=1, high=1000
+    )
+    similar: int = config.key(
+        4, "and with so many that show most of the same landmarks", unit="frames", low=0, high=1000
+    )
+    min_sights: int = config.key(30, "of a frame that joins", unit="sights", low=6, high=10000)
+    merge_px: float = config.key(
+        2.0, "what is seen so near to a landmark is that landmark", unit="px", low=0.0, high=20.0
+    )
+    mode_distance: float = config.key(
+        0.4, "a landmark looks otherwise when its descriptor is so far off", low=0.0, high=2.0
+    )
+    mode_spreads: float = config.key(
+        1.5, "and off by so many times its spread in the map", low=0.0, high=100.0
+    )
+    max_modes: int = config.key(3, "further descriptors of a landmark", low=0, high=8)
+    expected_often: int = config.key(
+        10, "a landmark this often in view that is never seen is counted", unit="frames",
+        low=1, high=10000,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class MappingSettings:
     """How `blimp map build` works."""
 
@@ -202,6 +240,7 @@ class MappingSettings:
     match: MatchSettings = field(default_factory=MatchSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
+    extend: ExtendSettings = field(default_factory=ExtendSettings)
     importing: ImportSettings = field(default_factory=ImportSettings)
 
 

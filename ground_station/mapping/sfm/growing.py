@@ -1,0 +1,51 @@
+"""Bundle adjustment of new images among points and images that stay where they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.sfm import colmap
+
+F64 = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+
+def adjust_among_fixed(
+    model: colmap.Model,
+    fixed_points: Flags,
+    fixed_images: Flags,
+    camera: Camera,
+    *,
+    loss_px: float,
+    threads: int = 0,
+    max_iterations: int = 50,
+) -> tuple[F64, F64]:
+    """Poses (K, 4, 4) and points (M, 3) of a model at the optimum.
+
+    Fixed points (M,) and images (K,) stay, bit for bit, and give the gauge. Every point needs two
+    sights. A Cauchy loss of scale `loss_px`; `threads` 0 takes one a core.
+    """
+    reconstruction = colmap.from_arrays(model, camera)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = False
+    options.refine_principal_point = False
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.num_threads = threads or -1
+    options.ceres.solver_options.max_num_iterations = max_iterations
+    options.ceres.solver_options.function_tolerance = 1e-6
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.image_id[~fixed_images].tolist():
+        config.add_image(image_id)
+    for point_id in model.point_id[fixed_points].tolist():
+        config.add_constant_point(point_id)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    wTc, position = colmap.positions(reconstruction, model)
+    position[fixed_points] = model.position[fixed_points]
+    wTc[fixed_images] = model.wTc[fixed_images]
+    return wTc, position
