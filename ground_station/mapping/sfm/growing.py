@@ -40,8 +40,10 @@ def adjust_among_fixed(
     options.ceres.solver_options.max_num_iterations = max_iterations
     options.ceres.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.image_id[~fixed_images].tolist():
+    for image_id in model.image_id.tolist():
         config.add_image(image_id)
+    for image_id in model.image_id[fixed_images].tolist():
+        config.set_constant_rig_from_world_pose(reconstruction.images[image_id].frame_id)
     for point_id in model.point_id[fixed_points].tolist():
         config.add_constant_point(point_id)
     pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()

@@ -8,6 +8,7 @@ are seen then only.
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping import landmarks, store
+from ground_station.mapping.extension.extend import Extension, extend_map
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import colmap
 
@@ -190,3 +192,28 @@ def corridor_world(_corridor_world, monkeypatch) -> World:
     """Its extractor is registered; tests that change the map work on a copy (`--out`)."""
     monkeypatch.setitem(extractors._EXTRACTORS, "corridor", lambda _: _corridor_world.corridor)
     return _corridor_world
+
+
+def extended(world: World, out: Path, *inputs: Path) -> tuple[store.Map, store.Map, Extension]:
+    """The map as it was and as it is with more inputs, in another folder."""
+    _, result = extend_map(world.folder, inputs, SETTINGS, out=out, rate_hz=RATE_HZ)
+    return store.load(world.folder), store.load(out), result
+
+
+@pytest.fixture(scope="session")
+def by_sunset(_corridor_world, tmp_path_factory):
+    """Extended once by the sunset flight; the tests only read it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(extractors._EXTRACTORS, "corridor", lambda _: _corridor_world.corridor)
+        out = tmp_path_factory.mktemp("sunset") / "extended"
+        return extended(_corridor_world, out, _corridor_world.flights["sunset"])
+
+
+@pytest.fixture
+def short_flight(corridor_world, tmp_path):
+    """The first frames of the sunset flight: enough to join."""
+    folder = tmp_path / "short"
+    folder.mkdir()
+    for path in sorted(corridor_world.flights["sunset"].iterdir())[:9]:
+        shutil.copy(path, folder / path.name)
+    return folder
