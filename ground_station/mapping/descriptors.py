@@ -67,9 +67,9 @@ class Descriptors:
             raise ValueError("descriptors are made unit rows in a new array")
         return np.asarray(self[:], dtype)
 
-    def rows(self, index: npt.ArrayLike) -> Descriptors:
-        """Some of them (N,), quantised as they are."""
-        return Descriptors(self._plain[np.asarray(index)])
+    def rows(self, index: Any) -> Descriptors:
+        """Those of an index, a slice or a mask on the first axis, quantised as they are."""
+        return Descriptors(self._plain[index])
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """What keeps them as they are in a map's file, by name; none of float32."""
@@ -117,9 +117,9 @@ class CodedDescriptors(Descriptors):
         words = self._words.take(self._plain[index] + self._first, axis=0)
         return _unit(words.reshape(*words.shape[:-2], self.shape[1]))
 
-    def rows(self, index: npt.ArrayLike) -> CodedDescriptors:
-        """Some of them (N,), with the same words."""
-        return CodedDescriptors(self._plain[np.asarray(index)], self.codebook)
+    def rows(self, index: Any) -> CodedDescriptors:
+        """Those of an index, a slice or a mask on the first axis, with the same words."""
+        return CodedDescriptors(self._plain[index], self.codebook)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Codes and words."""
@@ -169,7 +169,8 @@ def _unit(rows: F32) -> F32:
 def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -> Descriptors:
     """Maps the descriptors (count, dimension) of a map's file into memory without reading them.
 
-    The prefix stands before their arrays' names. The rest of the file has been checked by
+    The prefix stands before their arrays' names; without words of their own they have those
+    without it. The rest of the file has been checked by
     safetensors' own reader. Raises `MapError` when they are missing, of another size or type, not
     finite, or codes of no word. The file may be replaced by renaming while it is mapped, but not be
     written to.
@@ -183,7 +184,8 @@ def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -
                 raise MapError(f"{path}: it holds no {prefix}descriptors")
             if found == CODES:
                 codes = _mapped(file, path, header, length, prefix + CODES, "U8")
-                codebook = _mapped(file, path, header, length, prefix + CODEBOOK, "F16")
+                words = prefix + CODEBOOK if prefix + CODEBOOK in header else CODEBOOK
+                codebook = _mapped(file, path, header, length, words, "F16")
                 return _coded(path, codes, codebook, (count, dimension))
             name = prefix + found
             shape = tuple(header[name]["shape"])

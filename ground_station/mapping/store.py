@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import compact
-from ground_station.mapping.descriptors import Descriptors, open_descriptors, quantised
+from ground_station.mapping.descriptors import CODEBOOK, Descriptors, open_descriptors, quantised
 from ground_station.mapping.modes import MOST, Modes
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
@@ -161,7 +161,9 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     if map_.modes is not None and len(map_.modes):
         rows = {"descriptor": np.asarray(map_.modes.descriptor, np.float32)}
         if quantise or info.format == COMPACT:
-            rows = quantised(map_.modes.descriptor)
+            rows = quantised(map_.modes.descriptor, coded=info.format == COMPACT)
+        if CODEBOOK in rows and np.array_equal(rows[CODEBOOK], arrays.get(CODEBOOK, ())):
+            del rows[CODEBOOK]  # one copy does for both
         arrays["mode_landmark"] = map_.modes.landmark
         arrays |= {_OF_MODES + name: array for name, array in rows.items()}
     form = str(info.format)

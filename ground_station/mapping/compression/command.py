@@ -60,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
 def _shown(report: dict[str, Any]) -> dict[str, Any]:
     """The report with each number beside what it was."""
     shown: dict[str, Any] = {"method": report["method"]}
-    for name in ("landmarks", "sights"):
-        shown[name] = f"{report[f'{name}_before']} -> {report[name]}"
+    for name in ("landmarks", "modes", "sights"):
+        if before := report[f"{name}_before"]:
+            shown[name] = f"{before} -> {report[name]}"
     for name, value in report["in_keyframe"].items():
         shown[f"in_keyframe {name}"] = f"{report['in_keyframe_before'][name]} -> {value}"
     for name in ("descriptor_bytes", "descriptor_error"):

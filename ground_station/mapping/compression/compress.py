@@ -15,7 +15,7 @@ from ground_station.errors import MapError
 from ground_station.mapping import store
 from ground_station.mapping.compression import codes
 from ground_station.mapping.compression.choice import METHODS, choose
-from ground_station.mapping.descriptors import Descriptors
+from ground_station.mapping.descriptors import Descriptors, joined
 from ground_station.mapping.folder import carry_floorplan, check_target, replacing
 from ground_station.mapping.inspection.summary import as_model
 from ground_station.mapping.refinement.observations import landmarks_sha256
@@ -76,20 +76,21 @@ def compress_map(
         )
     kept = choose(map_, wanted.count(len(map_.landmarks)), wanted.method, wanted.seed)
     smaller = subset(map_, kept)
+    modes = [0 if m.modes is None else len(m.modes) for m in (map_, smaller)]
     told: dict[str, Any] = {
         "method": wanted.method,
         "landmarks_before": len(map_.landmarks),
         "landmarks": len(kept),
         "sights_before": len(map_.keyframes.landmark),
         "sights": len(smaller.keyframes.landmark),
+        "modes_before": modes[0],
+        "modes": modes[1],
         "seed": wanted.seed,
     }
-    whole = smaller.landmarks.descriptor
     if wanted.descriptor_bytes:
-        coded = codes.code(whole, wanted.descriptor_bytes, wanted.seed)
+        off = _code(smaller, wanted)
         told["descriptor_bytes"] = wanted.descriptor_bytes
-        told["descriptor_error"] = float(f"{codes.error(whole, coded):.4g}")
-        smaller.landmarks.descriptor = coded
+        told["descriptor_error"] = float(f"{off:.4g}")
     smaller.info = _info(map_, out.absolute().name, told)
     with replacing(out) as part:
         carry_floorplan(folder, part)
@@ -112,8 +113,19 @@ def compress_map(
     return store.load(out), report
 
 
+def _code(map_: store.Map, wanted: Compression) -> float:
+    """Makes a map's descriptors codes, those of its modes of the same words; their RMS error."""
+    lm, modes = map_.landmarks, map_.modes
+    whole = lm.descriptor if modes is None else joined(lm.descriptor, modes.descriptor)
+    coded = codes.code(whole, wanted.descriptor_bytes, wanted.seed)
+    if modes is not None:
+        map_.modes = dataclasses.replace(modes, descriptor=coded.rows(slice(len(lm), None)))
+    lm.descriptor = coded.rows(slice(0, len(lm)))
+    return codes.error(whole, coded)
+
+
 def subset(map_: store.Map, kept: Indices) -> store.Map:
-    """The map with some of its landmarks (N,), in order, and all of its keyframes."""
+    """The map with some of its landmarks (N,), in order, their modes, and all of its keyframes."""
     lm, kf = map_.landmarks, map_.keyframes
     names = [field.name for field in dataclasses.fields(store.Landmarks)]
     rows = {name: getattr(lm, name)[kept] for name in names if name != "descriptor"}
@@ -131,8 +143,9 @@ def subset(map_: store.Map, kept: Indices) -> store.Map:
         landmark=landmark[left].astype(np.int32),
         pixel_px=kf.pixel_px[left],
     )
+    modes = map_.modes.among(place >= 0) if map_.modes is not None else None
     info = store.MapInfo(**vars(map_.info))
-    return store.Map(info, store.Landmarks(**rows), keyframes, map_.folder)
+    return store.Map(info, store.Landmarks(**rows), keyframes, map_.folder, modes)
 
 
 def _info(map_: store.Map, name: str, told: dict[str, Any]) -> store.MapInfo:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -23,6 +24,7 @@ from ground_station.mapping.compression import command
 from ground_station.mapping.compression.compress import Compression, compress_map, subset
 from ground_station.mapping.descriptors import CodedDescriptors
 from ground_station.mapping.inspection.summary import describe
+from ground_station.mapping.modes import Modes
 from ground_station.mapping.refinement.refine import refine_map
 from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.sfm import colmap
@@ -97,23 +99,34 @@ def test_colmap_opens_the_model_with_or_without_tracks(built, small, tmp_path):
     assert len(model.point) == len(with_sights.keyframes.landmark)
 
 
-def test_frames_are_found_and_localized_in_it(built, small):
-    map_, _ = small
+@pytest.fixture
+def registered(built, tmp_path) -> Path:
+    """The room that was built, in metres."""
+    folder = tmp_path / "registered"
+    shutil.copytree(built.folder, folder)
+    truth = Trajectory.from_poses(built.map.keyframes.time_ns, built.scene.wTc)
+    register_map(folder, trajectory=truth, source="truth")
+    return folder
+
+
+def test_frames_are_found_and_localized_in_it(built, registered, tmp_path):
+    small, _ = compress_map(registered, tmp_path / "small", Compression(descriptor_bytes=16))
 
     class Extractor:
         name, sha256, dimension = "scene", "0" * 64, built.map.info.dimension
 
-    poses = []
-    for source in (built.map, map_):
+    for source, most_m in ((store.load(registered), 0.03), (small, 0.04)):
         localizer = Localizer(source, built.scene.camera, Extractor(), load_preset("default"))
         found = [
             localizer.process_features(10**9 + k * 100_000_000, features)
             for k, features in enumerate(built.scene.features)
         ]
-        assert sum(e.localized for e in found) >= len(found) - 1
-        poses.append(np.array([e.wTc[:3, 3] for e in found[1:]]))
-    size = np.ptp(built.map.keyframes.wTc[:, :3, 3], axis=0).max()
-    assert np.linalg.norm(poses[0] - poses[1], axis=1).max() < 0.02 * size
+        assert all(e.localized for e in found) and found[0].relocalized
+        off = [
+            np.linalg.norm(e.wTc[:3, 3] - T[:3, 3])
+            for e, T in zip(found, built.scene.wTc, strict=True)
+        ]
+        assert np.sqrt(np.mean(np.square(off))) < most_m
 
 
 def test_registering_it_keeps_it_compressed(built, small):
@@ -149,6 +162,28 @@ def test_the_floor_plan_goes_along_and_recordings_do_not(world, tmp_path):
     names = {path.name for path in small.folder.iterdir()}
     assert "floorplan.yaml" in names and "flight.mcap" not in names
     assert before["other"] < 10_000 and before["total"] == sum(list(before.values())[:-1])
+
+
+def test_modes_of_what_is_kept_are_kept_with_the_same_words(world, tmp_path):
+    rng = np.random.default_rng(2)
+    count, dimension = len(world.map.landmarks), world.map.info.dimension
+    landmark = np.sort(rng.permutation(count)[: count // 3]).astype(np.int32)
+    rows = np.abs(rng.normal(size=(len(landmark), dimension))).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    world.map.modes = Modes(landmark, rows)
+    store.save_tables(world.folder, world.map)
+    small, report = compress_map(world.folder, tmp_path / "small", Compression(0.5, 16))
+    ids = world.map.landmarks.id[landmark]
+    left = np.isin(ids, small.landmarks.id)
+    assert (report["modes_before"], report["modes"]) == (len(landmark), left.sum())
+    assert np.array_equal(small.landmarks.id[small.modes.landmark], ids[left])
+    assert np.einsum("nd,nd->n", small.modes.descriptor[:], rows[left]).min() > 0.95
+    assert isinstance(small.modes.descriptor, CodedDescriptors)
+    held = load_file(small.folder / "landmarks.safetensors")
+    assert "mode_descriptor_codes" in held and "mode_descriptor_codebook" not in held
+    store.save_tables(small.folder, small)  # and so they stay
+    again = store.load(small.folder).modes
+    assert np.array_equal(again.descriptor[:], small.modes.descriptor[:])
 
 
 def test_it_can_be_compressed_once_more(small, tmp_path):
