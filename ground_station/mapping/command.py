@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from ground_station.mapping.compression import command as compress
 from ground_station.mapping.construction import command as build
 from ground_station.mapping.extension import command as extend
 from ground_station.mapping.importing import command as importing
@@ -19,6 +20,7 @@ _COMMANDS = {
     "register": register,
     "refine": refine,
     "extend": extend,
+    "compress": compress,
     "info": info,
     "view": view,
     "export": export,
