@@ -23,6 +23,11 @@ _ROUNDS = 25
 _ROWS = 1 << 11
 
 
+def usual_bytes(dimension: int, numbers: int = 4) -> int:
+    """Bytes for descriptors of D numbers: one for every four of them, or the next that divides."""
+    return next(n for n in range(max(1, dimension // numbers), 0, -1) if dimension % n == 0)
+
+
 def code(descriptors: F32 | Descriptors, stretches: int, seed: int) -> CodedDescriptors:
     """Descriptors (M, D), M > 0, as a byte for each of so many stretches, with words of their own.
 

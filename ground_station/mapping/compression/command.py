@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, metavar="NEWMAP", help="folder of the smaller one")
     add("--landmarks", type=float, default=0.5, metavar="SHARE|N",
         help="up to 1 the share that is kept, above it their number (0.5)")  # fmt: skip
-    add("--descriptor-bytes", type=int, default=32, metavar="B",
-        help="bytes a descriptor; 0: as they are (32)")  # fmt: skip
+    add("--descriptor-bytes", type=int, metavar="B",
+        help="bytes a descriptor; 0: as they are (one for every four numbers)")  # fmt: skip
     add("--sights", action="store_true", help="the COLMAP model in sparse/ keeps its tracks")
     add("--seed", type=int, default=0, metavar="N", help="of the descriptors' words (0)")
     add("--json", metavar="FILE", help="write what came of it, too")
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         if path and not Path(path).resolve().parent.is_dir():
             raise InputError(f"{path}: its folder does not exist")
     for name, value in (("--seed", args.seed), ("--descriptor-bytes", args.descriptor_bytes)):
-        if value < 0:
+        if value is not None and value < 0:
             raise InputError(f"{name} is {value}; 0 or more is needed")
     wanted = Compression(args.landmarks, args.descriptor_bytes, args.sights, seed=args.seed)
     _, report = compress_map(args.map, args.out, wanted)

@@ -31,12 +31,13 @@ class Compression:
     """What is wanted.
 
     `landmarks`: a share of them up to 1, or their number; `descriptor_bytes` of each, 0: as they
-    are; `sights`: the COLMAP model keeps its tracks, which the tables hold as well; `method` is one
-    of `choice.METHODS`; `seed` of the words' first draw (and of the method `random`).
+    are, None: `codes.usual_bytes`; `sights`: the COLMAP model keeps its tracks, which the tables
+    hold as well; `method` is one of `choice.METHODS`; `seed` of the words' first draw (and of the
+    method `random`).
     """
 
     landmarks: float = 0.5
-    descriptor_bytes: int = 32
+    descriptor_bytes: int | None = None
     sights: bool = False
     method: str = "coverage"
     seed: int = 0
@@ -69,11 +70,13 @@ def compress_map(
     map_ = store.load(folder)
     if not len(map_.landmarks) or not len(map_.keyframes.landmark):
         raise MapError(f"{folder}: it has no landmarks that a keyframe saw")
-    if wanted.method not in METHODS or wanted.descriptor_bytes < 0:
-        raise MapError(
-            f"method '{wanted.method}' (known: {', '.join(METHODS)}), "
-            f"{wanted.descriptor_bytes} bytes a descriptor (0 or more)"
-        )
+    each = wanted.descriptor_bytes
+    if each is None:
+        each = codes.usual_bytes(map_.info.dimension)
+    if wanted.method not in METHODS:
+        raise MapError(f"there is no method '{wanted.method}' (known: {', '.join(METHODS)})")
+    if each < 0:
+        raise MapError(f"{each} bytes a descriptor; 0 or more are needed")
     kept = choose(map_, wanted.count(len(map_.landmarks)), wanted.method, wanted.seed)
     smaller = subset(map_, kept)
     modes = [0 if m.modes is None else len(m.modes) for m in (map_, smaller)]
@@ -87,9 +90,9 @@ def compress_map(
         "modes": modes[1],
         "seed": wanted.seed,
     }
-    if wanted.descriptor_bytes:
-        off = _code(smaller, wanted)
-        told["descriptor_bytes"] = wanted.descriptor_bytes
+    if each:
+        off = _code(smaller, each, wanted.seed)
+        told["descriptor_bytes"] = each
         told["descriptor_error"] = float(f"{off:.4g}")
     smaller.info = _info(map_, out.absolute().name, told)
     with replacing(out) as part:
@@ -113,11 +116,11 @@ def compress_map(
     return store.load(out), report
 
 
-def _code(map_: store.Map, wanted: Compression) -> float:
+def _code(map_: store.Map, each: int, seed: int) -> float:
     """Makes a map's descriptors codes, those of its modes of the same words; their RMS error."""
     lm, modes = map_.landmarks, map_.modes
     whole = lm.descriptor if modes is None else joined(lm.descriptor, modes.descriptor)
-    coded = codes.code(whole, wanted.descriptor_bytes, wanted.seed)
+    coded = codes.code(whole, each, seed)
     if modes is not None:
         map_.modes = dataclasses.replace(modes, descriptor=coded.rows(slice(len(lm), None)))
     lm.descriptor = coded.rows(slice(0, len(lm)))

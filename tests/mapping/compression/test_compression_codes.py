@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ground_station.errors import MapError
-from ground_station.mapping.compression.codes import code, error
+from ground_station.mapping.compression.codes import code, error, usual_bytes
 from ground_station.mapping.descriptors import Descriptors, quantised
 
 
@@ -71,6 +71,12 @@ def test_a_maps_own_descriptors_are_coded_as_they_come_out():
     rows = _rows(300)
     kept = Descriptors(quantised(rows)["descriptor_u8"])
     assert error(rows, code(kept, 8, seed=0)) < error(rows, code(rows, 8, seed=0)) + 0.01
+
+
+@pytest.mark.parametrize(("numbers", "each"), [(128, 32), (256, 64), (6, 1), (10, 2), (1, 1)])
+def test_a_byte_for_every_four_numbers_or_what_divides(numbers, each):
+    assert usual_bytes(numbers) == each and numbers % each == 0
+    assert usual_bytes(numbers, 8) <= each and numbers % usual_bytes(numbers, 8) == 0
 
 
 @pytest.mark.parametrize("stretches", [0, 3, 17, 32])
