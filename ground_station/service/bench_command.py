@@ -25,6 +25,12 @@ _COMMANDS = (
         "extractors on known homographies, real poses and simulated flights",
         "Measures all extractors: how often points are found again and matched, errors, time.",
     ),
+    (
+        "map",
+        "ground_station.evaluation.maps.command",
+        "size against accuracy: fewer landmarks, shorter descriptors",
+        "Measures what a map loses when 'blimp map compress' makes it smaller.",
+    ),
 )
 
 

@@ -1,0 +1,1 @@
+"""What the size of a map costs in accuracy."""
