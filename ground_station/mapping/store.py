@@ -328,7 +328,7 @@ def _read(
             names = [name for name in file.keys() if name in every]  # noqa: SIM118
             arrays = {name: file.get_tensor(name) for name in names}
             metadata = file.metadata() or {}
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{path}: {reason}") from None
     for name, (dtype, shape) in every.items():

@@ -242,6 +242,19 @@ def test_a_damaged_one_is_refused_in_one_line(small, file, changes, words):
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_type_that_numpy_does_not_know_is_refused_in_one_line(small):
+    path = small[0].folder / "landmarks.safetensors"
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["spread"]["dtype"] = "BF16"
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length :])
+    with pytest.raises(MapError, match="bfloat16") as caught:
+        store.load(small[0].folder)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("name", ["landmarks.safetensors", "keyframes.safetensors"])
 @pytest.mark.parametrize("left", [0.1, 0.6, 0.98])
 def test_one_that_was_cut_is_refused_in_one_line(small, name, left):
