@@ -115,7 +115,7 @@ def _in_words(axis: Axis, found: Found) -> str:
     words = f"{text[found.borne]} is borne"
     words += f", {text[found.refused]} is not" if found.refused is not None else ", the last level"
     if found.odd:
-        words += f"; not monotonous: {', '.join(text[n] for n in found.odd)} is borne again"
+        words += f"; not monotonic: {', '.join(text[n] for n in found.odd)} is borne again"
     return words
 
 

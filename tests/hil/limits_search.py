@@ -27,7 +27,7 @@ class Found:
 
     `borne` is the highest level up to which every tried one is borne, None when not even the first
     is; `refused` the next one that is not, None when there is no harder level. `odd` are tried
-    levels above a refused one that are borne all the same: there the answer is not monotonous.
+    levels above a refused one that are borne all the same: there the answer is not monotonic.
     """
 
     tried: dict[int, Tried] = field(default_factory=dict)

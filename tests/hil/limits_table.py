@@ -41,7 +41,7 @@ def render(document: dict[str, Any]) -> str:
         name = axis["title"]
         if axis["odd"]:
             notes.append(
-                f"Not monotonous: {name}: {', '.join(axis['odd'])} is borne again beyond {refused}."
+                f"Not monotonic: {name}: {', '.join(axis['odd'])} is borne again beyond {refused}."
             )
             name += " (see below)"
         least = "more was not tried" if axis["last"] else "none of those tried"
