@@ -52,11 +52,13 @@ def flight(plan: str, light: str, seed: int, duration_s: float, rate_hz: float) 
 
 
 def judge(path: Path, map_: Path, out: Path) -> dict[str, float]:
-    """A flight localized in a map."""
-    figures, poses = out / "judged.json", out / "judged.txt"
-    done = [sys.executable, "-m", "ground_station.cli", "localize", str(path), "--map", str(map_),
-            "--out", str(poses), "--json", str(figures)]  # fmt: skip
-    code = subprocess.run(done, cwd=ROOT, stdout=sys.stderr, check=False).returncode
+    """A flight localized in a map; what was measured before is taken up again."""
+    name = f"{map_.name}-{path.stem}"
+    figures, poses = out / f"{name}.json", out / f"{name}.txt"
+    if not figures.is_file():
+        words = ["localize", path, "--map", map_, "--out", poses, "--json", figures]
+        command = [sys.executable, "-m", "ground_station.cli", *map(str, words)]
+        subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)
     document = json.loads(figures.read_text())
     result: dict[str, float] = {
         "frames": document["frames"]["captured"],
@@ -66,7 +68,7 @@ def judge(path: Path, map_: Path, out: Path) -> dict[str, float]:
         "rmse_m": float("nan"),
         "median_m": float("nan"),
     }
-    if code == 0:
+    if result["localized"]:
         found, truth = read_tum(poses), trajectory_of(path)
         at = [truth.nearest(int(time_ns)) for time_ns in found.time_ns]
         off_m = np.linalg.norm(found.wTc[:, :3, 3] - truth.wTc[at][:, :3, 3], axis=1)
