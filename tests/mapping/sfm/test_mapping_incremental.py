@@ -71,23 +71,36 @@ def _kill(database: Path, work: Path, last: int) -> None:
     assert killed.returncode == -signal.SIGKILL
 
 
+@pytest.fixture(scope="module")
+def killed(database, tmp_path_factory) -> Path:
+    """The folder of a run that was killed at its 27th image; tests work on copies."""
+    work = tmp_path_factory.mktemp("killed")
+    _kill(database, work, 27)
+    return work
+
+
+@pytest.fixture
+def left(killed, tmp_path) -> Path:
+    """What a killed run left."""
+    return Path(shutil.copytree(killed, tmp_path / "work"))
+
+
 def _same(one: colmap.Model, other: colmap.Model) -> None:
     assert one.names == other.names
     assert np.abs(one.wTc - other.wTc).max() < 1e-6
     assert len(one.point_id) == len(other.point_id)
 
 
-@pytest.mark.parametrize("last", [7, 27])
-def test_a_killed_run_ends_in_the_map_of_one_that_ran_through(database, whole, tmp_path, last):
-    _kill(database, tmp_path / "work", last)
-    _same(_run(database, tmp_path / "work"), whole)
+def test_a_killed_run_ends_in_the_map_of_one_that_ran_through(database, whole, left, tmp_path):
+    _same(_run(database, left), whole)
+    early = tmp_path / "early"
+    _kill(database, early, 7)  # before anything was worth keeping
+    assert Snapshots(early / "snapshots").newest("") is None
+    _same(_run(database, early), whole)
 
 
-def test_what_was_done_is_not_done_again(database, whole, tmp_path, monkeypatch):
-    work = tmp_path / "work"
-    _kill(database, work, 27)
-    names = sorted(path.name for path in (work / "snapshots").iterdir())
-    before = Snapshots(work / "snapshots").load(names[-1])
+def test_what_was_done_is_not_done_again(database, whole, left, monkeypatch):
+    before = Snapshots(left / "snapshots").newest("00-")
     assert before is not None and 12 <= before[0].num_reg_images() <= 27
     registered = []
     register = Incremental._register_next
@@ -98,7 +111,7 @@ def test_what_was_done_is_not_done_again(database, whole, tmp_path, monkeypatch)
         return image_id
 
     monkeypatch.setattr(Incremental, "_register_next", counting)
-    _run(database, work)
+    _run(database, left)
     again = [image_id for image_id in registered if image_id is not None]
     assert len(again) == FRAMES - before[0].num_reg_images()
 
@@ -107,18 +120,16 @@ def test_what_was_done_is_not_done_again(database, whole, tmp_path, monkeypatch)
 
     monkeypatch.setattr(Incremental, "_batch", never)
     counted: list[int] = []
-    _same(_run(database, work, counted), whole)
+    _same(_run(database, left, counted), whole)
     assert len(counted) == FRAMES  # the progress says so, too
 
 
-def test_a_snapshot_that_was_cut_is_not_taken(database, whole, tmp_path):
-    work = tmp_path / "work"
-    _kill(database, work, 30)
-    newest = sorted((work / "snapshots").iterdir())[-1]
+def test_a_snapshot_that_was_cut_is_not_taken(database, whole, left):
+    newest = sorted((left / "snapshots").iterdir())[-1]
     points = newest / "points3D.bin"
     points.write_bytes(points.read_bytes()[:-100])
-    (work / "snapshots" / "00-999999.part").mkdir()
-    _same(_run(database, work), whole)
+    (left / "snapshots" / "00-999999.part").mkdir()
+    _same(_run(database, left), whole)
 
 
 def test_snapshots_are_whole_or_none_and_the_two_newest_stay(tmp_path):
