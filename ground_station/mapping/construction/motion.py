@@ -252,7 +252,8 @@ def corners(image: Image) -> F32:
             tile = image[top:bottom, left:right]
             found = cv2.goodFeaturesToTrack(tile, _POINTS, _QUALITY, _APART_PX)
             if found is not None:
-                parts.append(found.reshape(-1, 2) + np.array([left, top], np.float32))
+                corner = np.array([left, top], np.float32)
+                parts.append(np.asarray(found.reshape(-1, 2) + corner, np.float32))
     at = np.concatenate(parts)
     grey = image.astype(np.float32)
     patch = (_PATCH_PX, _PATCH_PX)
