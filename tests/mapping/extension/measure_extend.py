@@ -1,9 +1,10 @@
 """Measures what extending a noon map by a sunset flight is good for. Minutes; not a test.
 
-A sunset flight is added to the sample's noon map; then another sunset flight and a noon flight, of
-other seeds, are localized in the map as it was and as it is, by the default preset from nothing but
-their pictures: how many frames, and how far off (position RMSE, not aligned). With --same-light the
-flight that is added is a noon flight, too: what a map loses by growing.
+A sunset flight is added to the sample's noon map; then another sunset flight, of another seed, and
+the sample's noon flight, at 10 Hz, are localized in the map as it was and as it is, by the default
+preset from nothing but their pictures: how many frames, and how far off (position RMSE, not
+aligned). With --same-light the flight that is added is a noon flight, too: what a map loses by
+growing.
 
     .venv/bin/python tests/mapping/extension/measure_extend.py --out out/extend --json out/e.json
 """
@@ -11,6 +12,7 @@ flight that is added is a noon flight, too: what a map loses by growing.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
@@ -25,6 +27,7 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
 from ground_station.mapping import store
 from ground_station.recording.flight import FlightRecording, trajectory_of
+from ground_station.recording.open import parse_range
 
 ROOT = Path(__file__).parents[3]
 FLIGHTS = ROOT / "out" / "cache" / "flights"
@@ -51,12 +54,13 @@ def flight(plan: str, light: str, seed: int, duration_s: float, rate_hz: float) 
     return path
 
 
-def judge(path: Path, map_: Path, out: Path) -> dict[str, float]:
+def judge(path: Path, frames: str, map_: Path, out: Path) -> dict[str, float]:
     """A flight localized in a map; what was measured before is taken up again."""
     name = f"{map_.name}-{path.stem}"
     figures, poses = out / f"{name}.json", out / f"{name}.txt"
     if not figures.is_file():
-        words = ["localize", path, "--map", map_, "--out", poses, "--json", figures]
+        words = ["localize", path, "--map", map_, "--out", poses, "--json", figures,
+                 "--range", frames]  # fmt: skip
         command = [sys.executable, "-m", "ground_station.cli", *map(str, words)]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)
     document = json.loads(figures.read_text())
@@ -77,13 +81,13 @@ def judge(path: Path, map_: Path, out: Path) -> dict[str, float]:
     return result
 
 
-def cost(path: Path, folders: list[Path], frames: int) -> list[dict[str, float]]:
+def cost(path: Path, wanted: str, folders: list[Path], frames: int) -> list[dict[str, float]]:
     """Median milliseconds and inliers of frames located in each map, turn by turn in one run.
 
     Each by its own features, from 3 cm beside its true pose, and as if nothing came before.
     """
     settings = load_preset("default")
-    source = FlightRecording(path)
+    source = FlightRecording(path, parse_range(wanted))
     truth = trajectory_of(path)
     maps = [store.load(folder) for folder in folders]
     camera = source.camera or maps[0].info.camera
@@ -91,9 +95,7 @@ def cost(path: Path, folders: list[Path], frames: int) -> list[dict[str, float]]
     localizers = [Localizer(map_, camera, extractor, settings) for map_ in maps]
     spans: list[list[dict[str, float]]] = [[] for _ in maps]
     sights: list[list[int]] = [[] for _ in maps]
-    for k, frame in enumerate(source):
-        if k >= frames:
-            break
+    for k, frame in enumerate(itertools.islice(source, frames)):
         features = extractor.extract(frame.image)
         guess = truth.wTc[truth.nearest(frame.time_ns)].copy()
         guess[:3, 3] += [0.02, -0.02, 0.01]
@@ -123,9 +125,10 @@ def main() -> None:
     parser.add_argument("--plan", default="loop")
     parser.add_argument("--light", default="sunset")
     parser.add_argument("--add", type=int, nargs="+", default=[501], help="seeds of flights added")
-    parser.add_argument("--judge", type=int, default=502, help="seed of the flights that judge")
-    parser.add_argument("--duration-s", type=float, default=15.0, help="of those that judge")
+    parser.add_argument("--judge", type=int, default=502, help="seed of the flight that judges")
+    parser.add_argument("--duration-s", type=float, default=12.0, help="of those that judge")
     parser.add_argument("--rate-hz", type=float, default=10.0, help="of those that judge")
+    parser.add_argument("--noon-range", default="0:450:3", help="of the map's flight.mcap")
     parser.add_argument("--add-duration-s", type=float, default=48.0, help="48: a lap of the loop")
     parser.add_argument("--add-rate-hz", type=float, default=5.0)
     parser.add_argument("--settings", type=Path, help="of the extension")
@@ -146,15 +149,17 @@ def main() -> None:
         blimp("map", "extend", args.map, *added, "--out", extended, "--json", report, *more)
     document: dict[str, Any] = {"extended": json.loads(report.read_text()), "flights": {}}
     print("flight", "map", *FIGURES, sep="\t")
-    for each in (args.light, "noon"):
-        path = flight(args.plan, each, args.judge, *length)
+    judges = {
+        args.light: (flight(args.plan, args.light, args.judge, *length), ":"),
+        "noon": (args.map / "flight.mcap", args.noon_range),
+    }
+    for each, (path, frames) in judges.items():
         for when, map_ in (("before", args.map), ("after", extended)):
-            found = judge(path, map_, out)
+            found = judge(path, frames, map_, out)
             document["flights"][f"{each} {when}"] = found
             print(each, when, *(found.get(name, "") for name in FIGURES), sep="\t", flush=True)
-    for each in (args.light, "noon"):
-        path = flight(args.plan, each, args.judge, *length)
-        spent = cost(path, [args.map, extended], args.frames)
+    for each, (path, frames) in judges.items():
+        spent = cost(path, frames, [args.map, extended], args.frames)
         document[f"described by {each}"] = spent
         for when, row in zip(("before", "after"), spent, strict=True):
             print(each, when, *(f"{name} {value:g}" for name, value in row.items()), sep="\t")
