@@ -20,6 +20,8 @@ from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+I32 = npt.NDArray[np.int32]
+F32 = npt.NDArray[np.float32]
 
 CELLS = (8, 6)
 """Columns and rows that a picture is divided into."""
@@ -40,10 +42,10 @@ class ExpectedSights:
     all views, `landmark` (E,) and `chance` (E,) that it is found; `weight` (V,) of the views.
     """
 
-    view: Indices
-    cell: Indices
-    landmark: Indices
-    chance: F64
+    view: I32
+    cell: I32
+    landmark: I32
+    chance: F32
     weight: F64
 
     @property
@@ -63,15 +65,15 @@ def expected_sights(map_: Map, step: Callable[[], None] = lambda: None) -> Expec
     camera, cells = map_.info.camera, CELLS[0] * CELLS[1]
     shared = _shared(map_)
     weight = _alone(shared).tolist()
-    rows: list[tuple[Indices, Indices, Indices, F64]] = []
+    rows: list[tuple[I32, I32, I32, F32]] = []
     for k, near in enumerate(_surroundings(map_, shared)):
         for place, wTc in enumerate(near.views):
             number = len(weight) if place else k
             if place:
                 weight.append(_SHARE * weight[k])
             index, pixel = near.seen_from(wTc)
-            cell = number * cells + _cell(pixel, camera)
-            view = np.full(len(index), number)
+            cell = (number * cells + _cell(pixel, camera)).astype(np.int32)
+            view = np.full(len(index), number, np.int32)
             rows.append((view, cell, near.landmark[index], near.chance[index]))
         step()
     view, cell, landmark, chance = map(np.concatenate, zip(*rows, strict=True))
@@ -83,9 +85,9 @@ class _Surrounding:
     """A keyframe's and other views (N, 4, 4) there, and what its neighbours saw of landmarks."""
 
     views: F64
-    landmark: Indices
+    landmark: I32
     position: F64
-    chance: F64
+    chance: F32
     view: View
 
     def seen_from(self, wTc: F64) -> tuple[Indices, F64]:
@@ -154,7 +156,8 @@ def _surrounding(map_: Map, view: View, group: Indices, views: F64) -> _Surround
         local = poses.transform(poses.inverse(kf.wTc[n]), points)
         # A sight at the border may project just outside: it was seen all the same.
         could += view.inside(local) | np.isin(landmark, mine)
-    return _Surrounding(views, landmark.astype(np.int64), points, found / (could + PRIOR), view)
+    chance = (found / (could + PRIOR)).astype(np.float32)
+    return _Surrounding(views, landmark, points, chance, view)
 
 
 def _cell(pixel_px: npt.NDArray[np.floating], camera: Camera) -> Indices:
