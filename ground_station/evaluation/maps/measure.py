@@ -160,7 +160,7 @@ def row(
     runs: dict[str, list[dict[str, Any]]] = {flight.name: [] for flight, _ in flights}
     made: dict[str, Any] = {}
     for seed in seeds:
-        place, told = folder, {}
+        place, told = folder, dict[str, Any]()
         if wanted is not None:
             place = work / "map"
             _, told = compress_map(folder, place, replace(wanted, seed=seed))

@@ -74,8 +74,8 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
     negative is submodular), so the greedy choice is near the best.
     """
     worth = quality[sights.landmark] * sights.chance
-    filled = np.zeros(sights.cells)
-    covered = np.zeros(len(sights.weight))
+    filled: F64 = np.zeros(sights.cells)
+    covered: F64 = np.zeros(len(sights.weight))
     left = np.ones(len(quality), bool)
     kept: list[Indices] = []
     together = -(-count // rounds)
@@ -90,7 +90,7 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
         left[order] = False
         missing -= len(order)
         new = np.flatnonzero(~left[sights.landmark] & (worth > 0))
-        filled = np.bincount(sights.cell[new], worth[new], sights.cells)
+        filled = np.bincount(sights.cell[new], worth[new], sights.cells).astype(np.float64)
         in_view = np.log1p(filled).reshape(len(covered), -1)
         covered = in_view.sum(axis=1)
     return np.concatenate([*kept, np.empty(0, np.intp)]).astype(np.intp)
