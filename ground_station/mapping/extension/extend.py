@@ -126,7 +126,7 @@ def _structure(
 ) -> Structure:
     """The localized frames, adjusted among the map's landmarks, and the tracks of all frames."""
     anchoring = Anchoring(map_, flights, frames, localizer)
-    posed = np.isfinite(frames.wTc).all(axis=(1, 2))
+    posed = ~np.isnan(frames.wTc[:, 0, 0])
     none = (np.empty(0, np.intp), np.empty(0, np.intp))
     seen = [
         anchoring.of(k, frames.wTc[k], frames.twist[k]) if posed[k] else none

@@ -140,10 +140,10 @@ def describe(
                 )
     if not rows:
         raise MapError("the inputs gave no frame a second time: were they changed meanwhile?")
-    names, number, time_ns, wTc, twists, features_, pixels, row_times = zip(*rows, strict=True)
+    names, numbers, time_ns, wTc, twists, features_, pixels, row_times = zip(*rows, strict=True)
     return Frames(
         names=list(names),
-        flight=np.array(number, np.int64),
+        flight=np.array(numbers, np.int64),
         time_ns=np.array(time_ns, np.int64),
         wTc=np.stack(wTc),
         twist=np.stack(twists),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +39,7 @@ def join(map_: store.Map, grown: Grown, frames: Frames) -> store.Map:
     shown = grown.landmark[model.point[old]]
     again = landmarks.seen_again(lm, shown, model.wTc[model.image[old], :3, 3])
     new = _new_landmarks(map_, grown)
-    fields = {
+    fields: dict[str, Any] = {
         field.name: joined(lm.descriptor, new.descriptor)
         if field.name == "descriptor"
         else np.concatenate([getattr(again, field.name), getattr(new, field.name)])

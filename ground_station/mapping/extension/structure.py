@@ -63,7 +63,7 @@ class Structure:
         self._anchoring, self._settings, self._recovery = anchoring, settings, recovery
         self._threads, self._witnesses = threads, Witnesses(map_)
         self.wTc, self.twist = frames.wTc.copy(), frames.twist.copy()
-        self.posed = np.isfinite(self.wTc).all(axis=(1, 2))
+        self.posed: Flags = np.asarray(np.isfinite(self.wTc).all(axis=(1, 2)))
         self.position = np.full((tracks.count, 3), np.nan)
         self.landmark = np.full(tracks.count, -1, np.int64)
         camera = map_.info.camera
@@ -292,7 +292,7 @@ class Structure:
     def straighten(self) -> None:
         """Gives frames that were grown the twists of their way, for the readout to be undone."""
         gap_s = self._settings.refine.keyframe_gap_s
-        lost = ~np.isfinite(self.frames.wTc).all(axis=(1, 2))
+        lost = np.isnan(self.frames.wTc[:, 0, 0])
         for flight in np.unique(self.frames.flight):
             rows = np.flatnonzero(self.posed & (self.frames.flight == flight))
             twist = shutter.twists(self.frames.time_ns[rows], self.wTc[rows], 0.0, gap_s)
