@@ -21,14 +21,14 @@ class KeyframeSettings:
         160, "inputs of together no more frames are used whole", unit="frames", low=0, high=1000000
     )
     parallax_deg: float = config.key(
-        2.0, "a keyframe is due when the camera moved so far, seen from what it sees", unit="deg",
+        1.0, "a keyframe is due when the camera moved so far, seen from what it sees", unit="deg",
         low=0.1, high=45.0,
     )  # fmt: skip
     turn_deg: float = config.key(
-        6.0, "or turned so far, since the last one", unit="deg", low=0.5, high=90.0
+        4.0, "or turned so far, since the last one", unit="deg", low=0.5, high=90.0
     )
     lost: float = config.key(
-        0.35, "or so large a share of what it saw is no longer seen", low=0.05, high=0.75
+        0.2, "or so large a share of what it saw is no longer seen", low=0.05, high=0.5
     )
     min_sharpness: float = config.key(
         0.65, "a frame less sharp than this share of those around it is blurred", low=0.0, high=1.0
