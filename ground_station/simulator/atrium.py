@@ -26,9 +26,16 @@ _CREAM, _WHITE, _OCHRE = (0.60, 0.54, 0.43), (0.70, 0.69, 0.65), (0.52, 0.36, 0.
 _TEAL, _RED, _GREY = (0.10, 0.28, 0.28), (0.42, 0.09, 0.07), (0.36, 0.36, 0.37)
 
 
+MOVED_M = 1.2
+"""How far furniture has been moved at most, along x and y, where it has been."""
+_MOVED_SEED = 5
+
+
 class _Atrium:
-    def __init__(self, texels_per_m: float) -> None:
+    def __init__(self, texels_per_m: float, *, moved: bool, posted: bool) -> None:
         self.b = SceneBuilder(texels_per_m)
+        self.moved, self.posted = moved, posted
+        self._places = np.random.default_rng(_MOVED_SEED)
         self.footprints: list[Footprint] = []
         self.known: list[KnownPoint] = []
         self.lamps: list[Lamp] = []
@@ -39,10 +46,19 @@ class _Atrium:
         a, b, c = surface.normal.tolist()
         self.known.append(KnownPoint(name, (x, y, z), (a, b, c)))
 
+    def placed(self, x: float, y: float) -> tuple[float, float]:
+        """Where a piece of furniture stands that was at (x, y) when the hall was mapped."""
+        if not self.moved:
+            return x, y
+        dx, dy = self._places.uniform(-MOVED_M, MOVED_M, 2).tolist()
+        return x + dx, y + dy
+
     def sign(
         self, name: str, origin: list[float], u: list[float], v: list[float], **o: Any
     ) -> None:
         """A poster with two of its corners surveyed (they stand out from the wall by the sign)."""
+        if self.posted:
+            o["edition"] = 1
         surface = self.b.rectangle(origin, u, v, "poster", detail=1.6, text=name, **o)
         self.survey(f"sign-{name.lower()}-a", surface, 0)
         self.survey(f"sign-{name.lower()}-b", surface, 2)
@@ -271,10 +287,12 @@ class _Atrium:
 
         top = ("-x", "+x", "-y", "+y", "+z")
         for x, y in ((6.5, 4.0), (11.0, 4.0), (15.5, 4.0), (6.5, 11.6), (11.0, 11.6), (15.5, 11.6)):
+            x, y = self.placed(x, y)
             solid([x, y, 0.35], [x + 2.0, y + 0.5, 0.45], "wood")  # benches
             for q in (0.1, 1.75):
                 self.b.box([x + q, y + 0.05, 0], [x + q + 0.12, y + 0.45, 0.35], "metal")
         for x, y, rgb in ((8.2, 7.2, _TEAL), (13.6, 7.4, _RED)):  # sofas back to back
+            x, y = self.placed(x, y)
             solid([x, y, 0], [x + 1.9, y + 0.9, 0.42], "fabric", faces=top, rgb=rgb)
             self.b.box([x, y + 0.35, 0.42], [x + 1.9, y + 0.55, 0.85], "fabric", faces=top, rgb=rgb)
             solid([x + 2.2, y + 0.1, 0.42], [x + 3.0, y + 0.8, 0.48], "wood", faces=(*top, "-z"))
@@ -282,6 +300,7 @@ class _Atrium:
         solid([19.6, 8.2, 0], [20.4, 10.8, 1.1], "wood", faces=top, upright=True)  # reception
         self.b.box([19.5, 8.1, 1.1], [20.5, 10.9, 1.16], "terrazzo", slab_m=0.6, rgb=_GREY)
         for x, y in ((3.2, 4.6), (3.2, 11.2), (20.6, 4.2), (10.6, 9.6), (12.9, 5.6), (5.2, 8.0)):
+            x, y = self.placed(x, y)
             solid([x, y, 0], [x + 0.6, y + 0.6, 0.55], "concrete", faces=top, rgb=_GREY)  # planters
             for dx, dy, z0, z1 in (
                 (0.0, 0.0, 0.55, 1.0),
@@ -345,15 +364,19 @@ class _Atrium:
         self.b.rectangle([-6, 20, 14], [36, 0, 0], [0, -26, 0], "sky", detail=0.2, outside=True)
 
 
-def build_atrium(texels_per_m: float) -> Scene:
-    """The scene `atrium`; its textures are the same for every flight."""
-    a = _Atrium(texels_per_m)
+def build_atrium(texels_per_m: float, *, moved: bool = False, posted: bool = False) -> Scene:
+    """The scene `atrium`; its textures are the same for every flight.
+
+    `moved`: benches, sofas and plants stand up to `MOVED_M` elsewhere; `posted`: other posters hang
+    in the old ones' places. That is the hall some time after it was mapped.
+    """
+    a = _Atrium(texels_per_m, moved=moved, posted=posted)
     for part in (
         a.floor_and_ceiling, a.south, a.west, a.east, a.north, a.pillars, a.furniture, a.outside,
     ):  # fmt: skip
         part()
     return Scene(
-        name="atrium",
+        name="atrium" + "-moved" * moved + "-posted" * posted,
         size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
         surfaces=tuple(a.b.surfaces),
         footprints=tuple(a.footprints),

@@ -16,13 +16,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `blimp simulate`."""
     parser.epilog = EXAMPLE
     add = parser.add_argument
-    add("--scene", default="atrium", help="atrium or office (default: atrium)")
+    add(
+        "--scene",
+        default="atrium",
+        help="atrium, office, atrium-moved (other furniture),"
+        " atrium-moved-posted (and other posters) (default: atrium)",
+    )
     add("--plan", default="loop", help="mapping, loop, small-circle or fast (default: loop)")
     add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")
     add("--out", type=Path, metavar="F.mcap", help="recording to write")
     add("--duration-s", type=float, metavar="S", help="length of the flight (default: the plan's)")
     add("--rate-hz", type=float, default=30.0, metavar="R", help="frames a second (default: 30)")
+    add(
+        "--draught-m-s",
+        type=float,
+        metavar="V",
+        help="deviation of the air's speed (default: 0.05)",
+    )
     add("--build", metavar="NAME", help="the blimp, of hw/builds.toml (default: atrium)")
     quality = parser.add_mutually_exclusive_group()
     quality.add_argument(
@@ -81,4 +92,5 @@ def settings_from(args: argparse.Namespace) -> SimulationSettings:
         out=args.out, scene=args.scene, plan=args.plan, light=args.light, seed=args.seed,
         duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
         bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points, build=args.build,
+        draught_m_s=args.draught_m_s,
     )  # fmt: skip

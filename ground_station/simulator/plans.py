@@ -20,6 +20,10 @@ Shape = Callable[[Array], tuple[Array, Array]]
 """From a path parameter (N,) in turns to positions (N, 3), metres, and yaw (N,), radians."""
 
 
+_OFF_WALLS_M, _LOOKED_AT = 0.3, 400
+"""How near a path may come to a scene's outermost walls, and at how many places it is looked at."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp."""
@@ -76,7 +80,7 @@ def _ellipse(
 def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
     """The plan of that name for a scene; `rng` shifts its path a little.
 
-    Raises `SimulatorError` naming the plans there are.
+    Raises `SimulatorError` naming the plans there are, and for one that leaves the scene.
     """
     plans = {
         "mapping": _mapping,
@@ -89,7 +93,12 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
     centre = (scene.size_m[0] / 2, scene.size_m[1] / 2 - 0.1)
     shift = rng.uniform(-1, 1, 4)
-    return plans[name](centre, shift)
+    plan = plans[name](centre, shift)
+    path, _ = plan.shape(np.linspace(0, plan.turns, _LOOKED_AT))
+    if (path < _OFF_WALLS_M).any() or (path > np.array(scene.size_m) - _OFF_WALLS_M).any():
+        size = " x ".join(f"{length:g}" for length in scene.size_m)
+        raise SimulatorError(f"plan '{name}' does not fit into '{scene.name}' ({size} m)")
+    return plan
 
 
 def _mapping(centre: tuple[float, float], shift: Array) -> Plan:

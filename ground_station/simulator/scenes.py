@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from ground_station.simulator.atrium import build_atrium
 from ground_station.simulator.corridor import build_corridor
@@ -13,6 +14,8 @@ _SCENES: dict[str, Callable[[float], Scene]] = {
     "atrium": build_atrium,
     "office": build_office,
     "corridor": build_corridor,
+    "atrium-moved": partial(build_atrium, moved=True),
+    "atrium-moved-posted": partial(build_atrium, moved=True, posted=True),
 }
 
 

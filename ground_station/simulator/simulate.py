@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from types import FrameType
@@ -43,7 +43,8 @@ Progress = Callable[[int, int], None]
 class SimulationSettings:
     """What to fly. `duration_s` None is the plan's own; `bitrate_kbps` replaces `crf`.
 
-    `build` is one of `hw/builds.toml`; None: the one that `simulated` there names.
+    `build` is one of `hw/builds.toml`; None: the one that `simulated` there names. `draught_m_s` is
+    the deviation of the air's speed along each axis; None: that of a quiet hall.
     """
 
     out: Path
@@ -62,6 +63,7 @@ class SimulationSettings:
     renders: int = 2
     camera: Camera = THESIS_CAMERA
     build: str | None = None
+    draught_m_s: float | None = None
 
     def __post_init__(self) -> None:
         limits = {
@@ -77,6 +79,8 @@ class SimulationSettings:
                 raise SimulatorError(f"{name} is {value}; allowed: {low:g} to {high:g}")
         if self.duration_s is not None and not 0 < self.duration_s <= 3600:
             raise SimulatorError(f"duration_s is {self.duration_s:g}; allowed: above 0 to 3600")
+        if self.draught_m_s is not None and not 0 <= self.draught_m_s <= 2:
+            raise SimulatorError(f"draught_m_s is {self.draught_m_s:g}; allowed: 0 to 2 m/s")
         if self.bitrate_kbps is not None and not 10 <= self.bitrate_kbps <= 100_000:
             raise SimulatorError(f"bitrate_kbps is {self.bitrate_kbps}; allowed: 10 to 100000")
 
@@ -130,9 +134,13 @@ def prepare_flight(settings: SimulationSettings) -> Flight:
     if plan.by_hand:
         if settings.build is not None:
             raise SimulatorError(f"build is {settings.build!r}; plan {settings.plan!r} flies none")
+        if settings.draught_m_s is not None:
+            raise SimulatorError(f"draught_m_s is for a blimp; plan {settings.plan!r} is by hand")
         motion = handheld.carry(Reference(plan, phase, _RUN_UP_S), duration, air)
     else:
         blimp = dynamics.Blimp.of_build(settings.build) if settings.build else dynamics.Blimp()
+        if settings.draught_m_s is not None:
+            blimp = replace(blimp, draught_m_s=settings.draught_m_s)
         motion = dynamics.fly(Reference(plan, phase), duration, air, blimp)
     return Flight(scene, plan, motion, np.arange(count) / settings.rate_hz, noise, clicks)
 
@@ -276,6 +284,11 @@ def _write_head(
             "version": metadata.version("blimp-localization"),
             # The one that is flown without being asked for is not named, as ever.
             **({"build": settings.build} if settings.build else {}),
+            **(
+                {"draught_m_s": f"{settings.draught_m_s:g}"}
+                if settings.draught_m_s is not None
+                else {}
+            ),
         },
     )
     writer.write_calibration(

@@ -266,7 +266,12 @@ def _write(
 
 
 def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
-    """A printed sign, unlike any other: headline, a picture of shapes, lines of text."""
+    """A printed sign, unlike any other: headline, a picture of shapes, lines of text.
+
+    Another `edition` is another picture in the same place.
+    """
+    if edition := o.get("edition", 0):
+        rng = np.random.default_rng([edition, int(rng.integers(2**32))])
     hue = rng.random(3)
     background = np.clip(0.25 + 0.6 * hue, 0, 0.85).astype(np.float32)
     tones = 0.02 + 0.12 * rng.random(3) if background.mean() > 0.4 else 0.6 + 0.3 * rng.random(3)

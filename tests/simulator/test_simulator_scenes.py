@@ -11,7 +11,7 @@ from ground_station.recording.open import open_input
 from ground_station.simulator import scenes
 from ground_station.simulator.lighting import surface_albedo
 from ground_station.simulator.plans import Reference, plan_named
-from ground_station.simulator.scene import Scene
+from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, simulate
 from ground_station.simulator.textures import TextureBank
 
@@ -33,13 +33,22 @@ def nearest_surface_m(scene: Scene, position_m: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("plan", ["mapping", "loop", "small-circle", "fast"])
-@pytest.mark.parametrize("name", scenes.names())
+@pytest.mark.parametrize("name", [name for name in scenes.names() if name != "corridor"])
 def test_every_plan_keeps_clear_of_the_building(name: str, plan: str) -> None:
     scene = scenes.build(name, 10)
     reference = Reference(plan_named(plan, scene, np.random.default_rng(3)), 0.0)
     lap_s = 120.0 if plan == "mapping" else 45.0
     position, _ = reference.at(np.linspace(0, lap_s, 40))
     assert nearest_surface_m(scene, position) > HULL_M
+
+
+@pytest.mark.parametrize("plan", ["mapping", "loop", "small-circle", "fast"])
+def test_a_halls_plan_that_leaves_the_corridor_is_refused(plan: str) -> None:
+    corridor = scenes.build("corridor", 10)
+    with pytest.raises(
+        SimulatorError, match=rf"'{plan}' does not fit into 'corridor' \(28 x 4 x 3"
+    ):
+        plan_named(plan, corridor, np.random.default_rng(0))
 
 
 def test_the_scenes_share_no_texture() -> None:
@@ -73,3 +82,25 @@ def test_the_office_can_be_filmed(tmp_path: Path) -> None:
     )  # fmt: skip
     frames = [frame.image for frame in open_input(out)]
     assert len(frames) == 2 and all(frame.std() > 20 for frame in frames)
+
+
+def test_the_aged_hall_is_the_old_one_but_for_its_furniture_and_posters() -> None:
+    fresh, moved, posted = (
+        scenes.build(name, 10) for name in ("atrium", "atrium-moved", "atrium-moved-posted")
+    )
+    assert len(fresh.surfaces) == len(moved.surfaces) == len(posted.surfaces)
+    other = [
+        k
+        for k, (a, b) in enumerate(zip(fresh.surfaces, moved.surfaces, strict=True))
+        if not np.array_equal(a.origin_m, b.origin_m)
+    ]
+    assert len(other) > 50
+    corners = np.concatenate([moved.surfaces[k].corners() for k in other])
+    assert corners[:, 2].max() < 1.7 and (corners[:, :2] > 0).all()
+    assert fresh.known_points == moved.known_points == posted.known_points
+    bank = TextureBank(fresh.texture_seed)
+    k = next(k for k, s in enumerate(fresh.surfaces) if s.material == "poster")
+    old, same, new = (surface_albedo(bank, scene, k) for scene in (fresh, moved, posted))
+    assert np.array_equal(old, same) and np.abs(old - new).mean() > 0.02
+    wall = next(k for k, s in enumerate(fresh.surfaces) if s.material == "brick")
+    assert np.array_equal(surface_albedo(bank, fresh, wall), surface_albedo(bank, posted, wall))
