@@ -2,7 +2,7 @@
 .DEFAULT_GOAL := help
 BLIMP := .venv/bin/blimp
 
-.PHONY: help setup demo serve test check bench budget hil soak soak-service limits faults fuzz \
+.PHONY: help setup demo serve test check bench experiments budget hil soak soak-service limits faults fuzz \
   install-service uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
@@ -72,6 +72,9 @@ bench: setup  ## Measure localizer, payload and features: costs in ratios of one
 	@$(BLIMP) bench localize --json out/bench.json
 	@$(BLIMP) bench payload --json out/bench-payload.json
 	@$(BLIMP) bench features --json out/bench-features.json
+
+experiments: setup  ## The thesis's experiments and more: NAMES="motion fast", OPTIONS=--quick
+	@$(BLIMP) experiments $(NAMES) --out out/experiments $(OPTIONS)
 
 budget: setup  ## Reckon the default build: table and plots in out/budget; status 1 without margin
 	@.venv/bin/python -m hw budget --out out/budget

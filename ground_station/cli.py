@@ -33,6 +33,7 @@ _COMMANDS = (
     ),
     ("export", "ground_station.service.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
+    ("experiments", "ground_station.experiments.command", "fly the thesis's experiments again"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
     ("bench", "ground_station.service.bench_command", "measure what each step costs"),
 )

@@ -58,7 +58,7 @@ def trajectory_plot(
     """The path seen from above, x to the right and y up, metres."""
     figure, (axes,) = _figure(1, (8.0, 5.6), dress)
     if floorplan is not None:
-        _draw_floorplan(axes, floorplan, dress)
+        show_floorplan(axes, floorplan, dress)
     if truth is not None and len(truth):
         x, y = _broken(truth)
         axes.plot(x, y, color=dress.truth, linewidth=2.6, alpha=0.55, label="true path")
@@ -210,7 +210,7 @@ def _legend(axes: Axes, dress: Dress) -> None:
         )
 
 
-def _draw_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
+def show_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
     width_m, height_m = plan.size_m
     x, y, yaw = plan.origin
     to_world = Affine2D().rotate(yaw).translate(x, y)

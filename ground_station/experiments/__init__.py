@@ -1,0 +1,1 @@
+"""Experiments: what the thesis claims and what it could not ask, flown again with exact truth."""

@@ -1,0 +1,96 @@
+"""What happens to a flight's frames on their way: thinned, shrunk, blurred, lost, covered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.experiments.declaration import Alteration
+from ground_station.geometry.camera import Camera
+from ground_station.recording.frames import Frame
+from pi_firmware.wire import annexb
+
+PACKET_BYTES = 1200
+"""Of video in an RTP packet, as the payload's packetizer makes them."""
+
+
+def altered(
+    frames: Iterable[Frame], alteration: Alteration, arrived: npt.NDArray[np.bool_] | None = None
+) -> Iterator[Frame]:
+    """The frames that a localizer sees.
+
+    `arrived` (n,) says of each frame of the flight, by its index, whether it could be decoded;
+    None: all. Times, and the indices in the flight, stay.
+    """
+    start_ns: int | None = None
+    for frame in frames:
+        start_ns = frame.time_ns if start_ns is None else start_ns
+        if frame.index % alteration.every or (arrived is not None and not arrived[frame.index]):
+            continue
+        yield replace(frame, image=_seen(frame, alteration, (frame.time_ns - start_ns) / 1e9))
+
+
+def _seen(frame: Frame, alteration: Alteration, time_s: float) -> npt.NDArray[np.uint8]:
+    image = frame.image
+    if is_dark(alteration, time_s):
+        image = np.zeros_like(image)
+    if alteration.scale < 1:
+        height, width = scaled_size(image.shape[1], image.shape[0], alteration.scale)[::-1]
+        image = np.asarray(
+            cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8
+        )
+    if alteration.blur_px > 0:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), alteration.blur_px), np.uint8)
+    return image
+
+
+def is_dark(alteration: Alteration, time_s: float) -> bool:
+    """Whether the lens is covered `time_s` after the flight's first frame."""
+    return 0 <= time_s - alteration.dark_from_s < alteration.dark_s
+
+
+def scaled_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
+    """Width and height of a picture at that scale, at least 16 px each."""
+    return max(16, round(width_px * scale)), max(16, round(height_px * scale))
+
+
+def scaled_camera(camera: Camera, scale: float) -> Camera:
+    """The camera of pictures at that scale; pixel centres are whole numbers, so half a pixel moves.
+
+    The lens acts on the plane z = 1, which does not change.
+    """
+    if scale >= 1:
+        return camera
+    width, height = scaled_size(camera.width_px, camera.height_px, scale)
+    sx, sy = width / camera.width_px, height / camera.height_px
+    return replace(
+        camera,
+        width_px=width,
+        height_px=height,
+        fx_px=camera.fx_px * sx,
+        fy_px=camera.fy_px * sy,
+        cx_px=(camera.cx_px + 0.5) * sx - 0.5,
+        cy_px=(camera.cy_px + 0.5) * sy - 0.5,
+    )
+
+
+def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> npt.NDArray[np.bool_]:
+    """Which access units of an H.264 stream can be decoded when packets are lost one by one (n,).
+
+    A unit goes in packets of `PACKET_BYTES`; one that misses a packet is useless, and so is all
+    after it up to the next IDR, because each picture is predicted from the one before. There is no
+    retransmission and no error correction, as in the product.
+    """
+    rng = np.random.default_rng(seed)
+    whole = False
+    result = []
+    for unit in units:
+        packets = -(-len(unit) // PACKET_BYTES)
+        complete = bool((rng.random(packets) >= packet_loss).all())
+        whole = complete and (whole or annexb.is_idr(unit))
+        result.append(whole)
+    return np.array(result, dtype=bool)

@@ -1,0 +1,93 @@
+"""`blimp experiments`: the thesis's experiments and further ones, with exact truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLE = """\
+examples:
+  blimp experiments                       all of them; stopped and started again it goes on
+  blimp experiments illumination motion   some of them
+  blimp experiments --quick               one seed, short flights: to see that all works
+  blimp experiments --list
+
+What is flown stands in experiments.toml beside this command's module; --file takes another. Flights
+are simulated once and kept in the folder of --out, as are maps and runs, under what they depend on:
+after a change only what it touches is made anew."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = EXAMPLE
+    add = parser.add_argument
+    add("names", nargs="*", metavar="NAME", help="experiments (default: all)")
+    add("--list", action="store_true", help="say which there are, and nothing else")
+    add("--file", type=Path, metavar="TOML", help="experiments (default: the shipped)")
+    add("--quick", action="store_true", help="one seed and short flights")
+    add("--jobs", type=int, default=0, metavar="N", help="side by side (0: one a core)")
+    add("--data", type=Path, default=Path("../shared/data"), metavar="DIR",
+        help="folder of real video, redkitchen/ (../shared/data)")  # fmt: skip
+    add("--sample", type=Path, default=Path("maps/atrium"), metavar="DIR",
+        help="the sample map, for its settings and floor plan (maps/atrium)")  # fmt: skip
+    add("--out", type=Path, default=Path("out/experiments"), metavar="DIR",
+        help="for the report and all that is kept (out/experiments)")  # fmt: skip
+    add("--accept", type=Path, metavar="README.md",
+        help="put the table of this run between that file's markers")  # fmt: skip
+    add("--json", type=Path, metavar="F", help="write results.json there, too")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Flies, maps, localizes, reports; 1 where the default is not better in some row.
+
+    Raises `BlimpError` for what a person can mend. Real video that is not there is left out with
+    a line, unless it was asked for by name.
+    """
+    import sys
+
+    from ground_station.errors import InputError
+    from ground_station.experiments import (
+        declaration,
+        plan,
+        readme,
+        report,
+        schedule,
+        summary,
+        tables,
+    )
+    from ground_station.experiments.store import Store
+    from ground_station.files import write_json
+    from ground_station.localization.bench import machine
+    from ground_station.mapping.settings import load_settings
+
+    if not 0 <= args.jobs <= 256:
+        raise InputError(f"--jobs is {args.jobs}; allowed: 0 to 256")
+    declared = declaration.load(args.file or declaration.SHIPPED, args.names or None)
+    if args.list:
+        for experiment in declared.experiments:
+            print(f"{experiment.name:16} {experiment.title} ({len(experiment.cases)} rows)")
+        return 0
+    if not args.names:
+        declared, missing = declaration.without_missing(declared, args.data)
+        for line in missing:
+            print(f"blimp experiments: left out: {line}", file=sys.stderr, flush=True)
+    toml = args.sample / "mapping.toml"
+    mapping = load_settings(toml if toml.is_file() else None)
+    store = Store(args.out)
+    jobs = args.jobs or machine()["cores"]
+    planned = plan.make(declared, mapping, args.data, quick=args.quick)
+    schedule.carry_out(planned, store, args.data, jobs)
+    about = {"machine": machine(), "jobs": jobs, "quick": args.quick}
+    document = summary.summarise(declared, planned, store, about)
+    floorplan = args.sample / "floorplan.yaml"
+    report.write(document, args.out, floorplan if floorplan.is_file() else None)
+    if args.json:
+        write_json(args.json, document)
+    if args.accept:
+        readme.accept(document, args.accept, declaration.SHIPPED.with_name(readme.NAME))
+    for experiment in document["experiments"]:
+        print(tables.text(experiment), end="\n\n")
+    print(report.conditions(document))
+    print(tables.verdict(document))
+    print(f"{args.out / 'report.html'}\n{args.out / 'results.json'}\n{args.out / 'results.md'}")
+    return 1 if document["worse"] else 0

@@ -1,0 +1,173 @@
+"""One run: a localizer, a map and a flight; its figures, frame by frame and in all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.evaluation import ate
+from ground_station.experiments.alter import altered, arrivals, scaled_camera
+from ground_station.experiments.declaration import Alteration
+from ground_station.experiments.material import Flown
+from ground_station.features.settings import OF_THE_MAP
+from ground_station.geometry import poses
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization import results
+from ground_station.localization.estimate import PoseEstimate, State
+from ground_station.localization.extraction import extractor_for
+from ground_station.localization.kinematics import Kinematics
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.mapping.store import Map
+
+F64 = npt.NDArray[np.float64]
+
+_SAME_S = 0.005
+"""A frame is judged by a true pose within this time of its own."""
+_NEAR_M = 0.5
+"""A place is found again when the pose is so near the true one."""
+_STAGES = ("features", "projection", "association", "pose", "total")
+
+
+def measure(
+    map_: Map, flight: Flown, alteration: Alteration, settings: LocalizerSettings, seed: int
+) -> dict[str, Any]:
+    """Localizes a flight from its true first pose; plain values for the report.
+
+    `series` has for each localized frame: time (s), position in the world (m), both errors.
+    Errors are of the unaligned poses; None where no frame was localized.
+    """
+    features = replace(settings.features, extractor=OF_THE_MAP)
+    settings = replace(settings, features=features)
+    camera = scaled_camera(flight.camera, alteration.scale)
+    localizer = Localizer(map_, camera, extractor_for(map_.info, features), settings)
+    lossy = alteration.packet_loss > 0 and flight.recording is not None
+    arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
+    estimates: list[PoseEstimate] = []
+    smoothed: list[Kinematics] = []
+    for frame in altered(flight.frames, alteration, arrived):
+        if not estimates:
+            nearest = flight.truth.nearest(frame.time_ns)
+            localizer.set_initial_pose(flight.truth.wTc[nearest], frame.time_ns)
+        estimates.append(
+            localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
+        )
+        smoothed += localizer.smoothed()
+    smoothed += localizer.finish()
+    captured = flight.frames.count() or len(estimates)
+    return {
+        "frames": -(-captured // alteration.every),
+        "seen": len(estimates),
+        "localized": sum(e.localized for e in estimates),
+        "tracking": sum(e.state is State.TRACKING for e in estimates),
+        "landmarks": len(map_.landmarks),
+        "keyframes": len(map_.keyframes),
+        "stage_s": _stages(estimates),
+        "recovery_s": _recovery_s(estimates, flight.truth, alteration),
+        **_errors(estimates, flight.truth),
+        **_smoothed(smoothed, flight.truth),
+    }
+
+
+def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory) -> dict[str, Any]:
+    found = _pairs(results.trajectory(estimates), truth)
+    nothing = ("position_m", "rotation_deg", "position_zhang_m", "aligned_m", "p95_m")
+    if found is None:
+        return dict.fromkeys(nothing) | {"series": {}, "consistency": None}
+    estimate, true = found
+    errors = ate.errors(estimate, true)
+    start_ns = int(truth.time_ns[0])
+    return {
+        **errors.rmse(),
+        "aligned_m": _aligned_m(estimate, true),
+        "p95_m": float(np.percentile(errors.position_m, 95)),
+        "consistency": _consistency(estimates, truth),
+        "series": {
+            "time_s": _rounded((estimate.time_ns - start_ns) / 1e9),
+            "x_m": _rounded(estimate.position_m[:, 0]),
+            "y_m": _rounded(estimate.position_m[:, 1]),
+            "position_m": _rounded(errors.position_m),
+            "rotation_deg": _rounded(errors.rotation_deg),
+        },
+    }
+
+
+def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory] | None:
+    if not len(estimate):
+        return None
+    near = np.array(
+        [abs(int(truth.time_ns[truth.nearest(int(t))]) - int(t)) for t in estimate.time_ns]
+    )
+    if not (near <= _SAME_S * 1e9).any():
+        return None
+    return ate.synchronize(estimate, truth, _SAME_S)
+
+
+def _aligned_m(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """RMSE after SE(3): what a comparison without a common frame would have seen."""
+    from ground_station.errors import GeometryError
+
+    try:
+        return ate.errors(estimate, truth, "se3").rmse()["position_m"]
+    except GeometryError:
+        return None
+
+
+def _consistency(estimates: Sequence[PoseEstimate], truth: Trajectory) -> dict[str, float] | None:
+    """How well errors fit their covariances: the mean NEES (6 where they fit; Bar-Shalom et al.,
+
+    Estimation with Applications to Tracking and Navigation, 2001, 5.4) and the share of frames
+    inside the 95 % ellipsoid. None where no covariance was published.
+    """
+    values = []
+    for e in estimates:
+        if e.wTc is None or e.covariance is None or e.state is not State.TRACKING:
+            continue
+        error = poses.log(poses.inverse(e.wTc) @ truth.at(e.time_ns))
+        values.append(float(error @ np.linalg.solve(e.covariance, error)))
+    if not values:
+        return None
+    inside = np.asarray(values) <= _CHI2_95_6
+    return {"nees": float(np.mean(values)), "inside_95": float(np.mean(inside))}
+
+
+_CHI2_95_6 = 12.591587
+"""95 % quantile of χ² with 6 degrees of freedom."""
+
+
+def _smoothed(states: Sequence[Kinematics], truth: Trajectory) -> dict[str, Any]:
+    if not states:
+        return {"smoothed_m": None}
+    ordered = sorted(states, key=lambda state: state.time_ns)
+    times = [state.time_ns for state in ordered]
+    found = _pairs(Trajectory.from_poses(times, [state.wTc for state in ordered]), truth)
+    return {"smoothed_m": None if found is None else ate.errors(*found).rmse()["position_m"]}
+
+
+def _recovery_s(
+    estimates: Sequence[PoseEstimate], truth: Trajectory, alteration: Alteration
+) -> float | None:
+    """From the uncovered lens to a TRACKING pose near the true one; None: never, or not covered."""
+    if alteration.dark_s <= 0 or not estimates:
+        return None
+    end_ns = estimates[0].time_ns + round((alteration.dark_from_s + alteration.dark_s) * 1e9)
+    for e in estimates:
+        if e.time_ns < end_ns or e.state is not State.TRACKING or e.wTc is None:
+            continue
+        if np.linalg.norm(e.wTc[:3, 3] - truth.at(e.time_ns)[:3, 3]) <= _NEAR_M:
+            return (e.time_ns - end_ns) / 1e9
+    return None
+
+
+def _stages(estimates: Sequence[PoseEstimate]) -> dict[str, float]:
+    """The median time of each of the thesis's stages, seconds, over the frames where it ran."""
+    spans = {name: [e.stage_ms[name] for e in estimates if name in e.stage_ms] for name in _STAGES}
+    return {name: round(float(np.median(v)) / 1e3, 5) for name, v in spans.items() if v}
+
+
+def _rounded(values: F64) -> list[float]:
+    return [round(float(value), 4) for value in values]

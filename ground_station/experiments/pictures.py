@@ -1,0 +1,168 @@
+"""Pictures of experiments: paths coloured by their error, error over time, its distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from ground_station.evaluation.floorplan import FloorPlan
+from ground_station.evaluation.plots import Dress, dressed, show_floorplan
+
+_MOST_PATHS = 4
+_LEAST_M, _MOST_M = 0.002, 0.5
+"""Ends of the error's colours, which are logarithmic: a run's errors span two powers of ten."""
+_COLOURS = "cividis"
+"""Even in lightness, and the same to every colour vision (Nuñez, Anderton, Renslow, 2018)."""
+_STYLES = {"thesis": "--", "default": "-"}
+_HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+"""Okabe and Ito's, readable on both papers."""
+
+
+def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress) -> Figure:
+    """The default's path of each case's first seed from above, its colour the position error."""
+    shown = [(c["title"], s) for c in cases if (s := first_series(c, "default"))][:_MOST_PATHS]
+    columns = min(2, max(1, len(shown)))
+    rows = -(-max(1, len(shown)) // columns)
+    figure, axes = _figure(rows, columns, (8.0, 2.9 * rows + 0.8), dress)
+    points = None
+    for one, (title, series) in zip(axes, shown, strict=False):
+        if plan is not None:
+            show_floorplan(one, plan, dress)
+        error = np.clip(series["position_m"], _LEAST_M, _MOST_M)
+        points = one.scatter(
+            series["x_m"], series["y_m"], c=error, s=5, cmap=_COLOURS,
+            norm=LogNorm(_LEAST_M, _MOST_M),
+        )  # fmt: skip
+        one.set_aspect("equal")
+        one.set_title(title, color=dress.ink, fontsize=9)
+        one.set_xlabel("x, m")
+        one.set_ylabel("y, m")
+    for one in axes[len(shown) :]:
+        one.set_visible(False)
+    if points is not None:
+        bar = figure.colorbar(points, ax=axes, shrink=0.8, label="position error, m")
+        bar.ax.tick_params(colors=dress.ink, labelsize=8)
+        bar.ax.yaxis.label.set_color(dress.ink)
+    return figure
+
+
+def over_time(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
+    """Position error of each case's first seed over time, the preset thesis dashed."""
+    figure, (axes,) = _figure(1, 1, (8.0, 3.2), dress)
+    for hue, case in zip(_hues(len(cases)), cases, strict=True):
+        for preset, style in _STYLES.items():
+            series = first_series(case, preset)
+            if not series:
+                continue
+            t, e = _broken(series["time_s"], 100 * np.asarray(series["position_m"]))
+            label = str(case["title"]) if preset == "default" else None
+            axes.plot(t, e, style, color=hue, linewidth=1.0, label=label)
+    axes.set_yscale("log")
+    axes.set_xlabel("time, s")
+    axes.set_ylabel("position error, cm")
+    _legend(axes, dress)
+    return figure
+
+
+def distribution(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
+    """The share of a flight's frames within an error, over all seeds; the thesis's way dashed.
+
+    Frames that were not localized count: a line that ends below 1 has lost the rest.
+    """
+    figure, (axes,) = _figure(1, 1, (8.0, 3.4), dress)
+    for hue, case in zip(_hues(len(cases)), cases, strict=True):
+        for preset, style in _STYLES.items():
+            runs = [r for r in case["presets"].get(preset, {}).get("runs", []) if "failed" not in r]
+            errors = np.sort([e for run in runs for e in run["series"].get("position_m", [])])
+            frames = sum(run["frames"] for run in runs)
+            if not len(errors):
+                continue
+            label = str(case["title"]) if preset == "default" else None
+            axes.step(
+                100 * np.maximum(errors, 1e-4), np.arange(1, len(errors) + 1) / frames, style,
+                where="post", color=hue, linewidth=1.2, label=label,
+            )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel("position error, cm")
+    axes.set_ylabel("share of frames")
+    _legend(axes, dress)
+    return figure
+
+
+def sweep(cases: Sequence[dict[str, Any]], level: str, dress: Dress) -> Figure:
+    """Position error and share localized over what the cases vary, mean and spread."""
+    figure, (upper, lower) = _figure(2, 1, (8.0, 4.6), dress)
+    places = np.arange(len(cases))
+    for (preset, style), hue in zip(_STYLES.items(), (dress.second, dress.estimate), strict=True):
+        found = [case["presets"].get(preset, {}) for case in cases]
+        mean = [_value(row.get("position_m"), "mean") for row in found]
+        std = [_value(row.get("position_m"), "std") for row in found]
+        name = "default" if preset == "default" else "preset thesis"
+        upper.errorbar(
+            places, 100 * np.asarray(mean), 100 * np.asarray(std), fmt="o" + style, color=hue,
+            capsize=3, linewidth=1.2, markersize=4, label=name,
+        )  # fmt: skip
+        share = [np.nan if row.get("localized") is None else row["localized"] for row in found]
+        lower.plot(places, 100 * np.asarray(share), "o" + style, color=hue, markersize=4, lw=1.2)
+    upper.set_yscale("log")
+    upper.set_ylabel("position error, cm")
+    lower.set_ylabel("localized, %")
+    lower.set_ylim(0, 104)
+    lower.set_xticks(places, [str(case["title"]) for case in cases])
+    lower.set_xlabel(level)
+    _legend(upper, dress)
+    return figure
+
+
+def first_series(case: dict[str, Any], preset: str) -> dict[str, list[float]]:
+    """Frame by frame, of the first seed whose run localized any; empty where none did."""
+    for run in case["presets"].get(preset, {}).get("runs", []):
+        series: dict[str, list[float]] = run.get("series") or {}
+        if series.get("time_s"):
+            return series
+    return {}
+
+
+def _value(found: dict[str, float] | None, key: str) -> float:
+    return float("nan") if found is None else found[key]
+
+
+def _hues(count: int) -> list[str]:
+    return [_HUES[k % len(_HUES)] for k in range(count)]
+
+
+def _broken(
+    time_s: Sequence[float], values: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """With a NaN where the next localized frame comes a second later: no line over a gap."""
+    t = np.asarray(time_s, np.float64)
+    gaps = np.flatnonzero(np.diff(t) > 1.0) + 1
+    return np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan)
+
+
+def _figure(
+    rows: int, columns: int, size_inches: tuple[float, float], dress: Dress
+) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex="col" if columns == 1 else False)
+    axes = list(grid.ravel())
+    for one in axes:
+        dressed(one, dress, 8)
+    return figure, axes
+
+
+def _legend(axes: Axes, dress: Dress) -> None:
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc="best", fontsize=8, facecolor=dress.paper, edgecolor=dress.grid,
+            labelcolor=dress.ink, framealpha=0.85,
+        )  # fmt: skip

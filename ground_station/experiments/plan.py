@@ -1,0 +1,207 @@
+"""From experiments to jobs: each flight, map and run once, with what it needs and depends on."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import InputError
+from ground_station.experiments.declaration import (
+    Alteration,
+    Case,
+    Declaration,
+    Flight,
+    MapSpec,
+    changed,
+)
+from ground_station.experiments.material import file_name
+from ground_station.experiments.program import code_sha256
+from ground_station.features import extractors
+from ground_station.localization.settings import LocalizerSettings, load_preset
+from ground_station.mapping.settings import MappingSettings
+
+QUICK_S = 6.0
+"""Length of a flight with --quick."""
+
+
+@dataclass(frozen=True)
+class FlightJob:
+    """Simulates a flight into `flights/<name>`."""
+
+    key: str
+    name: str
+    flight: Flight
+    seed: int
+
+
+@dataclass(frozen=True)
+class MapJob:
+    """Builds a map in `maps/<key>`; `recording` is the name of the flight's, None: real ones."""
+
+    key: str
+    name: str
+    spec: MapSpec
+    settings: MappingSettings
+    recording: str | None
+
+
+@dataclass(frozen=True)
+class RunJob:
+    """Localizes a flight in a map; its figures go to `runs/<key>.json`."""
+
+    key: str
+    name: str
+    map_key: str
+    flight: Flight
+    recording: str | None
+    seed: int
+    alter: Alteration
+    settings: LocalizerSettings
+
+
+Job = FlightJob | MapJob | RunJob
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All jobs by key, each before those that need it; `runs[case][preset]` are keys by seed."""
+
+    jobs: dict[str, Job]
+    needs: dict[str, tuple[str, ...]]
+    runs: dict[tuple[str, str], dict[str, list[str]]]
+
+
+def make(
+    declaration: Declaration, mapping: MappingSettings, data: Path, *, quick: bool = False
+) -> Plan:
+    """The jobs of experiments; raises `ConfigError` or `InputError` before anything is worked.
+
+    `quick`: one seed, short flights. Real pictures have one seed, for they are flown once.
+    """
+    plan = Plan({}, {}, {})
+    for experiment in declaration.experiments:
+        for case in experiment.cases:
+            _check_features(case)
+            mine = {preset: _runs(plan, case, preset, declaration, mapping, data, quick)
+                    for preset in case.presets}  # fmt: skip
+            plan.runs[case.experiment, case.name] = mine
+    return plan
+
+
+def _runs(
+    plan: Plan,
+    case: Case,
+    preset: str,
+    declaration: Declaration,
+    mapping: MappingSettings,
+    data: Path,
+    quick: bool,
+) -> list[str]:
+    where = f"experiment '{case.experiment}', case '{case.name}', preset '{preset}'"
+    settings = changed(load_preset(preset), case.localizer, where)
+    map_job = _map(plan, case, mapping, data)
+    flight = case.flight
+    if quick and flight.simulated:
+        flight = replace(flight, duration_s=min(flight.duration_s, QUICK_S))
+    seeds = declaration.seeds[:1] if quick or not flight.simulated else declaration.seeds
+    keys = []
+    for seed in seeds:
+        needs = [map_job.key]
+        recording = None
+        if flight.simulated:
+            flown = _flight(plan, flight, seed)
+            recording = flown.name
+            needs.append(flown.key)
+        depends = {
+            "map": map_job.key,
+            "flight": needs[1] if flight.simulated else _real(flight, data),
+            "seed": seed,
+            "alter": asdict(case.alter),
+            "settings": asdict(settings),
+            "code": code_sha256("run"),
+        }
+        key = _key("run", depends)
+        name = f"{case.experiment}: {case.title}, {preset}, seed {seed}"
+        _add(plan, RunJob(key, name, map_job.key, flight, recording, seed, case.alter, settings),
+             tuple(needs))  # fmt: skip
+        keys.append(key)
+    return keys
+
+
+def _map(plan: Plan, case: Case, mapping: MappingSettings, data: Path) -> MapJob:
+    spec, needs, recording = case.map, [], None
+    if spec.flight.simulated:
+        flown = _flight(plan, spec.flight, spec.seed)
+        recording = flown.name
+        needs.append(flown.key)
+    depends = {
+        "flight": needs[0] if needs else _real(spec.flight, data),
+        "spec": asdict(spec),
+        "features": _sha256(spec.features),
+        "settings": asdict(mapping),
+        "code": code_sha256("map"),
+    }
+    job = MapJob(
+        _key("map", depends),
+        f"map of {spec.images or 'all'} images, {spec.features}",
+        spec,
+        mapping,
+        recording,
+    )
+    _add(plan, job, tuple(needs))
+    return job
+
+
+def _flight(plan: Plan, flight: Flight, seed: int) -> FlightJob:
+    name = file_name(flight, seed)
+    depends = {"flight": asdict(flight), "seed": seed, "code": code_sha256("flight")}
+    key = _key("flight", depends)
+    job = FlightJob(key, f"{name.removesuffix('.mcap')}-{key[:8]}.mcap", flight, seed)
+    _add(plan, job, ())
+    return job
+
+
+def _add(plan: Plan, job: Job, needs: tuple[str, ...]) -> None:
+    plan.jobs.setdefault(job.key, job)
+    plan.needs.setdefault(job.key, needs)
+
+
+def _key(kind: str, depends: dict[str, Any]) -> str:
+    text = json.dumps({"kind": kind, **depends}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+@functools.cache
+def _sha256(features: str) -> str:
+    return extractors.create(features, 50).sha256
+
+
+def _check_features(case: Case) -> None:
+    if case.map.features not in extractors.names():
+        known = ", ".join(extractors.names())
+        raise InputError(
+            f"experiment '{case.experiment}', case '{case.name}': there is no extractor "
+            f"'{case.map.features:.60}' (known: {known})"
+        )
+
+
+@functools.cache
+def _real(flight: Flight, data: Path) -> str:
+    """A hash of real pictures by name and size, of their camera and trajectory by content."""
+    folder = data / flight.folder
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder; --data says where real pictures are")
+    whole = hashlib.sha256()
+    for path in sorted(folder.iterdir()):
+        whole.update(f"{path.name}\0{path.stat().st_size}\n".encode())
+    for name in (flight.truth, flight.camera):
+        path = data / name
+        if not name or not path.is_file():
+            raise InputError(f"{path}: there is no such file")
+        whole.update(path.read_bytes())
+    whole.update(f"{flight.range}\0{flight.rate_hz}".encode())
+    return whole.hexdigest()

@@ -1,0 +1,101 @@
+"""README's table of the experiments: made of one accepted run, between two markers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from ground_station.errors import GroundStationError, InputError
+from ground_station.experiments import tables
+from ground_station.experiments.report import PRINTED, conditions
+from ground_station.files import write_json, write_text
+
+BEGIN = "<!-- experiments: made by `blimp experiments --accept`; do not edit -->"
+END = "<!-- experiments: end -->"
+NAME = "accepted.json"
+"""Of the file beside `experiments.toml` that holds the run which README shows."""
+
+
+def render(document: dict[str, Any]) -> str:
+    """One table of all rows of experiments that are no series of levels, and the verdict."""
+    head = ["experiment", "thesis's own*", "preset thesis", "default"]
+    rows = [
+        [f"{e['title']}: {case['title']}", tables.printed(case), *_presets(case)]
+        for e in document["experiments"]
+        if not e["level"]
+        for case in e["cases"]
+    ]
+    lines = ["| " + " | ".join(tables.escaped(cell) for cell in row) + " |" for row in rows]
+    table = ["| " + " | ".join(head) + " |", "|---|---|---|---|", *lines]
+    parts = [tables.verdict(document), "\n".join(table), f"{conditions(document)} {PRINTED}"]
+    return "\n\n".join(parts) + "\n"
+
+
+def table_in(readme: str) -> str | None:
+    """What stands between the markers; None without them."""
+    if BEGIN not in readme or END not in readme:
+        return None
+    return readme.split(BEGIN, 1)[1].split(END, 1)[0].strip("\n") + "\n"
+
+
+def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
+    """Makes a run the one that README shows, and keeps its figures without the single frames.
+
+    Raises `InputError` for a quick run, for one in which something failed or was not measured, and
+    for a README without the markers.
+    """
+    if document["quick"]:
+        raise InputError("a quick run is not what README shows; run them whole")
+    for e in document["experiments"]:
+        for case in e["cases"]:
+            for preset, row in case["presets"].items():
+                if row["failed"]:
+                    raise InputError(
+                        f"{e['title']}, {case['title']}, {preset}: {row['failed'][0]}; "
+                        "such a run is not accepted"
+                    )
+    text = readme.read_text()
+    if table_in(text) is None:
+        raise InputError(f"{readme}: has no line '{BEGIN}' with '{END}' after it")
+    before, rest = text.split(BEGIN, 1)
+    after = rest.split(END, 1)[1]
+    write_json(accepted, without_frames(document))
+    write_text(readme, f"{before}{BEGIN}\n{render(document)}{END}{after}")
+
+
+def without_frames(document: dict[str, Any]) -> dict[str, Any]:
+    """The same without the runs one by one: what a table needs."""
+    return document | {
+        "experiments": [
+            e
+            | {
+                "cases": [
+                    case
+                    | {
+                        "presets": {
+                            preset: {k: v for k, v in row.items() if k != "runs"}
+                            for preset, row in case["presets"].items()
+                        }
+                    }
+                    for case in e["cases"]
+                ]
+            }
+            for e in document["experiments"]
+        ]
+    }
+
+
+def read(path: Path) -> dict[str, Any]:
+    """An accepted run; raises `GroundStationError` where it is none."""
+    try:
+        document = json.loads(path.read_text())
+        if not isinstance(document["experiments"], list):
+            raise ValueError("no experiments")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GroundStationError(f"{path}: {error}") from None
+    return dict(document)
+
+
+def _presets(case: dict[str, Any]) -> list[str]:
+    return [tables.figures(case, preset) for preset in tables.NAMES]

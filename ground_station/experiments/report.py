@@ -1,0 +1,129 @@
+"""The report of experiments: one self-contained page, `results.json`, `results.md`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ground_station.evaluation.floorplan import FloorPlan, load_floorplan
+from ground_station.evaluation.pages import Shown, shown, write_page
+from ground_station.experiments import pictures, tables
+from ground_station.files import write_json, write_text
+
+_TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
+QUICK = "Quick: one seed and short flights, to see that all works."
+PRINTED = (
+    "* as the thesis printed it: another building, another camera. No ratio is taken against it."
+)
+
+
+def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) -> None:
+    """Writes `results.json`, `results.md` and `report.html` into the folder `out`.
+
+    `floorplan` is the plan of the simulated atrium, a floorplan.yaml.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "results.json", document)
+    write_text(out / "results.md", markdown(document))
+    plan = load_floorplan(floorplan) if floorplan is not None else None
+    experiments = [
+        {
+            "head": e,
+            "table": tables.table(e),
+            "pictures": _pictures(e, plan),
+            "settings": [_setting(case) for case in e["cases"]],
+            "failed": [
+                f"{case['title']}, {tables.NAMES[preset]}: {reason}"
+                for case in e["cases"]
+                for preset, row in case["presets"].items()
+                for reason in dict.fromkeys(row["failed"])
+            ],
+        }
+        for e in document["experiments"]
+    ]
+    write_page(
+        out / "report.html",
+        _TEMPLATE,
+        title="The experiments of the thesis, flown again",
+        verdict=tables.verdict(document),
+        good=not document["worse"],
+        document=document,
+        experiments=experiments,
+        printed=PRINTED,
+        quick=QUICK if document["quick"] else "",
+    )
+
+
+def markdown(document: dict[str, Any]) -> str:
+    """All tables, after the verdict."""
+    parts = [tables.verdict(document), conditions(document), PRINTED]
+    for experiment in document["experiments"]:
+        title = f"### {experiment['title']}"
+        question = experiment["question"]
+        parts += [title + (f"\n\n{question}" if question else ""), tables.markdown(experiment)]
+    return "\n\n".join(part.strip("\n") for part in parts) + "\n"
+
+
+def conditions(document: dict[str, Any]) -> str:
+    """How it was measured, in a sentence or two."""
+    seeds = document["seeds"]
+    quick = f" {QUICK}" if document["quick"] else ""
+    return (
+        f"Simulated flights, seeds {', '.join(map(str, seeds))}, unless real video is named; both "
+        "presets localize the same frames from the true first pose; errors are unaligned RMSE "
+        f"over the frames that were localized, mean ± standard deviation over the seeds.{quick}"
+    )
+
+
+def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Shown]:
+    cases = [c for c in experiment["cases"] if any(_localized(c, p) for p in c["presets"])]
+    if not cases:
+        return []
+    name = experiment["title"]
+    found = []
+    if experiment["level"]:
+        level = experiment["level"]
+        found.append(
+            shown(f"Error over {level}", f"{name}: position error and share localized over {level}",
+                  lambda dress: pictures.sweep(experiment["cases"], level, dress))
+        )  # fmt: skip
+    indoors = {case["flight"]["scene"] for case in cases if not case["flight"]["folder"]}
+    plan = atrium if indoors == {"atrium"} else None
+    if any(pictures.first_series(case, "default") for case in cases):
+        found.append(
+            shown("Paths, coloured by their error", f"{name}: paths from above, by error",
+                  lambda dress: pictures.paths(cases, plan, dress))
+        )  # fmt: skip
+    found.append(
+        shown("Error over time, the preset thesis dashed", f"{name}: position error over time",
+              lambda dress: pictures.over_time(cases, dress))
+    )  # fmt: skip
+    found.append(
+        shown("Share of frames within an error, the preset thesis dashed",
+              f"{name}: distribution of the position error",
+              lambda dress: pictures.distribution(cases, dress))
+    )  # fmt: skip
+    return found
+
+
+def _localized(case: dict[str, Any], preset: str) -> bool:
+    return bool(pictures.first_series(case, preset))
+
+
+def _setting(case: dict[str, Any]) -> tuple[str, str]:
+    """A case and what it was made of, as one line of keys and values."""
+    words = []
+    for table in ("flight", "map", "alter", "localizer"):
+        for key, value in _flat(case[table], f"{table}."):
+            words.append(f"{key} = {value}")
+    return str(case["title"]), "; ".join(words)
+
+
+def _flat(table: dict[str, Any], prefix: str) -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        if isinstance(value, dict):
+            rows += _flat(value, f"{prefix}{key}.")
+        elif value not in ("", 0, 0.0):
+            rows.append((prefix + key, value))
+    return rows

@@ -1,0 +1,125 @@
+"""Jobs over the cores, each after what it needs; stopped at any moment, the next start goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from ground_station.errors import GroundStationError
+from ground_station.experiments.plan import FlightJob, Job, Plan
+from ground_station.experiments.store import Store
+from ground_station.experiments.work import prepare, work
+from ground_station.progress import Progress
+from pi_firmware.wire.errors import BlimpError
+
+_TRIES = 2
+"""A process that ends takes its neighbours' pool with it: each gets a second try, alone."""
+
+
+Work = Callable[[Job, Path, Path], None]
+
+
+def carry_out(plan: Plan, store: Store, data: Path, jobs: int, do: Work = work) -> int:
+    """Does what is not there yet, `jobs` at a time, each by `do`; the number of jobs done.
+
+    Raises the first error that a person can mend, after the others in hand are finished; what was
+    done is kept. A job that its process did not survive is kept as failed.
+    """
+    open_ = {key: job for key, job in plan.jobs.items() if not store.done(job)}
+    _spread_failures(plan, store, open_)
+    done, tries = 0, dict.fromkeys(open_, 0)
+    with Progress("experiments, jobs", len(open_)) as progress:
+        while open_:
+            with _pool(jobs) as pool:
+                done += _until_broken(plan, store, data, jobs, do, pool, open_, tries, progress)
+    return done
+
+
+def _until_broken(
+    plan: Plan,
+    store: Store,
+    data: Path,
+    jobs: int,
+    do: Work,
+    pool: ProcessPoolExecutor,
+    open_: dict[str, Job],
+    tries: dict[str, int],
+    progress: Progress,
+) -> int:
+    """Works until all is done, or until a process dies and with it the pool."""
+    running: dict[Future[None], str] = {}
+    done = 0
+    error: BlimpError | None = None
+    while open_ and not (error and not running):
+        busy = set(running.values())
+        ready = [
+            key
+            for key in open_
+            if key not in busy and not any(need in open_ for need in plan.needs[key])
+        ]
+        chosen = ready[: jobs - len(running)]
+        second = [key for key in ready if tries[key]]
+        if second or any(tries[key] == _TRIES for key in busy):
+            chosen = [] if running else second[:1]
+        for key in [] if error else chosen:
+            tries[key] += 1
+            running[pool.submit(do, open_[key], store.folder, data)] = key
+        finished, _ = wait(running, return_when=FIRST_COMPLETED)
+        broken = False
+        for future in finished:
+            key = running.pop(future)
+            try:
+                future.result()
+            except BrokenProcessPool:
+                broken = True
+                if tries[key] < _TRIES:
+                    continue
+                _fail(store, open_[key])
+            except BlimpError as caught:
+                error = error or caught
+                continue
+            del open_[key]
+            done += 1
+            progress.step()
+            _spread_failures(plan, store, open_)
+        if broken:
+            return done
+    if error:
+        raise error
+    return done
+
+
+def _fail(store: Store, job: Job) -> None:
+    if isinstance(job, FlightJob):  # nothing can go on without it
+        raise GroundStationError(f"{job.name}: its process ended {_TRIES} times")
+    store.write(job.key, {"failed": f"its process ended {_TRIES} times"})
+
+
+def _spread_failures(plan: Plan, store: Store, open_: dict[str, Job]) -> None:
+    """A run in a map that cannot be built fails for the map's reason, without being tried."""
+    for key in list(open_):
+        for need in plan.needs[key]:
+            reason = None if need in open_ else store.failure(plan.jobs[need])
+            if reason is not None:
+                store.write(key, {"failed": reason})
+                del open_[key]
+                break
+
+
+@contextlib.contextmanager
+def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
+    """Fresh processes; on an error or Ctrl-C they are ended at once: all they do is kept whole."""
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, prepare)
+    try:
+        yield pool
+    except BaseException:
+        for process in list(getattr(pool, "_processes", {}).values()):
+            process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
+        raise
+    pool.shutdown(wait=True, cancel_futures=True)

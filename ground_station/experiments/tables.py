@@ -1,0 +1,150 @@
+"""Experiments as tables: cells of text, from which the page, the console and Markdown are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ground_station.evaluation.text import columns
+
+NONE = "–"
+NAMES = {"thesis": "preset thesis", "default": "default"}
+
+Cell = Callable[[dict[str, Any]], str]
+
+
+def table(experiment: dict[str, Any]) -> list[list[str]]:
+    """Head and rows of an experiment's table; a column only where some case has a figure."""
+    cases = experiment["cases"]
+    head: list[tuple[str, Cell]] = [(experiment["level"] or "case", lambda c: str(c["title"]))]
+    head.append(("thesis's own*", printed))
+    for preset, name in NAMES.items():
+        head += [
+            (f"{name}: position", _spread(preset, "position_m", 100.0, " cm")),
+            ("rotation", _spread(preset, "rotation_deg", 1.0, "°")),
+            ("localized", _localized(preset)),
+        ]
+    head += [
+        ("on frames of both", _both),
+        ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
+        ("inside 95 %", _inside),
+        ("found again after", _spread("default", "recovery_s", 1.0, " s")),
+        ("ms a frame", _time),
+        ("landmarks", _landmarks),
+    ]
+    rows = [[cell(case) for _, cell in head] for case in cases]
+    used = [k for k in range(len(head)) if k == 0 or any(row[k] != NONE for row in rows)]
+    lines = [[title for title, _ in head], *rows]
+    return [[line[k] for k in used] for line in lines]
+
+
+def markdown(experiment: dict[str, Any]) -> str:
+    """The table in Markdown, under its title."""
+    head, *rows = [[escaped(cell) for cell in line] for line in table(experiment)]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    lines += [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def text(experiment: dict[str, Any]) -> str:
+    """The table for a console."""
+    return "\n".join([experiment["title"], *("  " + line for line in columns(table(experiment)))])
+
+
+def verdict(document: dict[str, Any]) -> str:
+    """The first paragraph: where the default is not the better one, or that there is no such row.
+
+    Rows that were not compared are counted, so that silence says nothing.
+    """
+    cases = [case for e in document["experiments"] for case in e["cases"]]
+    compared = [case for case in cases if set(case["presets"]) == set(NAMES)]
+    not_better = [case for case in compared if case["worse"]]
+    others = len(cases) - len(compared)
+    alone = f" {others} more rows have one preset only." if others else ""
+    if not compared:
+        return f"Nothing was compared.{alone}"
+    if not not_better:
+        return (
+            f"In all {len(compared)} rows the default is better than the preset thesis in position "
+            f"and rotation, and localizes no smaller share of the frames.{alone}"
+        )
+    return (
+        f"In {len(not_better)} of {len(compared)} rows the default is not better than the preset "
+        f"thesis: {'; '.join(document['worse'])}.{alone}"
+    )
+
+
+def escaped(cell: str) -> str:
+    """A cell as Markdown takes it."""
+    return cell.replace("|", "/").replace("\n", " ")
+
+
+def printed(case: dict[str, Any]) -> str:
+    """What the thesis printed of a row."""
+    thesis = case["thesis"]
+    parts = []
+    if "position_m" in thesis:
+        parts.append(f"{100 * thesis['position_m']:.1f} cm")
+    if "rotation_deg" in thesis:
+        parts.append(f"{thesis['rotation_deg']:.3f}°")
+    if "note" in thesis:
+        parts.append(str(thesis["note"]))
+    return ", ".join(parts) or NONE
+
+
+def figures(case: dict[str, Any], preset: str) -> str:
+    """Position, rotation and share localized of one preset in one cell."""
+    if preset not in case["presets"]:
+        return NONE
+    position = _spread(preset, "position_m", 100.0, " cm")(case)
+    if position == NONE:
+        return "no frame localized"
+    rotation = _spread(preset, "rotation_deg", 1.0, "°")(case)
+    return f"{position}, {rotation}, {_localized(preset)(case)} localized"
+
+
+def _spread(preset: str, key: str, factor: float, unit: str) -> Cell:
+    def cell(case: dict[str, Any]) -> str:
+        found = case["presets"].get(preset, {}).get(key)
+        if found is None:
+            return NONE
+        mean, std = factor * found["mean"], factor * found["std"]
+        return f"{mean:.2f} ± {std:.2f}{unit}" if found["n"] > 1 else f"{mean:.2f}{unit}"
+
+    return cell
+
+
+def _localized(preset: str) -> Cell:
+    def cell(case: dict[str, Any]) -> str:
+        row = case["presets"].get(preset)
+        if row is None:
+            return NONE
+        if row["failed"] and row["localized"] is None:
+            return "failed"
+        return NONE if row["localized"] is None else f"{100 * row['localized']:.1f} %"
+
+    return cell
+
+
+def _both(case: dict[str, Any]) -> str:
+    found = [case["presets"].get(preset, {}).get("common_m") for preset in NAMES]
+    if None in found:
+        return NONE
+    theirs, ours = (100 * one["mean"] for one in found)
+    return f"{theirs:.2f} → {ours:.2f} cm"
+
+
+def _inside(case: dict[str, Any]) -> str:
+    found = case["presets"].get("default", {}).get("consistency")
+    return NONE if found is None else f"{100 * found['inside_95']:.1f} %"
+
+
+def _time(case: dict[str, Any]) -> str:
+    found = [case["presets"].get(p, {}).get("stage_s", {}).get("total") for p in NAMES]
+    shown = [f"{1e3 * value:.0f}" for value in found if value is not None]
+    return " → ".join(shown) or NONE
+
+
+def _landmarks(case: dict[str, Any]) -> str:
+    found = next((row["landmarks"] for row in case["presets"].values() if row["landmarks"]), None)
+    return NONE if found is None else f"{found:,}".replace(",", " ")

@@ -1,0 +1,79 @@
+"""README's table is of an accepted run of the shipped experiments, and current."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import made_up
+import pytest
+
+from ground_station.errors import InputError
+from ground_station.experiments import declaration, readme, summary
+from ground_station.experiments.plan import Plan
+from ground_station.experiments.store import Store
+
+ROOT = Path(__file__).parents[2]
+ACCEPTED = declaration.SHIPPED.with_name(readme.NAME)
+
+
+@pytest.fixture
+def document(tmp_path):
+    """Of two experiments, one a series of levels."""
+    path = tmp_path / "e.toml"
+    path.write_text(
+        'seeds = [1]\n[experiment.light]\ntitle = "Light"\n[experiment.light.case.noon]\n'
+        'thesis.position_m = 0.2\n[experiment.blur]\nlevel = "px"\n[experiment.blur.case.2]\n'
+    )
+    declared = declaration.load(path)
+    store = Store(tmp_path / "store")
+    runs = {}
+    for experiment, case in (("light", "noon"), ("blur", "2")):
+        for preset, error in (("thesis", 0.1), ("default", 0.01)):
+            store.write(f"{experiment}{preset}", made_up.run([error] * 3))
+        runs[experiment, case] = {p: [f"{experiment}{p}"] for p in ("thesis", "default")}
+    about = {"machine": {"cores": 2, "model": "x"}, "jobs": 2, "quick": False}
+    return summary.summarise(declared, Plan({}, {}, runs), store, about)
+
+
+def test_an_accepted_run_stands_in_readme_and_is_kept_without_its_frames(tmp_path, document):
+    page = tmp_path / "README.md"
+    page.write_text(f"before\n{readme.BEGIN}\n{readme.END}\nafter\n")
+    readme.accept(document, page, tmp_path / "accepted.json")
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("\nafter\n")
+    kept = readme.read(tmp_path / "accepted.json")
+    assert readme.table_in(text) == readme.render(kept) == readme.render(document)
+    assert "| Light: noon | 20.0 cm | 10.00 cm, 1.00°, 100.0 % localized | 1.00 cm" in text
+    assert "blur" not in text  # levels are the report's
+    assert "series" not in (tmp_path / "accepted.json").read_text()
+    readme.accept(document, page, tmp_path / "accepted.json")
+    assert page.read_text() == text
+
+
+def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_path, document):
+    page, accepted = tmp_path / "README.md", tmp_path / "accepted.json"
+    page.write_text("nothing")
+    with pytest.raises(InputError, match="has no line"):
+        readme.accept(document, page, accepted)
+    page.write_text(f"{readme.BEGIN}\n{readme.END}\n")
+    with pytest.raises(InputError, match="quick"):
+        readme.accept(document | {"quick": True}, page, accepted)
+    broken = json.loads(json.dumps(document))
+    broken["experiments"][0]["cases"][0]["presets"]["default"]["failed"] = ["no map"]
+    with pytest.raises(InputError, match="Light, noon, default: no map"):
+        readme.accept(broken, page, accepted)
+    assert not accepted.exists()
+
+
+def test_readme_shows_the_accepted_run_of_the_shipped_experiments_or_none():
+    shown = readme.table_in((ROOT / "README.md").read_text())
+    if shown is None:
+        assert not ACCEPTED.exists()
+        return
+    accepted = readme.read(ACCEPTED)
+    assert shown == readme.render(accepted)
+    declared = declaration.load()
+    assert accepted["seeds"] == list(declared.seeds)
+    names = [(e["name"], [c["name"] for c in e["cases"]]) for e in accepted["experiments"]]
+    assert names == [(e.name, [c.name for c in e.cases]) for e in declared.experiments]

@@ -1,0 +1,148 @@
+"""Jobs are done once each, in order, and what was done is kept whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from ground_station.errors import InputError
+from ground_station.experiments.declaration import Alteration, Flight, MapSpec
+from ground_station.experiments.plan import FlightJob, MapJob, Plan, RunJob
+from ground_station.experiments.schedule import carry_out
+from ground_station.experiments.store import Store
+from ground_station.localization.settings import LocalizerSettings
+from ground_station.mapping.settings import MappingSettings
+
+
+def a_plan(runs=3):
+    """A flight, a map of it, runs in that."""
+    jobs = {
+        "f": FlightJob("f", "f.mcap", Flight(), 1),
+        "m": MapJob("m", "map", MapSpec(), MappingSettings(), "f.mcap"),
+    }
+    needs = {"f": (), "m": ("f",)}
+    for k in range(runs):
+        key = f"r{k}"
+        jobs[key] = RunJob(key, key, "m", Flight(), "f.mcap", k, Alteration(), LocalizerSettings())
+        needs[key] = ("m", "f")
+    return Plan(jobs, needs, {})
+
+
+def _note(folder: Path, key: str) -> None:
+    with (folder / "done.txt").open("a") as file:
+        file.write(key + "\n")
+
+
+def note(job, folder: Path, data: Path) -> None:
+    """Does a job by writing its name down; what it needs must be there."""
+    store = Store(folder)
+    if isinstance(job, FlightJob):
+        store.flight(job.name).parent.mkdir(parents=True)
+        store.flight(job.name).write_bytes(b"flight")
+    elif isinstance(job, MapJob):
+        assert store.flight(job.recording).is_file()
+        store.map(job.key).mkdir(parents=True)
+        (store.map(job.key) / "map.toml").write_text("map")
+    else:
+        assert (store.map(job.map_key) / "map.toml").is_file()
+        store.write(job.key, {"frames": 1})
+    _note(folder, job.key)
+
+
+def no_map(job, folder: Path, data: Path) -> None:
+    if isinstance(job, MapJob):
+        Store(folder).write(job.key, {"failed": "no two images overlap"})
+        return
+    note(job, folder, data)
+
+
+def bad_input(job, folder: Path, data: Path) -> None:
+    if isinstance(job, RunJob) and job.seed == 0:
+        raise InputError("r0: nothing to read")
+    note(job, folder, data)
+
+
+def dies(job, folder: Path, data: Path) -> None:
+    if isinstance(job, RunJob) and job.seed == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    note(job, folder, data)
+
+
+def dies_once(job, folder: Path, data: Path) -> None:
+    before = folder / "died"
+    if isinstance(job, RunJob) and job.seed == 1 and not before.exists():
+        before.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    note(job, folder, data)
+
+
+def slow(job, folder: Path, data: Path) -> None:
+    if isinstance(job, RunJob):
+        (folder / f"begun-{job.key}").touch()
+        time.sleep(60)
+    note(job, folder, data)
+
+
+def done(folder: Path) -> list[str]:
+    path = folder / "done.txt"
+    return path.read_text().split() if path.exists() else []
+
+
+def test_each_job_is_done_once_after_what_it_needs(tmp_path):
+    assert carry_out(a_plan(), Store(tmp_path), tmp_path, 2, note) == 5
+    assert done(tmp_path)[:2] == ["f", "m"] and sorted(done(tmp_path)[2:]) == ["r0", "r1", "r2"]
+    assert carry_out(a_plan(), Store(tmp_path), tmp_path, 2, note) == 0
+    assert len(done(tmp_path)) == 5
+
+
+def test_a_map_that_cannot_be_built_fails_its_runs_for_the_same_reason(tmp_path):
+    store = Store(tmp_path)
+    carry_out(a_plan(), store, tmp_path, 2, no_map)
+    assert [store.read(f"r{k}") for k in range(3)] == [{"failed": "no two images overlap"}] * 3
+    assert done(tmp_path) == ["f"]
+
+
+def test_what_a_person_can_mend_is_raised_and_the_rest_kept(tmp_path):
+    with pytest.raises(InputError, match="r0: nothing to read"):
+        carry_out(a_plan(), Store(tmp_path), tmp_path, 1, bad_input)
+    assert done(tmp_path)[:2] == ["f", "m"]
+    assert carry_out(a_plan(), Store(tmp_path), tmp_path, 1, note) >= 1
+    assert sorted(done(tmp_path)) == ["f", "m", "r0", "r1", "r2"]
+
+
+def test_a_process_that_dies_once_costs_nothing_and_twice_its_own_job(tmp_path):
+    once, twice = tmp_path / "once", tmp_path / "twice"
+    once.mkdir()
+    twice.mkdir()
+    carry_out(a_plan(), Store(once), once, 2, dies_once)
+    assert sorted(done(once)) == ["f", "m", "r0", "r1", "r2"]
+    carry_out(a_plan(), Store(twice), twice, 1, dies)
+    assert sorted(done(twice)) == ["f", "m", "r0", "r2"]
+    assert Store(twice).read("r1") == {"failed": "its process ended 2 times"}
+
+
+def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):
+    import threading
+
+    def interrupt() -> None:
+        limit = time.monotonic() + 30
+        while not list(tmp_path.glob("begun-*")) and time.monotonic() < limit:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        start_s = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            carry_out(a_plan(), Store(tmp_path), tmp_path, 2, slow)
+        assert time.monotonic() - start_s < 40
+        thread.join()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done(tmp_path) == ["f", "m"]

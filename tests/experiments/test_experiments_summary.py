@@ -1,0 +1,121 @@
+"""From runs to tables, verdicts and pages."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import made_up
+import pytest
+
+from ground_station.experiments import declaration, report, summary, tables
+from ground_station.experiments.plan import Plan
+from ground_station.experiments.store import Store
+
+
+def document(tmp_path, runs, thesis="thesis.position_m = 0.2"):
+    """Of one experiment with one case, whose presets have those runs."""
+    path = tmp_path / "e.toml"
+    head = 'seeds = [1, 2]\n[experiment.light]\ntitle = "Light"\n[experiment.light.case.noon]\n'
+    path.write_text(f"{head}{thesis}\n")
+    declared = declaration.load(path)
+    store = Store(tmp_path / "store")
+    keys = {preset: [f"{preset}{k}" for k in range(len(rows))] for preset, rows in runs.items()}
+    for preset, rows in runs.items():
+        for key, row in zip(keys[preset], rows, strict=True):
+            if row is not None:
+                store.write(key, row)
+    planned = Plan({}, {}, {("light", "noon"): keys})
+    about = {"machine": {"cores": 2, "model": "a <b>"}, "jobs": 2, "quick": False}
+    return summary.summarise(declared, planned, store, about)
+
+
+def test_figures_are_the_mean_and_the_sample_deviation_over_the_seeds(tmp_path):
+    good = [made_up.run([0.01] * 4), made_up.run([0.03] * 4)]
+    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 4)] * 2, "default": good})
+    row = found["experiments"][0]["cases"][0]["presets"]["default"]
+    assert row["position_m"]["mean"] == pytest.approx(0.02)
+    assert row["position_m"]["std"] == pytest.approx(math.sqrt(2) * 0.01)
+    assert (row["position_m"]["min"], row["position_m"]["max"], row["position_m"]["n"]) == (
+        pytest.approx(0.01), pytest.approx(0.03), 2,
+    )  # fmt: skip
+    assert row["localized"] == 1.0 and found["worse"] == []
+    assert "In all 1 rows the default is better" in tables.verdict(found)
+
+
+def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
+    # The thesis's way gives up after the easy half, and so has the smaller error over its own.
+    theirs = made_up.run([0.02, 0.02, None, None])
+    ours = made_up.run([0.01, 0.01, 0.08, 0.08])
+    found = document(tmp_path, {"thesis": [theirs, theirs], "default": [ours, ours]})
+    case = found["experiments"][0]["cases"][0]
+    assert (
+        case["presets"]["thesis"]["position_m"]["mean"]
+        < case["presets"]["default"]["position_m"]["mean"]
+    )
+    assert case["presets"]["thesis"]["common_m"]["mean"] == pytest.approx(0.02)
+    assert case["presets"]["default"]["common_m"]["mean"] == pytest.approx(0.01)
+    assert case["presets"]["thesis"]["localized"] == 0.5
+    # Of the rotation nothing is known frame by frame in common, and it is said.
+    assert [reason.split()[0] for reason in case["worse"]] == ["rotation"]
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "words"),
+    [
+        ([0.02] * 4, [0.05] * 4, "position error 5.00 cm, the thesis's method 2.00 cm"),
+        ([0.02] * 4, [0.02] * 4, "position error 2.00 cm, the thesis's method 2.00 cm"),
+        ([0.05] * 4, [0.02, 0.02, None, None], "50.0 % of the frames are localized"),
+        ([0.05] * 4, [None] * 4, "position error none"),
+    ],
+)
+def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, ours, words):
+    runs = {"thesis": [made_up.run(theirs)] * 2, "default": [made_up.run(ours)] * 2}
+    found = document(tmp_path, runs)
+    assert any(words in line for line in found["worse"]), found["worse"]
+    assert tables.verdict(found).startswith("In 1 of 1 rows the default is not better")
+    assert words in report.markdown(found).splitlines()[0]
+
+
+def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
+    good = made_up.run([0.05] * 4)
+    runs = {"thesis": [good, good], "default": [{"failed": "no two images overlap"}, None]}
+    found = document(tmp_path, runs)
+    row = found["experiments"][0]["cases"][0]["presets"]["default"]
+    assert row["failed"] == ["no two images overlap", "not measured"]
+    assert any("it failed: no two images overlap" in line for line in found["worse"])
+    report.write(found, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "no two images overlap" in page and "not measured" in page
+
+
+def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):
+    store = Store(tmp_path)
+    store.write("a", made_up.run([0.1]))
+    whole = store.result("a").read_text()
+    store.result("a").write_text(whole[: len(whole) // 2])
+    assert store.read("a") is None
+    store.result("a").write_text("[1]")
+    assert store.read("a") is None
+
+
+def test_the_thesis_s_own_figure_stands_in_a_column_and_in_no_ratio(tmp_path):
+    good = [made_up.run([0.01] * 4)] * 2
+    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 4)] * 2, "default": good})
+    head, row = tables.table(found["experiments"][0])
+    assert row[head.index("thesis's own*")] == "20.0 cm"
+    text = report.markdown(found)
+    assert report.PRINTED in text and "seeds 1, 2" in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert {line.count("|") for line in lines} == {len(head) + 1}
+
+
+def test_the_page_holds_all_it_shows_and_escapes_names(tmp_path):
+    good = [made_up.run([0.01, 0.02, 0.01])] * 2
+    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 3)] * 2, "default": good})
+    report.write(found, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 6  # three pictures in two dresses
+    assert "http" not in page.replace("http-equiv", "")
+    assert "a &lt;b&gt;" in page and "<b>" not in page
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["seeds"] == [1, 2]
