@@ -131,6 +131,7 @@ def main() -> None:
     parser.add_argument("--noon-range", default="0:450:3", help="of the map's flight.mcap")
     parser.add_argument("--add-duration-s", type=float, default=48.0, help="48: a lap of the loop")
     parser.add_argument("--add-rate-hz", type=float, default=5.0)
+    parser.add_argument("--add-range", default=":", help="of the frames of those added")
     parser.add_argument("--settings", type=Path, help="of the extension")
     parser.add_argument("--name", default="extended", help="of the extended map")
     parser.add_argument("--same-light", action="store_true", help="add noon flights")
@@ -145,7 +146,8 @@ def main() -> None:
     added = [flight(args.plan, light, seed, *longer) for seed in args.add]
     extended, report = out / args.name, out / f"{args.name}.json"
     if not report.is_file():
-        more = ["--settings", args.settings] if args.settings else []
+        more = ["--range", args.add_range]
+        more += ["--settings", args.settings] if args.settings else []
         blimp("map", "extend", args.map, *added, "--out", extended, "--json", report, *more)
     document: dict[str, Any] = {"extended": json.loads(report.read_text()), "flights": {}}
     print("flight", "map", *FIGURES, sep="\t")
