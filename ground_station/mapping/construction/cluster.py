@@ -11,11 +11,13 @@ import asyncio
 import concurrent.futures
 import functools
 import logging
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cv2
@@ -43,7 +45,7 @@ _ALONE_S = 60.0
 """A cluster without workers is given so long to get one, as when they are all started anew."""
 _TRIES = 4
 _PAIRS = 16
-"""A pair takes 10 ms, sending something 1 ms."""
+"""In one call: what goes with a call is then little beside the work in it."""
 _CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
 
 Versions = dict[str, str]
@@ -221,19 +223,34 @@ def _client(where: str | int, held: ExitStack) -> Any:
     if isinstance(where, str):
         return distributed.Client(where, timeout=_CONNECT_S, set_as_default=False)
     folder = held.enter_context(tempfile.TemporaryDirectory(prefix="blimp-dask-"))
-    cluster = distributed.LocalCluster(
-        n_workers=where,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        protocol="tls://",
-        security=True,  # certificates of its own: other users of this machine must not send tasks
-        dashboard_address="127.0.0.1:0",
-        worker_dashboard_address="127.0.0.1:0",
-        local_directory=folder,
-        silence_logs=logging.CRITICAL,
-    )
+    with _uninterrupted():
+        cluster = distributed.LocalCluster(
+            n_workers=where,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            protocol="tls://",
+            security=True,  # certificates of its own: no other user of this machine sends tasks
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+        )
     held.enter_context(cluster)
     return distributed.Client(cluster, timeout=_CONNECT_S, set_as_default=False)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Processes and threads that begin meanwhile never see Ctrl-C: it is this one that ends them.
+
+    Else each would print where it was interrupted.
+    """
+    resource_tracker.ensure_running()  # which unblocks what is blocked when it begins later
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _check_workers(client: Any, place: str, settings: MappingSettings) -> None:

@@ -216,6 +216,8 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames):
         found = match(images, camera, SETTINGS, 2, workers=workers)
         # Structure from motion would start from the same, to the bit.
         assert content.structure_key(images, found, camera, SETTINGS) == expected
+        masks = workers._client.run(signal.pthread_sigmask, signal.SIG_BLOCK, [])
+        assert [signal.SIGINT in mask for mask in masks.values()] == [True, True]  # Ctrl-C is ours
         died = []
         assert _lost_while_under_way(workers, died) == [1000 + k for k in range(48)]
         assert died
