@@ -25,6 +25,8 @@ Bool = npt.NDArray[np.bool_]
 
 _NEAR = 0.25
 """A frame is near a due moment within this share of the way to the next."""
+_CLEAR = 0.9
+"""As sharp as this share of those around it, a frame is worth being further from the moment."""
 _AROUND_S = 0.5
 _AROUND_FRAMES = 2
 _SHARP_QUANTILE = 75.0
@@ -135,8 +137,8 @@ def _spaced(figures: Figures, sharp: F64, spacing: float, min_sharpness: float) 
         off = np.abs(figures.motion[rows] / spacing - stretch[rows[0]])
         near = rows[off <= max(_NEAR, float(off.min()))]
         best = near[np.argmax(rank[near])]
-        if sharp[best] < min_sharpness:
-            clear = sharp[rows] >= min_sharpness
+        if sharp[best] < _CLEAR:
+            clear = sharp[rows] >= _CLEAR
             if clear.any():
                 best = rows[clear][np.argmin(off[clear])]
             else:

@@ -46,7 +46,7 @@ _COHERENT = 3.0
 another scene some corners always seem to be followed, but not together."""
 _PATIENCE = 5
 """So many frames in a row may be unlike all before (blur, a hand, a flash) before it is a cut."""
-_BLURRED = 0.65
+_BLURRED = 0.85
 """Less sharp than this share of the usual, a frame loses points that are still in view, and becomes
 an anchor only when it is high time."""
 _FADES = 0.97

@@ -16,9 +16,11 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from ground_station.evaluation.text import columns
@@ -30,14 +32,35 @@ from ground_station.mapping.construction.inputs import ChosenFrames
 from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings, load_settings
 from ground_station.recording.flight import FlightRecording, trajectory_of
+from ground_station.recording.frames import Frame
 
 ROOT = Path(__file__).parents[3]
 
 
-def build(flight: Path, indices: list[int], settings: MappingSettings) -> dict[str, Any]:
+class Shaken:
+    """A flight in which every fifth frame or so is smeared, a few in a row: jolts of a hand."""
+
+    def __init__(self, source: FlightRecording, seed: int | None) -> None:
+        self._source, self._seed, self.camera = source, seed, source.camera
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._source:
+            if self._seed is None:
+                yield frame
+                continue
+            rng = np.random.default_rng([self._seed, frame.index // 4])  # four frames alike
+            length_px = int(rng.integers(6, 30)) if rng.random() < 0.22 else 1
+            size = (length_px, 1) if rng.random() < 0.5 else (1, length_px)
+            image = np.asarray(cv2.blur(frame.image, size), np.uint8)
+            yield dataclasses.replace(frame, image=image)
+
+
+def build(
+    flight: Path, indices: list[int], settings: MappingSettings, shake: int | None
+) -> dict[str, Any]:
     """A map of these frames, and how far its camera centres are off."""
     truth = trajectory_of(flight)
-    source = FlightRecording(flight, ChosenFrames(indices=frozenset(indices)))
+    source = Shaken(FlightRecording(flight, ChosenFrames(indices=frozenset(indices))), shake)
     folder = Path(tempfile.mkdtemp())
     began_s = time.monotonic()
     try:
@@ -65,11 +88,12 @@ def main() -> int:
     parser.add_argument("flight", type=Path, nargs="?", default=ROOT / "maps/atrium/flight.mcap")
     parser.add_argument("--most", type=int, nargs="+", default=[1000, 60])
     parser.add_argument("--settings", type=Path, help="settings file (default: the shipped)")
+    parser.add_argument("--shake", type=int, metavar="SEED", help="smear frames in bursts")
     parser.add_argument("--no-maps", action="store_true", help="choose only")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     settings = load_settings(args.settings)
-    source = FlightRecording(args.flight)
+    source = Shaken(FlightRecording(args.flight), args.shake)
     assert source.camera is not None
     began_s, cpu_s = time.monotonic(), time.process_time()
     figures = keyframes.measure(source, source.camera, settings.keyframes)
@@ -103,7 +127,7 @@ def main() -> int:
             }
             if not args.no_maps:
                 plain = dataclasses.replace(settings, max_images=5000)
-                row |= build(args.flight, figures.index[at].tolist(), plain)
+                row |= build(args.flight, figures.index[at].tolist(), plain, args.shake)
             rows.append(row)
     shown = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     print("\n".join(columns([list(rows[0]), *shown])))
