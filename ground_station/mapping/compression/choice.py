@@ -25,6 +25,8 @@ _ROUNDS = 200
 (then it is the greedy algorithm) takes their number times as long and covers no better."""
 _SIGMA_PX = 1.0
 """Of a feature's place in the picture: a landmark that is known worse than this counts less."""
+_NEAREST, _FARTHEST = 5.0, 0.2
+"""What a landmark's nearness counts, at most and at least: it fixes the place so much better."""
 _SPREAD = 0.35
 """Half the distance of descriptors at which the localizer gives up; one that has varied more
 counts less."""
@@ -50,10 +52,11 @@ def choose(map_: Map, count: int, method: str = "coverage", seed: int = 0) -> In
 
 
 def quality(landmarks: Landmarks, focal_px: float) -> F64:
-    """How much a sight of each landmark (M,) tells, 0 to 1.
+    """How much a sight of each landmark (M,) tells, above 0.
 
-    Less for one whose place across the line of sight is not known to a pixel, as seen from the
-    distance it was seen from, and for one that did not always look the same.
+    More for one that is nearer than most; less for one whose place across the line of sight is not
+    known to a pixel, as seen from the distance it was seen from, and for one that did not always
+    look the same.
     """
     covariance = landmarks.covariance_m2.astype(np.float64)
     ray = landmarks.view_direction.astype(np.float64)
@@ -62,16 +65,17 @@ def quality(landmarks: Landmarks, focal_px: float) -> F64:
     distance = np.sqrt(np.prod(landmarks.distance_m.astype(np.float64), axis=1))
     square_px = focal_px**2 * across / np.maximum(distance, 1e-9) ** 2
     steady = 1 / (1 + (landmarks.spread.astype(np.float64) / _SPREAD) ** 2)
-    return np.asarray(steady * _SIGMA_PX**2 / (_SIGMA_PX**2 + square_px))
+    near = np.clip(np.median(distance) / np.maximum(distance, 1e-9), _FARTHEST, _NEAREST)
+    return np.asarray(near * steady * _SIGMA_PX**2 / (_SIGMA_PX**2 + square_px))
 
 
 def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUNDS) -> Indices:
     """`count` of M landmarks that cover the views, the best first; quality (M,).
 
     Greedily minimises the sum over views of w / (1 + A), as a pose's variance falls with what fixes
-    it; A is the sum over a picture's cells of log(1 + n), n the quality that the chosen landmarks
-    are expected to show there. What one landmark gains only falls while others are chosen (its
-    negative is submodular), so the greedy choice is near the best.
+    it; A is the sum over a picture's cells of sqrt(1 + n) - 1, n the quality that the chosen
+    landmarks are expected to show there. What one landmark gains only falls while others are
+    chosen (its negative is submodular), so the greedy choice is near the best.
     """
     worth = quality[sights.landmark] * sights.chance
     filled: F64 = np.zeros(sights.cells)
@@ -81,7 +85,8 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
     together = -(-count // rounds)
     missing = count
     while missing:
-        gain = np.log1p(worth / (1 + filled[sights.cell]))
+        before = filled[sights.cell]
+        gain = np.sqrt(1 + before + worth) - np.sqrt(1 + before)
         gain *= (sights.weight / np.square(1 + covered))[sights.view]
         total = np.bincount(sights.landmark, gain, len(quality))
         # What no view sees comes last, by its quality.
@@ -91,6 +96,6 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
         missing -= len(order)
         new = np.flatnonzero(~left[sights.landmark] & (worth > 0))
         filled = np.bincount(sights.cell[new], worth[new], sights.cells).astype(np.float64)
-        in_view = np.log1p(filled).reshape(len(covered), -1)
+        in_view = np.sqrt(1 + filled).reshape(len(covered), -1) - 1
         covered = in_view.sum(axis=1)
     return np.concatenate([*kept, np.empty(0, np.intp)]).astype(np.intp)
