@@ -40,11 +40,13 @@ def build_map(
     built: dict[str, Any] | None = None,
     cache: Cache | None = None,
     workers: Workers | None = None,
+    held: ExitStack | None = None,
 ) -> store.Map:
     """Builds a map from frames in the folder `out`; a killed build leaves the old map there.
 
     `total` is the number of frames if known, `built` what map.toml shall say of the inputs. With a
     `cache`, what an earlier build has made is not made again, one that was killed included.
+    `held` keeps the work of structure from motion until the caller has done with the map, too.
     `workers` extract and match, by default threads of this process. Raises `InputError` when there
     are fewer than two frames, `MapError` when sizes differ from the camera's, images do not
     overlap, or structure from motion fails.
@@ -54,7 +56,7 @@ def build_map(
     workers = workers or Threads(threads)
     stage_s: dict[str, float] = {}
     # What lasts is let go of only when the map is in its place.
-    with ExitStack() as held, replacing(out) as folder:
+    with ExitStack() as own, replacing(out) as folder:
         with _timed(stage_s, "features"):
             images = extract(frames, camera, settings, threads, total, cache=cache, workers=workers)
         with _timed(stage_s, "match"):
@@ -63,7 +65,8 @@ def build_map(
         if cache:
             print(f"{cache.figures} (cache {cache.folder})", flush=True)
             key = structure_key(images, pairs, camera, settings)
-            work = held.enter_context(lasting(cache.folder / "work", key))
+            keeper = own if held is None else held
+            work = keeper.enter_context(lasting(cache.folder / "work", key))
         if work is None:
             work = folder / "work"
             work.mkdir()

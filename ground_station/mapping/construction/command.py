@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,7 +78,11 @@ def run(args: argparse.Namespace) -> int:
     settings = with_changes(load_settings(args.settings), changes, "blimp map build")
     threads = settings.threads or os.cpu_count() or 1
     # A cluster that is not there is said before anything is read.
-    with open_workers(args.dask, threads, settings) as workers, _cache(args, settings) as cache:
+    with (
+        open_workers(args.dask, threads, settings) as workers,
+        _cache(args, settings) as cache,
+        ExitStack() as held,
+    ):
         inputs = open_inputs(
             args.inputs, settings, camera=args.camera, rate_hz=args.rate_hz, frames=args.range
         )
@@ -86,9 +90,9 @@ def run(args: argparse.Namespace) -> int:
             print(line, flush=True)
         build_map(
             inputs, inputs.camera, settings, args.out,
-            total=inputs.total, built=inputs.built, cache=cache, workers=workers,
+            total=inputs.total, built=inputs.built, cache=cache, workers=workers, held=held,
         )  # fmt: skip
-    map_ = straighten(args.out, settings)
+        map_ = straighten(args.out, settings)
     for note in inputs.notes:
         print(f"note: {note}", file=sys.stderr)
     print_table(describe(map_))
