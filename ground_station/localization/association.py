@@ -110,10 +110,9 @@ def associate(
     limit = limit[order] if limit.ndim else limit
     if shows is not None:
         candidate = shows[candidate]
-        key = feature.astype(np.int64) * len(candidate_px) + candidate
-        first = np.sort(np.unique(key, return_index=True)[1])
-        feature, candidate, distance = feature[first], candidate[first], distance[first]
-        limit = limit[first] if limit.ndim else limit
+        kept = _nearest_of_each(feature, candidate, shows)
+        feature, candidate, distance = feature[kept], candidate[kept], distance[kept]
+        limit = limit[kept] if limit.ndim else limit
     new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
     wins = new & (distance < limit)
     if settings.max_ratio < 1.0:
@@ -128,6 +127,18 @@ def associate(
     owner[candidate[rows]] = rows
     rows = np.sort(rows[owner[candidate[rows]] == rows])
     return Associations(feature[rows], candidate[rows], distance[rows])
+
+
+def _nearest_of_each(feature: Indices, landmark: Indices, shows: Indices) -> Indices:
+    """Of pairs (N,) in order of distance, the first of each feature with each landmark."""
+    total = len(shows)
+    doubled = np.zeros(total, bool)  # only what is described more than once is there twice
+    doubled[shows[shows != np.arange(total)]] = True
+    rows = np.flatnonzero(doubled[landmark])
+    _, first = np.unique(feature[rows] * np.int64(total) + landmark[rows], return_index=True)
+    kept = ~doubled[landmark]
+    kept[rows[first]] = True
+    return np.flatnonzero(kept)
 
 
 def _ordered(distance: F32) -> npt.NDArray[np.uint64]:

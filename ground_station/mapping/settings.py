@@ -196,9 +196,12 @@ class ExtendSettings:
     similar: int = config.key(
         4, "and with so many that show most of the same landmarks", unit="frames", low=0, high=1000
     )
+    min_track: int = config.key(
+        6, "frames that must have seen a new landmark", unit="frames", low=2, high=100
+    )
     min_sights: int = config.key(30, "of a frame that joins", unit="sights", low=6, high=10000)
     merge_px: float = config.key(
-        2.0, "what is seen so near to a landmark is that landmark", unit="px", low=0.0, high=20.0
+        1.0, "what is seen so near to a landmark is that landmark", unit="px", low=0.0, high=20.0
     )
     mode_distance: float = config.key(
         0.4, "a landmark looks otherwise when its descriptor is so far off", low=0.0, high=2.0

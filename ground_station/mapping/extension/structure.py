@@ -302,7 +302,7 @@ class Structure:
 def weak_points(model: Model, new: Flags, settings: MappingSettings) -> Flags:
     """Which points (M,) of a model no image sees, or are new and too little is known of them."""
     few = np.bincount(model.point, minlength=len(model.point_id))
-    weak = (few < settings.sfm.min_track) | (
+    weak = (few < settings.extend.min_track) | (
         landmarks.largest_angles_deg(model) < settings.sfm.min_tri_angle_deg
     )
     return np.asarray((few == 0) | (new & weak))

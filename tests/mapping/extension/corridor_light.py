@@ -21,7 +21,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping import landmarks, store
 from ground_station.mapping.extension.extend import Extension, extend_map
-from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.settings import ExtendSettings, MappingSettings
 from ground_station.mapping.sfm import colmap
 
 DIMENSION = 64
@@ -31,7 +31,7 @@ RATE_HZ = 5.0
 LENGTH_M, MAPPED_M = 15.0, 8.0
 TURNED = np.deg2rad(70.0)
 """Between a point's two looks: 1.15 as a distance, which no localizer takes for one point."""
-SETTINGS = MappingSettings(features="corridor", threads=1)
+SETTINGS = MappingSettings(features="corridor", threads=1, extend=ExtendSettings(min_track=3))
 
 
 def unit(rows):

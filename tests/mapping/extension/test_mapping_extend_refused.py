@@ -108,7 +108,7 @@ def test_the_command_prints_before_and_after_and_refuses_the_same_flight(
     shutil.copytree(corridor_world.folder, folder)
     before = _content(folder)
     settings = tmp_path / "settings.toml"
-    settings.write_text("threads = 1\n")
+    settings.write_text("threads = 1\n[extend]\nmin_track = 3\n")
 
     def run(*words):
         parser = argparse.ArgumentParser()
