@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ground_station import user_folders
 from ground_station.errors import KeysError
 
 if TYPE_CHECKING:
@@ -46,8 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Runs one action; raises `BlimpError` with one line."""
     from ground_station.keys.authority import Authority
 
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
-    folder = arguments.folder or Path(data) / "blimp" / "keys"
+    folder = arguments.folder or user_folders.data() / "keys"
     action = arguments.action
     if action == "init":
         Authority.create(folder)

@@ -57,7 +57,7 @@ PAYLOAD, HERE = "payload", "this program"
 # MB and 192 descriptors. (Of a slow counter half an hour tells no less than 7 an hour from 0.)
 # This program's own memory grows by design: it keeps every frame's number.
 BOUNDS = {PAYLOAD: (1.0, 8.0), HERE: (None, 8.0)}
-MEDIAN_MS, P99_MS, CLOCK_MS = 5.0, 50.0, 1.0
+MEDIAN_MS, P99_MS = 5.0, 50.0
 
 
 @dataclass
@@ -85,7 +85,8 @@ def nothing() -> Flown:
         Watch(BOUNDS),
         Measure(LATENCY, "median", "ms", MEDIAN_MS),
         Measure(LATENCY, "p99", "ms", P99_MS),
-        Measure(CLOCK, "capture against arrival", "ms", CLOCK_MS, both=True),
+        # Drawn; what it promises, over the flight and not an hour, is a row of its own.
+        Measure(CLOCK, "capture against arrival", "ms"),
         Account(),
         [],
     )
