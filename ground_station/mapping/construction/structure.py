@@ -81,7 +81,9 @@ class _Reconstruction:
     def run(self, pairs: Pairs) -> Structure:
         """Models, their judgement, and another try where the chain contradicts them."""
         ordered = chains.in_order(self._sequence, pairs)
-        links = chains.links(self._counts, self._sequence, ordered, pairs)
+        near = chains.in_front(pairs, self._images.pinhole_px, self._camera.matrix)
+        links = chains.links(self._counts, self._sequence, ordered, near)
+        pairs = {pair: near[pair] if pair in links else view for pair, view in pairs.items()}
         models, notes = self._solve("all", pairs)
         wrong = self._misplaced(models[0], links, pairs)
         moved, placed = len(wrong), set(models[0].reg_image_ids())

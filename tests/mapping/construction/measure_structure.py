@@ -207,12 +207,12 @@ def _pycolmaps_own(work: Path, camera: Camera, truth: Trajectory) -> Row:
     return judged("redkitchen, pycolmap's own", time_ns, centres, truth) | timing
 
 
-def corridor(flights: Path, with_methods: bool) -> list[Row]:
+def corridor(flights: Path, with_methods: bool, step: int = 1) -> list[Row]:
     """Equal bays: what COLMAP makes of our pairs, and what we make of them."""
     settings = load_settings()
     path = flight(flights, "corridor", "corridor", 2.0, 105.0)
     truth = trajectory_of(path, TRUTH_TOPIC, [])
-    images, pairs, camera = pairs_of(path, settings, None, None)
+    images, pairs, camera = pairs_of(path, settings, f"0:100000:{step}", None)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)

@@ -64,7 +64,8 @@ def _counts(corridor) -> list[int]:
 def _links(corridor) -> set[tuple[int, int]]:
     sequence = sequences(corridor.images.names, corridor.images.time_ns)
     ordered = chains.in_order(sequence, corridor.pairs)
-    return chains.links(_counts(corridor), sequence, ordered, corridor.pairs)
+    near = chains.in_front(corridor.pairs, corridor.images.pinhole_px, corridor.camera.matrix)
+    return chains.links(_counts(corridor), sequence, ordered, near)
 
 
 def _misplaced(corridor, model) -> set[int]:

@@ -11,8 +11,10 @@ Images in no order have no chain; nothing that is judged by it says anything abo
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
@@ -21,17 +23,23 @@ from scipy.sparse.csgraph import connected_components
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 
+F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 REACH = 12
 """Frames; a link spans at most so many steps."""
 _BRIDGE = 4
 """Frames; where the chain is broken, as by a blurred frame, so short a step needs no witness."""
-_CONFIRMED = 0.2
-"""Share of a link's matches that the frames between must confirm: most often it is more than half,
-between places that look alike nearly none."""
-_BESIDE = 0.5
-"""Share of frames whose best partner stands beside them, for images to be in order."""
+_CONFIRMED = 0.5
+"""Share of a link's matches with tracks at both ends, for which the two must be one: most often it
+is nearly all, between places that look alike nearly none."""
+_WITNESSES = 8
+"""Matches that must be confirmed so."""
+_BESIDE, _MOSTLY, _STRONGER = 0.4, 0.8, 1.3
+"""In a video an image has so many of its most matches with the next, so many images do, and that is
+so many times what two images share on average."""
+_STILL_PX = 5.0
+"""A point that moved less has no depth that one could tell the sign of."""
 _FEWEST = 8
 """Fewer images have no order that one could tell."""
 
@@ -39,57 +47,110 @@ _FEWEST = 8
 def in_order(sequence: I64, pairs: Mapping[Pair, TwoView]) -> npt.NDArray[np.bool_]:
     """Which images are in an order that means something, (n,): a whole sequence is or is not.
 
-    In a video the image that an image has most matches with stands right beside it. In a folder of
-    pictures it stands anywhere.
+    In a video an image has nearly as many matches with the next as with any, and so with each. In
+    a folder of pictures it has few or none with most that follow.
     """
     n = len(sequence)
-    most, partner = np.zeros(n, dtype=np.int64), np.full(n, -1)
+    most = np.zeros(n, dtype=np.int64)
     for (i, j), view in pairs.items():
-        for one, other in ((i, j), (j, i)):
-            if len(view.matches) > most[one]:
-                most[one], partner[one] = len(view.matches), other
+        most[[i, j]] = np.maximum(most[[i, j]], len(view.matches))
     ordered = np.zeros(n, dtype=bool)
     for number in np.unique(sequence):
         members = np.flatnonzero(sequence == number)
-        known = members[partner[members] >= 0]
-        if len(known) < _FEWEST:
+        if len(members) < _FEWEST:
             continue
-        near = min(5, max(1, len(members) // 10))
-        beside = (np.abs(partner[known] - known) <= near) & (sequence[partner[known]] == number)
-        ordered[members] = beside.mean() >= _BESIDE
+        strength = {pair: len(view.matches) for pair, view in pairs.items()}
+        steps = [(k, k + 1) for k in members[:-1].tolist()]
+        beside = [strength.get(pair, 0) for pair in steps]
+        held = [
+            pair in strength and strength[pair] >= _BESIDE * min(most[pair[0]], most[pair[1]])
+            for pair in steps
+        ]
+        within = {*members.tolist()}
+        total = sum(count for pair, count in strength.items() if {*pair} <= within)
+        others = len(members) * (len(members) - 1) / 2 - len(steps)
+        usual = (total - sum(beside)) / others
+        ordered[members] = (
+            sum(held) >= _MOSTLY * len(steps) and np.mean(beside) >= _STRONGER * usual
+        )
     return ordered
 
 
+def in_front(
+    pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64
+) -> dict[Pair, TwoView]:
+    """The pairs that may be links, without matches that lie behind the camera.
+
+    Along a wall of equal bays a match with the next bay lies on the right epipolar line, too; only
+    it would have moved against the camera's way. `pixels` (N, 2) of each image are undistorted. A
+    flow of a few pixels says nothing.
+    """
+    kept = {}
+    for (i, j), view in pairs.items():
+        if j - i > REACH:
+            continue
+        p = np.ascontiguousarray(pixels[i][view.matches[:, 0]])
+        q = np.ascontiguousarray(pixels[j][view.matches[:, 1]])
+        _, R, t, _ = cv2.recoverPose(view.essential, p, q, camera_matrix)
+        far = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(camera_matrix).T @ R.T
+        far = far @ camera_matrix.T  # where it would be seen at infinity
+        x = far[:, :2] / far[:, 2:]
+        nearer = (camera_matrix @ t).ravel()
+        flow = q - x
+        against = np.sum(flow * (nearer[:2] - x * nearer[2]), axis=1) < 0
+        behind = against & (np.linalg.norm(flow, axis=1) > _STILL_PX)
+        kept[i, j] = dataclasses.replace(view, matches=view.matches[~behind])
+    return kept
+
+
 def links(
-    features: Sequence[int], sequence: I64, ordered: npt.NDArray[np.bool_],
+    features: Sequence[int],
+    sequence: I64,
+    ordered: npt.NDArray[np.bool_],
     pairs: Mapping[Pair, TwoView],
-) -> set[Pair]:  # fmt: skip
+) -> set[Pair]:
     """The pairs that are links of a chain; `features` is the number of key points of each image.
 
     From the shortest steps to the longest, each is judged by the tracks that the shorter ones make.
+    A track with two key points of one image is none: a match in it leads to another bay.
     """
+    n = len(sequence)
     offset = np.concatenate([[0], np.cumsum(features)]).astype(np.int64)
+    owner = np.repeat(np.arange(n), features)
     found: set[Pair] = set()
     edges: list[I64] = []
     image_edges: list[Pair] = []
     for step in range(1, REACH + 1):
         track = components(edges, int(offset[-1]))
-        chained = components([np.array(image_edges, np.int64).reshape(-1, 2)], len(sequence))
+        clean = _clean(track, owner, n)
+        chained = components([np.array(image_edges, np.int64).reshape(-1, 2)], n)
         new: list[Pair] = []
-        for i in range(len(sequence) - step):
+        for i in range(n - step):
             j = i + step
             view = pairs.get((i, j))
             if view is None or not ordered[i] or sequence[i] != sequence[j]:
                 continue
             ends = view.matches + offset[[i, j]]
-            confirmed = float(np.mean(track[ends[:, 0]] == track[ends[:, 1]]))
+            one, other = track[ends[:, 0]], track[ends[:, 1]]
+            known = clean[one] & clean[other]
+            confirmed = int(np.count_nonzero(known & (one == other)))
+            confirms = confirmed >= max(_WITNESSES, _CONFIRMED * np.count_nonzero(known))
             bridges = step <= _BRIDGE and chained[i] != chained[j]
-            if step == 1 or bridges or confirmed >= _CONFIRMED:
+            if step == 1 or bridges or confirms:
                 new.append((i, j))
                 edges.append(ends)
         found.update(new)
         image_edges += new
     return found
+
+
+def _clean(track: npt.NDArray[np.int32], owner: I64, images: int) -> npt.NDArray[np.bool_]:
+    """Which tracks, by number, have key points of more than one image, and one of each at most."""
+    size = np.bincount(track)
+    key, count = np.unique(track.astype(np.int64) * images + owner, return_counts=True)
+    clean = size > 1
+    clean[key[count > 1] // images] = False
+    return clean
 
 
 def components(edges: Sequence[I64], nodes: int) -> npt.NDArray[np.int32]:
