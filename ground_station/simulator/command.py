@@ -19,10 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--scene",
         default="atrium",
-        help="atrium, office, atrium-moved (other furniture),"
+        help="atrium, office, corridor, atrium-moved (other furniture),"
         " atrium-moved-posted (and other posters) (default: atrium)",
     )
-    add("--plan", default="loop", help="mapping, loop, small-circle or fast (default: loop)")
+    add("--plan", default="loop", help="mapping, loop (default), small-circle, fast, corridor")
     add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")
     add("--out", type=Path, metavar="F.mcap", help="recording to write")

@@ -22,7 +22,10 @@ def _run(*words: object) -> int:
     return command.run(parser.parse_args([str(word) for word in words]))
 
 
-@pytest.mark.parametrize("sub", ["build", "import", "register", "refine", "info", "view", "export"])
+@pytest.mark.parametrize(
+    "sub",
+    ["build", "import", "register", "refine", "extend", "compress", "info", "view", "export"],
+)
 def test_help_shows_an_example_and_loads_nothing_heavy(sub):
     script = (
         "import argparse, sys; from ground_station.mapping import command\n"

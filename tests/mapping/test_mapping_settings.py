@@ -14,7 +14,7 @@ from pi_firmware.wire.errors import ConfigError
 def test_the_shipped_file_holds_every_key_with_its_default():
     assert load_settings() == MappingSettings()
     assert set(config.read(SHIPPED)) == {f.name for f in dataclasses.fields(MappingSettings)}
-    for name in ("match", "sfm", "refine"):
+    for name in ("match", "sfm", "refine", "extend"):
         table = getattr(MappingSettings(), name)
         assert config.read(SHIPPED)[name] == dataclasses.asdict(table)
 

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", metavar="TOML", help="camera file; a recording carries its own")
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map")
     parser.add_argument("--features", help="extractor or model by name (default: the settings')")
-    parser.add_argument("--range", metavar="A:B[:S]", help="frames A up to B, every S-th")
+    parser.add_argument("--range", metavar="A:B[:S]", help="frames A to B, with S every S-th")
     parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
     parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
     parser.add_argument("--seed", type=int, help="of every random choice (default: the settings')")

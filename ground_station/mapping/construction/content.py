@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ground_station.mapping.construction.images import Images
     from ground_station.mapping.construction.verification import Rules
 
-_FEATURES, _PAIR, _STRUCTURE = b"blimp features 1\n", b"blimp pair 1\n", b"blimp structure 1\n"
+_FEATURES, _PAIR, _STRUCTURE = b"blimp features 1\n", b"blimp pair 1\n", b"blimp structure 2\n"
 """Counted on when the same input gives another result: what was made before is then made anew."""
 
 

@@ -12,6 +12,7 @@ from ground_station.mapping.inspection.prediction import levelled
 from ground_station.mapping.refinement.graph import build_graph
 from ground_station.mapping.refinement.refined import Refined
 from ground_station.mapping.sfm.colmap import Model
+from ground_station.mapping.sizes import sizes
 from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
@@ -26,7 +27,7 @@ def describe(map_: Map) -> dict[str, Any]:
     info, lm, kf = map_.info, map_.landmarks, map_.keyframes
     camera, built = info.camera, info.built
     folder = map_.folder
-    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) if folder else 0
+    held = sizes(folder) if folder else {"total": 0}
     registration, flights = info.registration, Refined.of(map_).flights
     return {
         "name": info.name,
@@ -36,6 +37,7 @@ def describe(map_: Map) -> dict[str, Any]:
         "images_given": built.get("images", len(kf)),
         "model_sizes": built.get("model_sizes", [len(kf)]),
         "landmarks": len(lm),
+        "modes": len(map_.modes) if map_.modes is not None else None,
         "mean_track": round(float(lm.observations.mean()), 2) if len(lm) else 0.0,
         "reprojection_px": round(float(built.get("reprojection_px", float("nan"))), 3),
         **{name: _quantiles(values) for name, values in figures(map_).items()},
@@ -53,7 +55,9 @@ def describe(map_: Map) -> dict[str, Any]:
         "refined": [f"{flight['name']} ({flight['frames']} frames)" for flight in flights],
         "seed": built.get("settings", {}).get("seed"),
         "stage_s": built.get("stage_s", {}),
-        "size_mb": round(size / 1e6, 2),
+        "compressed": info.compressed,
+        "bytes": held,
+        "size_mb": round(held["total"] / 1e6, 2),
     }
 
 

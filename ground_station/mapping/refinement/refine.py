@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.mapping import landmarks, store
+from ground_station.mapping.descriptors import Descriptors
 from ground_station.mapping.folder import carry_floorplan, kept_name, replacing
 from ground_station.mapping.refinement import graph as graphs
 from ground_station.mapping.refinement.adjust import adjust
@@ -196,7 +197,7 @@ def _assemble(map_: store.Map, graph: Graph) -> store.Map:
     lm = dataclasses.replace(
         made,
         covariance_m2=covariance.astype(np.float32),
-        descriptor=old.descriptor if kept.all() else old.descriptor[np.flatnonzero(kept)],
+        descriptor=_those(old.descriptor, kept),
         spread=old.spread[kept],
     )
     camera = map_.info.camera
@@ -263,6 +264,15 @@ def _flight_report(flight: Chosen, start: Graph, graph: Graph, group: int) -> di
         "median_px": _median(graph.error_px()[mine]),
         "frames_left_out": {reason: count for reason, count in flight.left.items() if count},
     }
+
+
+def _those(
+    descriptor: npt.NDArray[np.float32] | Descriptors, kept: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.float32] | Descriptors:
+    """The descriptors of the landmarks that stay, as they lie: codes stay codes."""
+    if isinstance(descriptor, Descriptors):
+        return descriptor if kept.all() else descriptor.rows(np.flatnonzero(kept))
+    return descriptor[kept]
 
 
 def _median(values: F64) -> float:

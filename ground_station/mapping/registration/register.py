@@ -111,4 +111,5 @@ def transform_map(map_: store.Map, fit: Alignment) -> store.Map:
             pixel_px=kf.pixel_px,
         ),
         folder=map_.folder,
+        modes=map_.modes,
     )

@@ -9,6 +9,10 @@ from typing import Any
 from pieces import Picker, as_json, changed, odd
 
 _BYTES = {"F64": 8, "I64": 8, "F32": 4, "I32": 4, "U8": 1, "I8": 1}
+_FORMS = {
+    "F64": "d", "F32": "f", "F16": "e",
+    "I64": "q", "I32": "i", "I8": "b", "U32": "I", "U16": "H", "U8": "B",
+}  # fmt: skip
 _TYPES = (*_BYTES, "BF16", "F16", "BOOL", "U64", "F8_E4M3")
 _EXTENTS = (0, 1, 2, 2**31, 2**60, -1)
 
@@ -55,6 +59,6 @@ def array(
     count = 1
     for extent in shape:
         count *= extent
-    form = {"F64": "d", "I64": "q", "F32": "f", "I32": "i", "U8": "B", "I8": "b"}[kind]
+    form = _FORMS[kind]
     number = float(value) if kind.startswith("F") else int(value)
     return kind, shape, struct.pack("<" + form, number) * count
