@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import made_up
+import kept_runs
 import pytest
 
 from ground_station.errors import InputError
@@ -30,9 +30,9 @@ def document(tmp_path):
     runs = {}
     for experiment, case in (("light", "noon"), ("blur", "2")):
         for preset, error in (("thesis", 0.1), ("default", 0.01)):
-            store.write(f"{experiment}{preset}", made_up.run([error] * 3))
+            store.write(f"{experiment}{preset}", kept_runs.run([error] * 3))
         runs[experiment, case] = {p: [f"{experiment}{p}"] for p in ("thesis", "default")}
-    about = {"machine": {"cores": 2, "model": "x"}, "jobs": 2, "quick": False}
+    about = {"machine": {"cores": 2}, "jobs": 2, "quick": False}
     return summary.summarise(declared, Plan({}, {}, runs), store, about)
 
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import math
 
-import made_up
+import kept_runs
 import pytest
 
 from ground_station.experiments import declaration, report, summary, tables
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
+from ground_station.localization.bench import machine
 
 
 def document(tmp_path, runs, thesis="thesis.position_m = 0.2"):
     """Of one experiment with one case, whose presets have those runs."""
     path = tmp_path / "e.toml"
-    head = 'seeds = [1, 2]\n[experiment.light]\ntitle = "Light"\n[experiment.light.case.noon]\n'
+    head = 'seeds = [1, 2]\n[experiment.light]\ntitle = "Light <b>"\n[experiment.light.case.noon]\n'
     path.write_text(f"{head}{thesis}\n")
     declared = declaration.load(path)
     store = Store(tmp_path / "store")
@@ -26,13 +27,13 @@ def document(tmp_path, runs, thesis="thesis.position_m = 0.2"):
             if row is not None:
                 store.write(key, row)
     planned = Plan({}, {}, {("light", "noon"): keys})
-    about = {"machine": {"cores": 2, "model": "a <b>"}, "jobs": 2, "quick": False}
+    about = {"machine": machine(), "jobs": 2, "quick": False}
     return summary.summarise(declared, planned, store, about)
 
 
 def test_figures_are_the_mean_and_the_sample_deviation_over_the_seeds(tmp_path):
-    good = [made_up.run([0.01] * 4), made_up.run([0.03] * 4)]
-    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 4)] * 2, "default": good})
+    good = [kept_runs.run([0.01] * 4), kept_runs.run([0.03] * 4)]
+    found = document(tmp_path, {"thesis": [kept_runs.run([0.1] * 4)] * 2, "default": good})
     row = found["experiments"][0]["cases"][0]["presets"]["default"]
     assert row["position_m"]["mean"] == pytest.approx(0.02)
     assert row["position_m"]["std"] == pytest.approx(math.sqrt(2) * 0.01)
@@ -45,8 +46,8 @@ def test_figures_are_the_mean_and_the_sample_deviation_over_the_seeds(tmp_path):
 
 def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
     # The thesis's way gives up after the easy half, and so has the smaller error over its own.
-    theirs = made_up.run([0.02, 0.02, None, None])
-    ours = made_up.run([0.01, 0.01, 0.08, 0.08])
+    theirs = kept_runs.run([0.02, 0.02, None, None])
+    ours = kept_runs.run([0.01, 0.01, 0.08, 0.08])
     found = document(tmp_path, {"thesis": [theirs, theirs], "default": [ours, ours]})
     case = found["experiments"][0]["cases"][0]
     assert (
@@ -70,7 +71,7 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
     ],
 )
 def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, ours, words):
-    runs = {"thesis": [made_up.run(theirs)] * 2, "default": [made_up.run(ours)] * 2}
+    runs = {"thesis": [kept_runs.run(theirs)] * 2, "default": [kept_runs.run(ours)] * 2}
     found = document(tmp_path, runs)
     assert any(words in line for line in found["worse"]), found["worse"]
     assert tables.verdict(found).startswith("In 1 of 1 rows the default is not better")
@@ -78,7 +79,7 @@ def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, o
 
 
 def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
-    good = made_up.run([0.05] * 4)
+    good = kept_runs.run([0.05] * 4)
     runs = {"thesis": [good, good], "default": [{"failed": "no two images overlap"}, None]}
     found = document(tmp_path, runs)
     row = found["experiments"][0]["cases"][0]["presets"]["default"]
@@ -91,7 +92,7 @@ def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
 
 def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):
     store = Store(tmp_path)
-    store.write("a", made_up.run([0.1]))
+    store.write("a", kept_runs.run([0.1]))
     whole = store.result("a").read_text()
     store.result("a").write_text(whole[: len(whole) // 2])
     assert store.read("a") is None
@@ -100,8 +101,8 @@ def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):
 
 
 def test_the_thesis_s_own_figure_stands_in_a_column_and_in_no_ratio(tmp_path):
-    good = [made_up.run([0.01] * 4)] * 2
-    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 4)] * 2, "default": good})
+    good = [kept_runs.run([0.01] * 4)] * 2
+    found = document(tmp_path, {"thesis": [kept_runs.run([0.1] * 4)] * 2, "default": good})
     head, row = tables.table(found["experiments"][0])
     assert row[head.index("thesis's own*")] == "20.0 cm"
     text = report.markdown(found)
@@ -111,11 +112,11 @@ def test_the_thesis_s_own_figure_stands_in_a_column_and_in_no_ratio(tmp_path):
 
 
 def test_the_page_holds_all_it_shows_and_escapes_names(tmp_path):
-    good = [made_up.run([0.01, 0.02, 0.01])] * 2
-    found = document(tmp_path, {"thesis": [made_up.run([0.1] * 3)] * 2, "default": good})
+    good = [kept_runs.run([0.01, 0.02, 0.01])] * 2
+    found = document(tmp_path, {"thesis": [kept_runs.run([0.1] * 3)] * 2, "default": good})
     report.write(found, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 6  # three pictures in two dresses
     assert "http" not in page.replace("http-equiv", "")
-    assert "a &lt;b&gt;" in page and "<b>" not in page
+    assert "Light &lt;b&gt;" in page and "<b>" not in page
     assert json.loads((tmp_path / "out" / "results.json").read_text())["seeds"] == [1, 2]

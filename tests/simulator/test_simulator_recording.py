@@ -184,10 +184,14 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
     [
         (
             {"plan": "zigzag"},
-            "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast",
+            "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor",
         ),
         ({"light": "moon"}, "light 'moon' is unknown; there are: noon, cloudy, evening, sunset"),
-        ({"scene": "cave"}, "scene 'cave' is unknown; there are: atrium, office"),
+        (
+            {"scene": "cave"},
+            "scene 'cave' is unknown; there are: atrium, office, corridor, atrium-moved, "
+            "atrium-moved-posted",
+        ),
         ({"rate_hz": 0.0}, "rate_hz is 0.0; allowed: 0.1 to 120"),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
         ({"duration_s": -1.0}, "duration_s is -1; allowed: above 0 to 3600"),
