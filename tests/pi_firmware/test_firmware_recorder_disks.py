@@ -40,6 +40,7 @@ from pi_firmware.wire.messages import EVENT_RECORDING_ENDED, EVENT_RECORDING_STA
 from pi_firmware.wire.recorder import folder as folder_module
 from pi_firmware.wire.recorder import recorder as recorder_module
 from pi_firmware.wire.recorder import run
+from pi_firmware.wire.recorder.queue import Queue
 from pi_firmware.wire.recording import RecordingReader
 
 
@@ -295,3 +296,17 @@ def test_a_file_deleted_under_its_writer_ends_the_recording(tmp_path: Path) -> N
     assert made.start() == "flight-000001.mcap"  # a folder that vanished is made again
     made.close()
     assert not is_cut(tmp_path / "flight-000001.mcap")
+
+
+def test_what_comes_while_a_broken_disk_is_told_of_is_left_out_and_after_a_stop_it_is_not() -> None:
+    broken, stopped = Queue(1 << 20, 1 << 19), Queue(1 << 20, 1 << 19)
+    for queue in (broken, stopped):
+        queue.unit(info(0), unit(0))
+    broken.close(broken=True)
+    stopped.close()
+    stopped.close(broken=True)  # its end was asked for before
+    for queue in (broken, stopped):
+        queue.unit(info(1), unit(1))
+    assert (broken.left_out, stopped.left_out) == (1, 0)
+    broken.clear()
+    assert broken.left_out == 2

@@ -43,7 +43,7 @@ class Queue:
         self._items: deque[tuple[int, object]] = deque()
         self._bytes = 0
         self._skipping: set[str] = set()
-        self._closed = False
+        self._closed = self._broken = False
         self._lock = threading.Lock()
         self._wake = threading.Event()
 
@@ -54,6 +54,7 @@ class Queue:
         size = len(access_unit) + _ITEM_BYTES
         with self._lock:
             if self._closed:
+                self.left_out += self._broken
                 return
             takes = self._bytes + size <= self._limit_bytes
             if stream in self._skipping:
@@ -90,9 +91,13 @@ class Queue:
             self._bytes -= size
             return item
 
-    def close(self) -> None:
-        """From now on nothing is taken; what waits can still be."""
+    def close(self, *, broken: bool = False) -> None:
+        """From now on nothing is taken; what waits can still be.
+
+        `broken`: nobody asked for it, so units that come until all know of it are left out, too.
+        """
         with self._lock:
+            self._broken = self._broken or (broken and not self._closed)
             self._closed = True
         self._wake.set()
 

@@ -137,7 +137,7 @@ class Run(ABC):
             reason = str(error)
         except Exception as error:  # whatever it is, a flight does not end for its recording
             reason = f"{type(error).__name__}: {error}"
-        self.queue.close()
+        self.queue.close(broken=reason is not None)
         self.queue.clear()
         if not self._opened.is_set():
             self._refused = reason
