@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.evaluation.plots import Dress, dressed, show_floorplan
@@ -64,7 +65,7 @@ def over_time(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
             t, e = _broken(series["time_s"], 100 * np.asarray(series["position_m"]))
             label = str(case["title"]) if preset == "default" else None
             axes.plot(t, e, style, color=hue, linewidth=1.0, label=label)
-    axes.set_yscale("log")
+    _logarithmic(axes, y=True)
     axes.set_xlabel("time, s")
     axes.set_ylabel("position error, cm")
     _legend(axes, dress)
@@ -89,7 +90,7 @@ def distribution(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
                 100 * np.maximum(errors, 1e-4), np.arange(1, len(errors) + 1) / frames, style,
                 where="post", color=hue, linewidth=1.2, label=label,
             )  # fmt: skip
-    axes.set_xscale("log")
+    _logarithmic(axes, y=False)
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("position error, cm")
     axes.set_ylabel("share of frames")
@@ -112,7 +113,7 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, dress: Dress) -> Figure:
         )  # fmt: skip
         share = [np.nan if row.get("localized") is None else row["localized"] for row in found]
         lower.plot(places, 100 * np.asarray(share), "o" + style, color=hue, markersize=4, lw=1.2)
-    upper.set_yscale("log")
+    _logarithmic(upper, y=True)
     upper.set_ylabel("position error, cm")
     lower.set_ylabel("localized, %")
     lower.set_ylim(0, 104)
@@ -129,6 +130,20 @@ def first_series(case: dict[str, Any], preset: str) -> dict[str, list[float]]:
         if series.get("time_s"):
             return series
     return {}
+
+
+def _logarithmic(axes: Axes, *, y: bool) -> None:
+    """A logarithmic axis with plain numbers: nobody reads 6 x 10^0 centimetres."""
+    if y:
+        axes.set_yscale("log")
+    else:
+        axes.set_xscale("log")
+    axis = axes.yaxis if y else axes.xaxis
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(plain)
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    axis.set_minor_formatter(plain)
+    axis.set_tick_params(which="minor", labelsize=8, colors=axes.xaxis.label.get_color())
 
 
 def _value(found: dict[str, float] | None, key: str) -> float:
