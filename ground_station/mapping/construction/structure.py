@@ -207,6 +207,24 @@ class _Reconstruction:
         colmap.drop_images(reconstruction, model.image_id[judged[~keep]])
 
 
+def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> None:
+    """Takes out observations above `max_error_px`, then points that too few images see.
+
+    A point needs `min_track` images and two sights `min_tri_angle_deg` apart.
+    """
+    model = colmap.to_arrays(reconstruction)
+    error = np.linalg.norm(landmarks.residuals_px(model), axis=1)
+    bad = error > sfm.max_error_px
+    colmap.drop_observations(reconstruction, model.image_id[model.image[bad]], model.feature[bad])
+    model = colmap.to_arrays(reconstruction)
+    # Tracks that were merged may have two key points of one image.
+    seen = np.unique(np.stack([model.point, model.image]), axis=1)[0]
+    weak = (np.bincount(seen, minlength=len(model.position)) < sfm.min_track) | (
+        landmarks.largest_angles_deg(model) < sfm.min_tri_angle_deg
+    )
+    colmap.drop_points(reconstruction, model.point_id[weak])
+
+
 def adjust_and_filter(
     reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: int
 ) -> colmap.Model:
@@ -219,19 +237,7 @@ def adjust_and_filter(
         colmap.adjust(
             reconstruction, loss_px=sfm.loss_px, refine_camera=sfm.refine_camera, threads=threads
         )
-        model = colmap.to_arrays(reconstruction)
-        error = np.linalg.norm(landmarks.residuals_px(model), axis=1)
-        bad = error > sfm.max_error_px
-        colmap.drop_observations(
-            reconstruction, model.image_id[model.image[bad]], model.feature[bad]
-        )
-        model = colmap.to_arrays(reconstruction)
-        # Tracks that were merged may have two key points of one image.
-        seen = np.unique(np.stack([model.point, model.image]), axis=1)[0]
-        weak = (np.bincount(seen, minlength=len(model.position)) < sfm.min_track) | (
-            landmarks.largest_angles_deg(model) < sfm.min_tri_angle_deg
-        )
-        colmap.drop_points(reconstruction, model.point_id[weak])
+        drop_misfits(reconstruction, sfm)
     model = colmap.to_arrays(reconstruction)
     if not len(model.point_id):
         raise MapError(

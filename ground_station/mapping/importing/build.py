@@ -18,6 +18,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.mapping import landmarks, store
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.images import extract
+from ground_station.mapping.construction.structure import drop_misfits
 from ground_station.mapping.folder import replacing
 from ground_station.mapping.importing.matching import covisible_pairs, match
 from ground_station.mapping.settings import MappingSettings, SfmSettings
@@ -111,19 +112,7 @@ def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: in
     """
     for _ in range(2):
         adjust_points(reconstruction, loss_px=sfm.loss_px, threads=threads)
-        model = colmap.to_arrays(reconstruction)
-        error = np.linalg.norm(landmarks.residuals_px(model), axis=1)
-        bad = error > sfm.max_error_px
-        colmap.drop_observations(
-            reconstruction, model.image_id[model.image[bad]], model.feature[bad]
-        )
-        model = colmap.to_arrays(reconstruction)
-        # Tracks that were merged may have two key points of one image.
-        seen = np.unique(np.stack([model.point, model.image]), axis=1)[0]
-        weak = (np.bincount(seen, minlength=len(model.position)) < sfm.min_track) | (
-            landmarks.largest_angles_deg(model) < sfm.min_tri_angle_deg
-        )
-        colmap.drop_points(reconstruction, model.point_id[weak])
+        drop_misfits(reconstruction, sfm)
     model = colmap.to_arrays(reconstruction)
     if not len(model.point_id):
         raise MapError(

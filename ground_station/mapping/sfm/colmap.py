@@ -125,6 +125,23 @@ def write_database(
     part.replace(path)
 
 
+def adjustment_options(
+    loss_px: float, threads: int, max_iterations: int
+) -> pycolmap.BundleAdjustmentOptions:
+    """Of every bundle adjustment here: constant intrinsics, a Cauchy loss of scale `loss_px`."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = False
+    options.refine_principal_point = False
+    options.refine_extra_params = False
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.num_threads = threads or -1
+    options.ceres.solver_options.max_num_iterations = max_iterations
+    options.ceres.solver_options.function_tolerance = 1e-6
+    return options
+
+
 def adjust(
     model: Reconstruction,
     *,
@@ -137,16 +154,8 @@ def adjust(
 
     Returns whether it converged within `max_iterations`.
     """
-    options = pycolmap.BundleAdjustmentOptions()
+    options = adjustment_options(loss_px, threads, max_iterations)
     options.refine_focal_length = refine_camera
-    options.refine_principal_point = False
-    options.refine_extra_params = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_px
-    options.ceres.solver_options.num_threads = threads or -1
-    options.ceres.solver_options.max_num_iterations = max_iterations
-    options.ceres.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)

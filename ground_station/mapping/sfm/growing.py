@@ -29,16 +29,7 @@ def adjust_among_fixed(
     sights. A Cauchy loss of scale `loss_px`; `threads` 0 takes one a core.
     """
     reconstruction = colmap.from_arrays(model, camera)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_principal_point = False
-    options.refine_extra_params = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_px
-    options.ceres.solver_options.num_threads = threads or -1
-    options.ceres.solver_options.max_num_iterations = max_iterations
-    options.ceres.solver_options.function_tolerance = 1e-6
+    options = colmap.adjustment_options(loss_px, threads, max_iterations)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.image_id.tolist():
         config.add_image(image_id)

@@ -14,6 +14,10 @@ from ground_station.mapping.sfm.colmap import pycolmap
 F64 = npt.NDArray[np.float64]
 
 
+_ITERATIONS = 100
+"""At most, of an adjustment of the points alone."""
+
+
 def triangulate(
     database: Path, wTc: F64, *, seed: int, min_tri_angle_deg: float, max_error_px: float
 ) -> colmap.Reconstruction:
@@ -50,16 +54,9 @@ def triangulate(
 
 def adjust_points(model: colmap.Reconstruction, *, loss_px: float, threads: int = 0) -> None:
     """Adjusts all points, with a Cauchy loss of scale `loss_px`, and neither poses nor camera."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_principal_point = False
-    options.refine_extra_params = False
+    options = colmap.adjustment_options(loss_px, threads, _ITERATIONS)
     options.refine_rig_from_world = False
     options.refine_sensor_from_rig = False
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_px
-    options.ceres.solver_options.num_threads = threads or -1
     chosen = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         chosen.add_image(image_id)
