@@ -46,6 +46,7 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
         link.load_key(loaded.telemetry.certificates if loaded.link.encrypted else "")
         print("configuration is good")
         return
+    from pi_firmware.health import memory
     from pi_firmware.payload import Payload
 
     payload = Payload(loaded)
@@ -58,6 +59,7 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
             sep="\n",
             flush=True,
         )
+        memory.freeze()
         payload.run(stop)
         if payload.cut_reason:
             notice = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pi_firmware.capture import Capture
 from pi_firmware.ground import Ground
-from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi
+from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi, memory
 from pi_firmware.recording import Recorder
 from pi_firmware.release import Release, of_environment
 from pi_firmware.settings import Settings
@@ -20,8 +20,10 @@ from pi_firmware.wire.messages import Health
 from pi_firmware.wire.systemd import Notifier
 
 VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
+MEMORY = "memory"
 _FEED_S = 1.0
 _CLOCK_S = 10.0
+_MEMORY_S = 60.0
 _SILENCE_S = 5.0  # before that a ground station may only be slow
 TELEMETRY_UP, TELEMETRY_DOWN = "telemetry up", "telemetry down"
 """What systemd's status line says; whoever tries out a new release looks for it."""
@@ -42,6 +44,7 @@ def tasks(settings: Settings) -> tuple[Task, ...]:
         Task(AUTOPILOT, settings.autopilot.period_s, 3 * settings.autopilot.period_s + 5),
         Task(HEALTH, period_s, 3 * period_s + 5),
         Task(CLOCK, _CLOCK_S, 3 * _CLOCK_S),
+        Task(MEMORY, _MEMORY_S, 3 * _MEMORY_S),
     )
 
 
@@ -90,7 +93,7 @@ class Supervision:
     def start(
         self, capture: Capture, ground: Ground, recorder: Recorder, telemetry: Telemetry
     ) -> None:
-        """Starts the threads that publish health and ask for the ground's time."""
+        """Starts the threads that publish health, ask for the ground's time and tidy up."""
 
         def publish() -> None:
             self.wifi.step()
@@ -109,6 +112,7 @@ class Supervision:
         self._threads = [
             PeriodicThread(self.table, HEALTH, publish, _complain),
             PeriodicThread(self.table, CLOCK, ask, _complain),
+            PeriodicThread(self.table, MEMORY, memory.collect, _complain),
         ]
         self.table.begin(VIDEO)
         for thread in self._threads:
