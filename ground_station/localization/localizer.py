@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
-from ground_station.localization import following
+from ground_station.localization import following, gate
 from ground_station.localization.acquisition import Acquired, Acquirer, Located
 from ground_station.localization.attempt import Attempt, Conditions
 from ground_station.localization.blur import gradient_energy, sharpness
@@ -63,6 +63,7 @@ class Localizer:
         self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
         self._seen: npt.NDArray[np.intp] | None = None
         self._last_frame_ns: int | None = None
+        self._last_worked_ns: int | None = None
         self._last_search_ns: int | None = None
         self._idle_since_s = 0.0
 
@@ -120,13 +121,18 @@ class Localizer:
             return refused
         attempt.entropy = entropy_bits(image)
         attempt.watch.lap("entropy")
-        unhurried = self._unhurried(time_ns)
         self._last_frame_ns = time_ns
-        limit = self.settings.gate.min_entropy_bits
-        if attempt.entropy < limit:
-            return self._gated(attempt, f"entropy {attempt.entropy:.2f} below {limit:g} bits")
+        state, motion = self.settings.state, self.settings.motion
+        if reason := gate.dull(attempt.entropy, self.settings.gate):
+            # Skipped is not failed: until the prediction is no more than a held pose.
+            return self._gated(attempt, reason, max(state.lost_after_s, motion.coast_s))
+        if reason := gate.blind(image, self.settings.gate):
+            return self._gated(attempt, reason, state.lost_after_s)
+        attempt.watch.lap("gate")
         attempt.taken = self._conditions(image, exposure_s)
         attempt.watch.lap("sharpness")
+        unhurried = self._unhurried(time_ns)
+        self._last_worked_ns = time_ns
         if unhurried:
             estimate = self._describe(attempt, image)
         else:
@@ -140,7 +146,7 @@ class Localizer:
         attempt = Attempt(time_ns, index)
         if (refused := self._refuse(attempt)) is not None:
             return refused
-        self._last_frame_ns = time_ns
+        self._last_frame_ns = self._last_worked_ns = time_ns
         return self._locate(attempt, describe(features, self.camera, self._conditions(None, None)))
 
     def _conditions(self, image: Image | None, exposure_s: float | None) -> Conditions:
@@ -169,10 +175,10 @@ class Localizer:
     def _unhurried(self, time_ns: int) -> bool:
         """Whether there is time for a frame's own features.
 
-        Where nothing may wait that is idle time before the frame came: frames that are far apart
-        because others were dropped are no leisure.
+        Skipped frames take none. Where nothing may wait it is idle time before the frame came:
+        frames that are far apart because others were dropped are no leisure.
         """
-        last, tracking = self._last_frame_ns, self.settings.tracking
+        last, tracking = self._last_worked_ns, self.settings.tracking
         if not tracking.enabled or last is None:
             return True
         if tracking.features_lag_frames == 0:
@@ -346,17 +352,18 @@ class Localizer:
 
     def _unsolved(self, attempt: Attempt, reason: str) -> PoseEstimate:
         verdict = self._judge.unsolved(attempt.time_ns)
-        if verdict is State.LOST and self._keyframe is not None:
-            # Found again by chance it would only repeat where the camera was.
-            self._keyframe, self._followed, self._seen = None, None, None
-            self._replace(self._fresh())
+        self._forget_if_lost(verdict)
         attempt.observations = no_observations()
         return publish(attempt, verdict, reason)
 
-    def _gated(self, attempt: Attempt, reason: str) -> PoseEstimate:
-        # Skipped is not failed: until the prediction is no more than a held pose.
-        patience_s = max(self.settings.state.lost_after_s, self.settings.motion.coast_s)
+    def _gated(self, attempt: Attempt, reason: str, patience_s: float) -> PoseEstimate:
         verdict = self._judge.unsolved(attempt.time_ns, patience_s)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
-        self._idle_since_s = perf_counter()
+        self._forget_if_lost(verdict)
         return publish(attempt, verdict, reason, gated=True)
+
+    def _forget_if_lost(self, verdict: State) -> None:
+        """Found again by chance the keyframe would only repeat where the camera was."""
+        if verdict is State.LOST and self._keyframe is not None:
+            self._keyframe, self._followed, self._seen = None, None, None
+            self._replace(self._fresh())

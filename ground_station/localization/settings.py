@@ -19,6 +19,13 @@ class GateSettings:
     min_entropy_bits: float = config.key(
         0.0, "frames of less luma entropy are skipped; 0: none", unit="bits", low=0, high=8
     )
+    min_contrast: float = config.key(
+        0.0,
+        "frames whose brightest and darkest 8x8 px differ by less are skipped; 0: none",
+        unit="grey levels",
+        low=0,
+        high=255,
+    )
 
 
 @dataclass(frozen=True)

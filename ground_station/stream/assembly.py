@@ -20,6 +20,9 @@ from pi_firmware.wire.annexb import NO_PARAMETER_SETS
 SETS_TIMEOUT_S = 3.0
 """A stream that has come for so long without parameter sets cannot be shown."""
 
+_TOO_MANY_LOST = 0.05
+"""Of a stream's packets: where more are lost that is why, and not how it is encoded."""
+
 
 @dataclass(frozen=True)
 class ReceivedFrame:
@@ -81,7 +84,17 @@ class Assembly:
         if self._first_arrival_ns is None or self._decoder.saw_parameter_sets:
             return None
         came_ns = self.last_arrival_ns - self._first_arrival_ns
-        return NO_PARAMETER_SETS if came_ns > self._sets_timeout_ns else None
+        if came_ns <= self._sets_timeout_ns:
+            return None
+        counters = self._counters
+        sent, lost = counters.packets - counters.packets_late, counters.packets_lost
+        sent += lost  # those that came too late are among the lost
+        if lost <= _TOO_MANY_LOST * sent:
+            return NO_PARAMETER_SETS
+        return (
+            f"no picture came whole in {came_ns / 1e9:.0f} s: of {sent} packets {lost} were lost or"
+            " came too late"
+        )
 
     def push(self, packet: rtp.Packet) -> Iterator[ReceivedFrame]:
         """Takes a packet; the frames that are whole with it."""

@@ -217,7 +217,7 @@ def test_the_thesis_preset_has_the_values_of_the_thesis():
     assert (pose.solver, pose.sigma_px, pose.huber_k) == ("graph", 5.0, 1.345)
     assert pose.landmark_sigma_m == 0.01
     assert not thesis.recovery.relocalize
-    assert load_preset("default").gate.min_entropy_bits == 0.0
+    assert thesis.gate.min_contrast == 0.0 == load_preset("default").gate.min_entropy_bits
 
 
 def test_a_bad_preset_or_value_is_refused_by_name():

@@ -190,15 +190,34 @@ def test_the_same_frames_give_the_same_poses_again(wall):
         assert np.array_equal(a.wTc, b.wTc) and np.array_equal(a.covariance, b.covariance)
 
 
-def test_a_black_frame_is_searched_beside_and_the_next_is_followed_again(wall):
+def a_hand() -> np.ndarray:
+    """What shows something, and nothing of the map."""
+    coarse = np.random.default_rng(3).integers(60, 120, (6, 8)).astype(np.uint8)
+    return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
+
+
+def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
     localizer, extractor = make(wall)
     times, truth = path(12)
     localizer.set_initial_pose(truth[0], times[0])
     for k in range(8):
         localizer.process(times[k], wall.picture(truth[k]), k)
     black = localizer.process(times[8], np.zeros((480, 640), np.uint8), 8)
-    assert not black.localized and not black.tracked and black.state is State.DEGRADED
-    assert "features" not in black.stage_ms and "points found" in black.reason
+    assert black.gated and not black.localized and black.state is State.DEGRADED
+    back = localizer.process(times[9], wall.picture(truth[9]), 9)
+    assert back.localized and back.tracked and back.state is State.DEGRADED
+    assert extractor.threads.count(threading.current_thread().name) == 1
+
+
+def test_a_strange_frame_is_searched_beside_and_the_next_is_followed_again(wall):
+    localizer, extractor = make(wall)
+    times, truth = path(12)
+    localizer.set_initial_pose(truth[0], times[0])
+    for k in range(8):
+        localizer.process(times[k], wall.picture(truth[k]), k)
+    strange = localizer.process(times[8], a_hand(), 8)
+    assert not strange.localized and not strange.tracked and strange.state is State.DEGRADED
+    assert "features" not in strange.stage_ms and "points found" in strange.reason
     back = localizer.process(times[9], wall.picture(truth[9]), 9)
     assert back.localized and back.tracked and back.state is State.DEGRADED
     assert back.reason.startswith("just recovered")
@@ -206,24 +225,27 @@ def test_a_black_frame_is_searched_beside_and_the_next_is_followed_again(wall):
     assert extractor.threads.count(threading.current_thread().name) == 1
 
 
-def test_a_blackout_is_lost_and_found_beside_the_frames(wall):
+@pytest.mark.parametrize("covered", ["dark", "a hand"])
+def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wall, covered):
     localizer, extractor = make(wall)
     times, truth = path(70)
     localizer.set_initial_pose(truth[0], times[0])
-    dark = np.zeros((480, 640), np.uint8)
-    pictures = [dark if 10 <= k < 35 else wall.picture(truth[k]) for k in range(70)]
+    cover = np.zeros((480, 640), np.uint8) if covered == "dark" else a_hand()
+    pictures = [cover if 10 <= k < 35 else wall.picture(truth[k]) for k in range(70)]
     frames = [localizer.process(times[k], pictures[k], k) for k in range(70)]
     states = [frame.state for frame in frames]
     assert State.LOST not in states[:15] and set(states[22:35]) == {State.LOST}
     found = next(k for k in range(35, 70) if frames[k].localized)
-    assert frames[found].relocalized and found < 50
+    assert frames[found].relocalized and (found == 35 if covered == "dark" else found < 50)
     assert frames[found].reason.startswith("found again, to be confirmed")
     sure = states.index(State.TRACKING, 35)
     assert found < sure < 62 and all(state is State.TRACKING for state in states[sure:])
     for k in range(found, 70):
         assert np.linalg.norm(frames[k].wTc[:3, 3] - truth[k][:3, 3]) < 0.02
-    assert extractor.threads.count(threading.current_thread().name) == 1
-    assert all("features" not in frame.stage_ms for frame in frames[1:])
+    here = extractor.threads.count(threading.current_thread().name)
+    assert here == (2 if covered == "dark" else 1)
+    described = {k for k, frame in enumerate(frames) if "features" in frame.stage_ms}
+    assert described == ({0, 35} if covered == "dark" else {0})
 
 
 def test_a_relocalization_is_not_confirmed_by_its_own_points(wall):

@@ -305,6 +305,20 @@ def test_a_stream_without_parameter_sets_is_said_in_one_line() -> None:
         assert receiver.get(1.0) is not None
 
 
+def test_a_stream_of_which_half_is_lost_is_not_called_one_without_parameter_sets() -> None:
+    sent = packets(flight_units())
+    kept = [datagram for k, datagram in enumerate(sent) if k % 4 in (1, 2)]
+    with Receiver(0, parameter_sets_timeout_s=0.2) as receiver:
+        with pytest.raises(StreamError) as caught:
+            for datagram in kept:
+                send([datagram], receiver)
+                receiver.get(0.002)
+            assert until(lambda: receiver.problem is not None)
+            receiver.get(0.1)
+        assert "were lost or came too late" in str(caught.value)
+        assert "parameter sets" not in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_closing_wakes_who_waits() -> None:
     receiver = Receiver(0)
     receiver.close()

@@ -1,0 +1,38 @@
+"""Which frames are not worth solving: those that say too little, and those that show nothing."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.localization.settings import GateSettings
+
+Image = npt.NDArray[np.uint8]
+
+_BLOCK_PX = 8
+
+
+def contrast(image: Image) -> float:
+    """The brightest less the darkest block of 8x8 px of a picture (H, W), grey levels.
+
+    A block's mean has an eighth of the sensor's noise, and one small dark thing on a white wall
+    still has a block of its own.
+    """
+    height, width = image.shape
+    size = max(1, width // _BLOCK_PX), max(1, height // _BLOCK_PX)
+    return float(np.ptp(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
+
+
+def dull(entropy: float, settings: GateSettings) -> str:
+    """Why a picture of that entropy, bits, is skipped; empty when it is not."""
+    if entropy >= settings.min_entropy_bits:
+        return ""
+    return f"entropy {entropy:.2f} below {settings.min_entropy_bits:g} bits"
+
+
+def blind(image: Image, settings: GateSettings) -> str:
+    """Why nothing can be seen in a grey picture (H, W); empty when something can."""
+    if settings.min_contrast <= 0 or (shown := contrast(image)) >= settings.min_contrast:
+        return ""
+    return f"contrast {shown:.0f} below {settings.min_contrast:g} grey levels"
