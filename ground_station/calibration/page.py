@@ -8,7 +8,7 @@ from pathlib import Path
 from ground_station.calibration import pictures, results
 from ground_station.calibration.board import Board
 from ground_station.calibration.calibrate import Result
-from ground_station.evaluation.pages import shown, write_page
+from ground_station.presentation.pages import shown, write_page
 
 _TEMPLATE = Path(__file__).parent / "calibration.html"
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
-from ground_station.evaluation.plots import Dress, dressed
+from ground_station.presentation.dress import Dress, dressed
 
 WIDTH_IN = 6.6
 _SMALL = 8.5

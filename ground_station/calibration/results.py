@@ -10,8 +10,8 @@ from typing import Any
 from ground_station.calibration.board import Board
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.lens import NAMES
-from ground_station.evaluation.text import columns
 from ground_station.files import write_text
+from ground_station.presentation.text import columns
 
 
 def write_camera(path: str | Path, result: Result, board: Board) -> None:

@@ -67,8 +67,9 @@ def run(args: argparse.Namespace) -> int:
         write_json(args.json, _document(result, estimate, truth, args))
     if args.plot:
         from ground_station.evaluation import plots
+        from ground_station.presentation.dress import write_png
 
-        plots.write_png(plots.evaluation(result, args.align or "none"), args.plot)
+        write_png(plots.evaluation(result, args.align or "none"), args.plot)
     return 0
 
 
@@ -95,7 +96,7 @@ def _heading(result: Evaluation, estimated: int, true: int, args: argparse.Names
 def table(result: Evaluation, names: list[str]) -> str:
     """The errors of the alignments `names`, then the shares of the first of them, as plain text."""
     from ground_station.evaluation import ate
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
 
     rows = [
         ["alignment", "position, m", "", "", "rotation, °", "", "", "Zhang, m"],

@@ -1,14 +1,10 @@
 """Pictures of an evaluation: the path over the floor plan, errors and latency over time.
 
-Figures are plain objects (no global state), in a light and a dark dress. Colours are of Okabe and
-Ito's palette, which people of every colour vision can tell apart; lines differ in style, too.
+In a light and a dark dress; lines differ in style as well as in colour.
 """
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,34 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
 from ground_station.evaluation.ate import Evaluation
-from ground_station.evaluation.floorplan import FloorPlan
-from ground_station.files import write_bytes
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import FloorPlan
+from ground_station.presentation.dress import LIGHT, Dress, dressed, figure_of, legend
 
 Array = npt.NDArray[np.float64]
 
 GAP_S = 1.0
 """A pause longer than this breaks a line: nothing was estimated there."""
-
-_DPI = 160
-
-
-@dataclass(frozen=True)
-class Dress:
-    """The colours of a picture."""
-
-    paper: str
-    ink: str
-    grid: str
-    truth: str
-    estimate: str
-    second: str
-    limit: str
-
-
-LIGHT = Dress("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", "#8a5a00")
-DARK = Dress("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
 
 
 def trajectory_plot(
@@ -56,7 +33,7 @@ def trajectory_plot(
     dress: Dress = LIGHT,
 ) -> Figure:
     """The path seen from above, x to the right and y up, metres."""
-    figure, (axes,) = _figure(1, (8.0, 5.6), dress)
+    figure, (axes,) = figure_of(1, (8.0, 5.6), dress)
     if floorplan is not None:
         show_floorplan(axes, floorplan, dress)
     if truth is not None and len(truth):
@@ -93,7 +70,7 @@ def error_plot(
     dress: Dress = LIGHT,
 ) -> Figure:
     """Position error (cm) over rotation error (°), both over time (s); limits are RMSE bounds."""
-    figure, (upper, lower) = _figure(2, (8.0, 4.4), dress)
+    figure, (upper, lower) = figure_of(2, (8.0, 4.4), dress)
     limit_cm = None if position_limit_m is None else position_limit_m * 100
     rows = (
         (upper, np.asarray(position_m) * 100, limit_cm, "position error, cm", dress.estimate),
@@ -106,7 +83,7 @@ def error_plot(
             axes.axhline(
                 limit, color=dress.limit, linestyle="--", lw=1.2, label="bound of the RMSE"
             )
-            _legend(axes, dress)
+            legend(axes, dress)
         axes.set_ylim(0, 1.3 * max(float(np.nanmax(values, initial=0.0)), limit or 0.0, 1e-3))
     lower.set_xlabel("time, s")
     return figure
@@ -121,7 +98,7 @@ def latency_plot(
     dress: Dress = LIGHT,
 ) -> Figure:
     """Capture-to-pose latency of each frame (ms) over time (s)."""
-    figure, (axes,) = _figure(1, (8.0, 3.0), dress)
+    figure, (axes,) = figure_of(1, (8.0, 3.0), dress)
     axes.plot(time_s, latency_ms, ".", color=dress.estimate, markersize=4)
     axes.set_xlabel("time, s")
     axes.set_ylabel("latency, ms")
@@ -130,7 +107,7 @@ def latency_plot(
             label = f"{name}, {value:.0f} ms"
             axes.axhline(value, color=dress.limit, linestyle=style, linewidth=1.2, label=label)
     axes.set_ylim(0, 1.5 * max(float(np.nanmax(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
-    _legend(axes, dress)
+    legend(axes, dress)
     return figure
 
 
@@ -158,56 +135,8 @@ def evaluation(result: Evaluation, align: str = "none") -> Figure:
         dressed(axes, LIGHT)
     upper.set_ylim(bottom=0)
     lower.set_ylim(bottom=0)
-    _legend(path, LIGHT)
+    legend(path, LIGHT)
     return figure
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
-    return buffer.getvalue()
-
-
-def write_png(figure: Figure, path: str | Path) -> None:
-    """Writes the figure as a PNG file, beside and renamed."""
-    write_bytes(path, png(figure))
-
-
-def _figure(rows: int, size_inches: tuple[float, float], dress: Dress) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
-    FigureCanvasAgg(figure)
-    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
-    for one in axes:
-        dressed(one, dress)
-    return figure, axes
-
-
-def dressed(axes: Axes, dress: Dress, label_size: float | None = None) -> None:
-    """Gives axes a page's colours and two spines; the numbers' size in points, where given."""
-    axes.set_facecolor(dress.paper)
-    axes.grid(True, color=dress.grid, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=dress.ink, length=3)
-    if label_size is not None:
-        axes.tick_params(labelsize=label_size)
-    axes.xaxis.label.set_color(dress.ink)
-    axes.yaxis.label.set_color(dress.ink)
-    for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(dress.ink)
-
-
-def _legend(axes: Axes, dress: Dress) -> None:
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(
-            loc="upper right",
-            facecolor=dress.paper,
-            edgecolor=dress.grid,
-            labelcolor=dress.ink,
-            fontsize=9,
-            framealpha=0.9,
-        )
 
 
 def show_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:

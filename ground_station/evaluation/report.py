@@ -17,15 +17,15 @@ import numpy.typing as npt
 from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
-from ground_station.evaluation.floorplan import load_floorplan
-from ground_station.evaluation.pages import TEMPLATES, Shown, data_uri, shown, write_page
-from ground_station.evaluation.text import columns
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import load_floorplan
+from ground_station.presentation.pages import Shown, data_uri, shown, write_page
+from ground_station.presentation.text import columns
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
-_TEMPLATE = TEMPLATES / "report.html"
+_TEMPLATE = Path(__file__).parent / "templates" / "report.html"
 
 _FRAME_MEANINGS = {
     "captured": "taken by the camera",

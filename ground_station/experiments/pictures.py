@@ -13,12 +13,17 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from ground_station.evaluation.floorplan import FloorPlan
-from ground_station.evaluation.plots import Dress, dressed, show_floorplan
+from ground_station.evaluation.plots import show_floorplan
+from ground_station.mapping.floorplan import FloorPlan
+from ground_station.presentation.dress import Dress, dressed
 
 _MOST_PATHS = 4
 _LEAST_M, _MOST_M = 0.002, 0.5
 """Ends of the error's colours, which are logarithmic: a run's errors span two powers of ten."""
+_MARKS_M = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+_WIDTH_IN, _HIGHEST_IN = 8.0, 5.0
+_LABELS_IN, _BAR_IN = 0.75, 0.7
+"""Room for a panel's numbers and title, and for the bar of colours below all."""
 _COLOURS = "cividis"
 """Even in lightness, and the same to every colour vision (Nuñez, Anderton, Renslow, 2018)."""
 _STYLES = {"thesis": "--", "default": "-"}
@@ -29,9 +34,13 @@ _HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7
 def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress) -> Figure:
     """The default's path of each case's first seed from above, its colour the position error."""
     shown = [(c["title"], s) for c in cases if (s := first_series(c, "default"))][:_MOST_PATHS]
-    columns = min(2, max(1, len(shown)))
-    rows = -(-max(1, len(shown)) // columns)
-    figure, axes = _figure(rows, columns, (8.0, 2.9 * rows + 0.8), dress)
+    count = max(1, len(shown))
+    columns = 2 if count in (2, 4) else min(3, count)
+    rows = -(-count // columns)
+    panel_m = plan.size_m if plan is not None else _extent([series for _, series in shown])
+    wide = _WIDTH_IN / columns - _LABELS_IN
+    tall = min(wide * panel_m[1] / panel_m[0], _HIGHEST_IN) + _LABELS_IN
+    figure, axes = _figure(rows, columns, (_WIDTH_IN, tall * rows + _BAR_IN), dress)
     points = None
     for one, (title, series) in zip(axes, shown, strict=False):
         if plan is not None:
@@ -48,9 +57,13 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress)
     for one in axes[len(shown) :]:
         one.set_visible(False)
     if points is not None:
-        bar = figure.colorbar(points, ax=axes, shrink=0.8, label="position error, m")
+        bar = figure.colorbar(
+            points, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.03,
+            label="position error, m", ticks=_MARKS_M, format="%g",
+        )  # fmt: skip
+        bar.ax.minorticks_off()
         bar.ax.tick_params(colors=dress.ink, labelsize=8)
-        bar.ax.yaxis.label.set_color(dress.ink)
+        bar.ax.xaxis.label.set_color(dress.ink)
     return figure
 
 
@@ -121,6 +134,13 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, dress: Dress) -> Figure:
     lower.set_xlabel(level)
     _legend(upper, dress)
     return figure
+
+
+def _extent(paths: Sequence[dict[str, list[float]]]) -> tuple[float, float]:
+    """Width and height, m, that the longest of the paths take; of a square without any."""
+    sizes = [(np.ptp(path["x_m"]), np.ptp(path["y_m"])) for path in paths]
+    width, height = np.max(sizes, axis=0) if sizes else (1.0, 1.0)
+    return max(float(width), 1e-3), max(float(height), 1e-3)
 
 
 def first_series(case: dict[str, Any], preset: str) -> dict[str, list[float]]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ground_station.evaluation.floorplan import FloorPlan, load_floorplan
-from ground_station.evaluation.pages import Shown, shown, write_page
 from ground_station.experiments import pictures, tables
 from ground_station.files import write_json, write_text
+from ground_station.mapping.floorplan import FloorPlan, load_floorplan
+from ground_station.presentation.pages import Shown, shown, write_page
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
 QUICK = "Quick: one seed and short flights, to see that all works."

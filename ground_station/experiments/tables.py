@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ground_station.evaluation.text import columns
+from ground_station.presentation.text import columns
 
 NONE = "–"
 NAMES = {"thesis": "preset thesis", "default": "default"}

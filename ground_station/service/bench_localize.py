@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 def report(result: dict[str, Any]) -> list[str]:
     """The tables as lines of plain text."""
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
 
     machine, frame = result["machine"], result["frame"]
     association, pose = result["association"], result["pose"]
@@ -115,7 +115,7 @@ def report(result: dict[str, Any]) -> list[str]:
 
 
 def _growth(growth: list[dict[str, Any]]) -> list[str]:
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
 
     stages = ("projection", "association", "pose", "total")
     table = [["landmarks", "density", "in view", *stages, "over the first", "by each landmark"]]

@@ -90,7 +90,7 @@ def report(result: dict[str, Any]) -> list[str]:
 
 
 def _start(start: dict[str, Any]) -> list[str]:
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
 
     rows = [["from exec to", "s"]]
     for label, key in (
@@ -127,7 +127,7 @@ def _stream(stream: dict[str, Any]) -> list[str]:
 def _instructions(
     variants: dict[str, dict[str, Any]], kept: dict[str, float], frames: int
 ) -> list[str]:
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
     from ground_station.service.bench_figures import SENT, payload_alone
 
     base = variants[SENT]

@@ -12,13 +12,12 @@ from ground_station.evaluation.report import summary_table, write_report
 from ground_station.files import write_json
 from ground_station.localization.settings import load_preset
 from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.construction.inputs import open_inputs
 from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import load_settings
 from ground_station.mapping.store import Map
-from ground_station.recording.frames import FrameRange
-from ground_station.recording.open import open_input
 from ground_station.service import flight_report
 from ground_station.service.replay import replay, settings_for
 from ground_station.service.serve import SAMPLE
@@ -84,24 +83,10 @@ def run(
 
 
 def build(mapping: Path, sample: Path, folder: Path) -> Map:
-    """The registered map of the sample's mapping flight, every frame of which is an image."""
+    """The registered map of the sample's mapping flight."""
     settings = load_settings(sample / "mapping.toml")
-    source = open_input(mapping)
-    total = source.count()
-    step = max(1, -(-(total or 1) // settings.max_images))
-    if step > 1:
-        source = open_input(mapping, frame_range=FrameRange(0, None, step))
-        total = source.count()
-    if source.camera is None:
-        raise InputError(f"{mapping}: it carries no camera calibration")
-    build_map(
-        source,
-        source.camera,
-        settings,
-        folder,
-        total=total,
-        built={"inputs": [mapping.name], "range": f"::{step}", "rate_hz": 0.0},
-    )
+    inputs = open_inputs([str(mapping)], settings)
+    build_map(inputs, inputs.camera, settings, folder, total=inputs.total, built=inputs.built)
     straighten(folder, settings)
     registered, found = register_map(
         folder, sights=read_pairs(sample / "PAIRS.csv"), source="PAIRS.csv"

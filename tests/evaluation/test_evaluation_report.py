@@ -19,7 +19,6 @@ from parsed_page import Page
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.evaluation import plots
-from ground_station.evaluation.floorplan import load_floorplan
 from ground_station.evaluation.report import (
     Bound,
     MatchPicture,
@@ -29,6 +28,8 @@ from ground_station.evaluation.report import (
     write_report,
 )
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import load_floorplan
+from ground_station.presentation.dress import write_png
 
 
 def circle(n: int = 100) -> Trajectory:
@@ -242,10 +243,10 @@ def test_bounds_and_percentiles_are_inside_the_picture() -> None:
 
 def test_a_plot_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "p.png"
-    plots.write_png(plots.trajectory_plot(circle(), None), path)
+    write_png(plots.trajectory_plot(circle(), None), path)
     assert cv2.imread(str(path)) is not None and not list(tmp_path.glob("*.part"))
     with pytest.raises(GroundStationError, match=r"p\.png"):
-        plots.write_png(plots.trajectory_plot(None, None), tmp_path / "no" / "p.png")
+        write_png(plots.trajectory_plot(None, None), tmp_path / "no" / "p.png")
 
 
 def test_plots_keep_no_global_state() -> None:

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.geometry.trajectory import read_tum
+from ground_station.mapping.floorplan import FloorPlan
 from ground_station.service.cases import frames
 from ground_station.service.cases.outcome import (
     FRAMES,

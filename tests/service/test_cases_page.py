@@ -16,9 +16,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from parsed_page import Page
 
-from ground_station.evaluation import plots
-from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import FloorPlan
+from ground_station.presentation.dress import DARK, LIGHT
 from ground_station.service.cases import judge, page, pictures
 from ground_station.service.cases.compare import compare
 from ground_station.service.cases.judge import Judged
@@ -159,7 +159,7 @@ def test_states_are_drawn_where_they_were_and_pauses_left_out() -> None:
 
 def test_pictures_of_nothing_are_drawn_all_the_same() -> None:
     none, empty = np.empty(0), Trajectory.from_poses([], [])
-    for dress in (plots.LIGHT, plots.DARK):
+    for dress in (LIGHT, DARK):
         for figure in (
             pictures.path(np.empty((0, 3)), none, under=[("A", empty)], dress=dress),
             pictures.over_time([("error, cm", [pictures.Series("A", none, none)], None)],

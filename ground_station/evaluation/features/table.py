@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ground_station.evaluation.text import columns
+from ground_station.presentation.text import columns
 
 _NONE = "-"
 

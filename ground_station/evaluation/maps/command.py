@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         write_json(args.json, result | {"flights": about, "rows": rows})
     if args.plot:
         from ground_station.evaluation.maps.plot import sizes_plot
-        from ground_station.evaluation.plots import write_png
+        from ground_station.presentation.dress import write_png
 
         write_png(sizes_plot(rows, about), args.plot)
     return 0

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from ground_station.evaluation.text import columns
+from ground_station.presentation.text import columns
 
 _HEAD = (
     "landmarks", "bytes each", "kB", "of whole", "tables", "of whole",

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from ground_station.errors import MapError
-from ground_station.evaluation.floorplan import FloorPlan, load_floorplan
+from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.mapping.inspection.prediction import Prediction, Predictor
 from ground_station.mapping.store import Map
 

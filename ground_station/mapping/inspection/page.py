@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from ground_station.evaluation.floorplan import FloorPlan
-from ground_station.evaluation.pages import data_uri, write_page
 from ground_station.geometry import poses
+from ground_station.mapping.floorplan import FloorPlan
 from ground_station.mapping.inspection import scripts, tables
 from ground_station.mapping.inspection.comparison import Comparison
 from ground_station.mapping.inspection.localizability import LocalizabilityMap
 from ground_station.mapping.inspection.summary import describe, figures, sigma
 from ground_station.mapping.store import Map
+from ground_station.presentation.pages import data_uri, write_page
 
 F64 = npt.NDArray[np.float64]
 

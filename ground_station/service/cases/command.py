@@ -214,7 +214,7 @@ def _allowed(args: argparse.Namespace) -> Allowed:
 
 def text(result: Comparison) -> str:
     """A comparison for the terminal: the verdict, then what got worse first."""
-    from ground_station.evaluation.text import columns
+    from ground_station.presentation.text import columns
     from ground_station.service.cases.page import cells
 
     def row(line: Line) -> list[str]:

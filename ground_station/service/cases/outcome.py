@@ -18,9 +18,9 @@ import cv2
 import yaml
 
 from ground_station.errors import InputError
-from ground_station.evaluation.floorplan import FloorPlan, load_floorplan
 from ground_station.files import write_bytes, write_json, write_text
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
+from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.mapping.refinement.observations import landmarks_sha256
 from ground_station.mapping.store import Map
 from ground_station.service.cases.frames import Frames, read_csv, write_csv

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ground_station.evaluation.pages import Shown, shown, write_page
+from ground_station.presentation.pages import Shown, shown, write_page
 from ground_station.service.cases import measure, pictures
 from ground_station.service.cases.compare import Comparison, Line
 from ground_station.service.cases.frames import UNKNOWN

@@ -17,10 +17,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ground_station.evaluation import plots
-from ground_station.evaluation.floorplan import FloorPlan
-from ground_station.evaluation.plots import GAP_S, Dress, dressed
+from ground_station.evaluation.plots import GAP_S
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
+from ground_station.mapping.floorplan import FloorPlan
+from ground_station.presentation.dress import LIGHT, Dress, dressed
 
 Array = npt.NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def path(
     first_m: Array | None = None,
     floorplan: FloorPlan | None = None,
     label: str = "off, cm",
-    dress: Dress = plots.LIGHT,
+    dress: Dress = LIGHT,
 ) -> Figure:
     """A path from above, each of its poses (N, 3) coloured by how far it is off (N,).
 
@@ -86,7 +87,7 @@ def path(
         order = np.argsort(off_m[finite])  # the worst on top
         xy, cm = points_m[finite][order, :2], 100 * off_m[finite][order]
         # Dark on white paper, light on black: far off stands out on both.
-        scale = "cividis_r" if dress is plots.LIGHT else "cividis"
+        scale = "cividis_r" if dress is LIGHT else "cividis"
         top = max(0.1, float(cm[-1]))
         drawn = axes.scatter(
             xy[:, 0], xy[:, 1], s=9, c=cm, cmap=scale, vmin=0.0, vmax=top, zorder=3
@@ -119,7 +120,7 @@ def over_time(
     panels: Sequence[tuple[str, Sequence[Series], float | None]],
     strips: Sequence[Strip] = (),
     outages_s: Sequence[tuple[float, float]] = (),
-    dress: Dress = plots.LIGHT,
+    dress: Dress = LIGHT,
 ) -> Figure:
     """Panels over one another, each a label, its series and a bound; the states below; outages
     shaded. Times are seconds from the flight's first frame."""
@@ -151,7 +152,7 @@ def over_time(
 
 
 def distributions(
-    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], dress: Dress = plots.LIGHT
+    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], dress: Dress = LIGHT
 ) -> Figure:
     """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
     figure = _sheet((WIDTH_IN, 2.9), dress)

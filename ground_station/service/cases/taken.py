@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.evaluation.floorplan import FloorPlan, load_floorplan
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.mapping.store import Map
 from ground_station.service.cases import frames, program
 from ground_station.service.cases.outcome import Accounts, Outage, Outcome, Run, map_sha256

@@ -61,7 +61,7 @@ def _features(info, preset: str, folder: Path) -> Finding:  # type: ignore[no-un
 
 
 def _floorplan(folder: Path) -> Finding:
-    from ground_station.evaluation.floorplan import load_floorplan
+    from ground_station.mapping.floorplan import load_floorplan
 
     path = folder / "floorplan.yaml"
     if not path.exists():

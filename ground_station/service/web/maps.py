@@ -135,7 +135,7 @@ class Maps:
         def read() -> tuple[dict[str, Any], bytes]:
             import cv2
 
-            from ground_station.evaluation.floorplan import load_floorplan
+            from ground_station.mapping.floorplan import load_floorplan
 
             plan = load_floorplan(path)
             height, width = plan.image.shape

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ground_station.evaluation.plots import LIGHT, _figure
+from ground_station.presentation.dress import LIGHT, figure_of
 from soaking.judging import slope_text
 from soaking.measures import CLOCK, DESCRIPTORS, KINDS, LATENCY, MEMORY, Array, Measure
 from soaking.trend import Trend, trend
@@ -38,7 +38,7 @@ def picture(measures: Sequence[Measure], settled_s: float, title: str) -> Figure
     chosen = [[m for m in measures if m.kind == kind and m.points] for kind in kinds]
     lines = sum(len(some) for some in chosen)
     size = (9.0, 1.0 + 2.2 * max(1, len(kinds)) + 0.17 * lines)
-    figure, panels = _figure(max(1, len(kinds)), size, LIGHT)
+    figure, panels = figure_of(max(1, len(kinds)), size, LIGHT)
     for axes, kind, some in zip(panels, kinds, chosen, strict=False):
         _panel(axes, kind, some, settled_s)
     panels[-1].set_xlabel("hours from the start")

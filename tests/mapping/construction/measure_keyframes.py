@@ -23,7 +23,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ground_station.evaluation.text import columns
 from ground_station.files import write_json
 from ground_station.geometry.alignment import align
 from ground_station.mapping.construction import keyframes
@@ -31,6 +30,7 @@ from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import ChosenFrames
 from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings, load_settings
+from ground_station.presentation.text import columns
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame
 

@@ -10,12 +10,12 @@ import pytest
 from rooms_map import SIDE_M, looking, made_of, two_rooms, wall
 
 from ground_station.errors import InputError, MapError
-from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.lens import Lens
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.settings import load_preset
+from ground_station.mapping.floorplan import FloorPlan
 from ground_station.mapping.inspection.comparison import compare, spearman
 from ground_station.mapping.inspection.localizability import localizability
 from ground_station.mapping.inspection.prediction import Needs, Predictor, levelled

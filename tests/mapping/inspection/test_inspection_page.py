@@ -13,8 +13,8 @@ import pytest
 from rooms_map import looking, two_rooms
 
 from ground_station.errors import GroundStationError
-from ground_station.evaluation.floorplan import FloorPlan
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.floorplan import FloorPlan
 from ground_station.mapping.inspection import page, scripts, view_command
 from ground_station.mapping.inspection.comparison import compare
 from ground_station.mapping.inspection.localizability import localizability

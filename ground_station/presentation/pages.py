@@ -14,9 +14,8 @@ from pathlib import Path
 import jinja2
 from matplotlib.figure import Figure
 
-from ground_station.evaluation import plots
-from ground_station.evaluation.plots import Dress
 from ground_station.files import write_text
+from ground_station.presentation.dress import DARK, LIGHT, Dress, png
 from pi_firmware.wire.text import printable
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -34,7 +33,7 @@ class Shown:
 
 def shown(heading: str, words: str, draw: Callable[[Dress], Figure]) -> Shown:
     """The picture that `draw` makes in each dress."""
-    light, dark = (data_uri("png", plots.png(draw(dress))) for dress in (plots.LIGHT, plots.DARK))
+    light, dark = (data_uri("png", png(draw(dress))) for dress in (LIGHT, DARK))
     return Shown(heading, light, dark, words)
 
 

@@ -1,0 +1,1 @@
+"""How the product shows itself: pages, pictures and tables in one dress."""

@@ -1,0 +1,88 @@
+"""The dress of a picture: its colours by day and by night, and what they are put on.
+
+Figures are plain objects (no global state). Colours are of Okabe and Ito's palette, which people of
+every colour vision can tell apart.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ground_station.files import write_bytes
+
+_DPI = 160
+
+
+@dataclass(frozen=True)
+class Dress:
+    """The colours of a picture."""
+
+    paper: str
+    ink: str
+    grid: str
+    truth: str
+    estimate: str
+    second: str
+    limit: str
+
+
+LIGHT = Dress("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", "#8a5a00")
+DARK = Dress("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
+
+
+def figure_of(
+    rows: int, size_inches: tuple[float, float], dress: Dress
+) -> tuple[Figure, list[Axes]]:
+    """A figure in that dress and its axes, one below the other with the same x."""
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
+    FigureCanvasAgg(figure)
+    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    for one in axes:
+        dressed(one, dress)
+    return figure, axes
+
+
+def dressed(axes: Axes, dress: Dress, label_size: float | None = None) -> None:
+    """Gives axes a page's colours and two spines; the numbers' size in points, where given."""
+    axes.set_facecolor(dress.paper)
+    axes.grid(True, color=dress.grid, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=dress.ink, length=3)
+    if label_size is not None:
+        axes.tick_params(labelsize=label_size)
+    axes.xaxis.label.set_color(dress.ink)
+    axes.yaxis.label.set_color(dress.ink)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(dress.ink)
+
+
+def legend(axes: Axes, dress: Dress) -> None:
+    """A legend in that dress, where anything has a label."""
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc="upper right",
+            facecolor=dress.paper,
+            edgecolor=dress.grid,
+            labelcolor=dress.ink,
+            fontsize=9,
+            framealpha=0.9,
+        )
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as PNG bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    return buffer.getvalue()
+
+
+def write_png(figure: Figure, path: str | Path) -> None:
+    """Writes the figure as a PNG file, beside and renamed."""
+    write_bytes(path, png(figure))
