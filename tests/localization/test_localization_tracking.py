@@ -196,12 +196,18 @@ def a_hand() -> np.ndarray:
     return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
 
 
-def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
+def after_eight_frames(wall):
+    """A localizer that tracks, its extractor, and the flight's times and poses."""
     localizer, extractor = make(wall)
     times, truth = path(12)
     localizer.set_initial_pose(truth[0], times[0])
     for k in range(8):
         localizer.process(times[k], wall.picture(truth[k]), k)
+    return localizer, extractor, times, truth
+
+
+def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
+    localizer, extractor, times, truth = after_eight_frames(wall)
     black = localizer.process(times[8], np.zeros((480, 640), np.uint8), 8)
     assert black.gated and not black.localized and black.state is State.DEGRADED
     back = localizer.process(times[9], wall.picture(truth[9]), 9)
@@ -210,11 +216,7 @@ def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
 
 
 def test_a_strange_frame_is_searched_beside_and_the_next_is_followed_again(wall):
-    localizer, extractor = make(wall)
-    times, truth = path(12)
-    localizer.set_initial_pose(truth[0], times[0])
-    for k in range(8):
-        localizer.process(times[k], wall.picture(truth[k]), k)
+    localizer, extractor, times, truth = after_eight_frames(wall)
     strange = localizer.process(times[8], a_hand(), 8)
     assert not strange.localized and not strange.tracked and strange.state is State.DEGRADED
     assert "features" not in strange.stage_ms and "points found" in strange.reason
