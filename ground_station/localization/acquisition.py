@@ -169,7 +169,7 @@ class Acquirer:
             watch = Stopwatch()
             seen = self.describe(image, taken)
             closer_px = self._settings.association.refine_radius_px
-            radius_px = closer_px or self._settings.association.radius_px
+            radius_px = closer_px or self.matcher.radius_px
             found = self._locate_once(seen, state, state, estimator, radius_px, watch)
             found = self._verified(seen, found, watch)
             return self._acquired(time_ns, image, found, watch, searched=False)

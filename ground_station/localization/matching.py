@@ -27,6 +27,9 @@ Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.intp]
 
+_WIDTH_PX = 640.0
+"""Of the pictures for which the settings name a search radius."""
+
 _REACH = 3.0
 """Standard deviations of a landmark's predicted pixel that a feature may be away."""
 
@@ -93,6 +96,8 @@ class Matcher:
             if settings.association.learn_thresholds
             else None
         )
+        self.radius_px = settings.association.radius_px * camera.width_px / _WIDTH_PX
+        """How far a landmark is looked for at most: what a prediction misses is an angle."""
         self._rolling = settings.pose.solver == "rolling"
         self._readout_s = camera.readout_s if settings.pose.rolling_shutter else 0.0
 
@@ -101,7 +106,7 @@ class Matcher:
     ) -> Matches:
         """Which features are which landmarks near where `expected` projects them.
 
-        Without a radius it follows the expected covariance, up to `association.radius_px`.
+        Without a radius it follows the expected covariance, up to `self.radius_px`.
         """
         settings, landmarks = self.settings, self.landmarks
         among = self._index.near(expected.wTc, self._lens, settings.projection)
@@ -109,7 +114,7 @@ class Matcher:
             among = self._covisibility.covisible(seen.taken.recent, expected.wTc, among)
         projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
         where = projected.pinhole_px
-        radius: float | Array = radius_px or settings.association.radius_px
+        radius: float | Array = radius_px or self.radius_px
         if self._rolling and len(where):
             points = landmarks.position_m[projected.landmark]
             where = self._at_rows(points, where, expected)
@@ -201,8 +206,8 @@ class Matcher:
         J = pixel_jacobian(points_m, expected.wTc, self.camera)
         variance = np.einsum("nij,jk,nik->ni", J, expected.covariance[:6, :6], J).sum(axis=1)
         radius = _REACH * np.sqrt(variance + 2 * settings.pose.sigma_px**2)
-        least = settings.association.refine_radius_px or settings.association.radius_px
-        return np.clip(np.nan_to_num(radius, nan=np.inf), least, settings.association.radius_px)
+        least = min(settings.association.refine_radius_px or np.inf, self.radius_px)
+        return np.clip(np.nan_to_num(radius, nan=np.inf), least, self.radius_px)
 
 
 def pixel_jacobian(points_m: Array, wTc: Array, camera: Camera) -> Array:

@@ -113,7 +113,11 @@ class AssociationSettings:
     """Which feature is which landmark."""
 
     radius_px: float = config.key(
-        40.0, "a feature looks for landmarks this near", unit="px", low=1, high=500
+        40.0,
+        "a feature looks for landmarks this near, in a picture 640 px wide; a share of its width",
+        unit="px",
+        low=1,
+        high=500,
     )
     max_descriptor_distance: float = config.key(
         0.7, "largest L2 distance of unit descriptors", low=0, high=2

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ground_station.experiments.alter import scaled_camera
 from ground_station.geometry import poses
 from ground_station.localization.acquisition import Acquirer
 from ground_station.localization.attempt import Conditions, Stopwatch
@@ -91,6 +92,24 @@ def test_what_is_far_from_its_prediction_is_found_within_the_predictions_doubt(r
         expected = estimator_at(room, aside, sigma).predict(0)
         matches[sigma] = acquirer.matcher.match(seen, expected, None, Stopwatch())
     assert len(matches[1e-4]) < 0.3 * len(matches[0.05])
+
+
+@pytest.mark.parametrize("preset", ["default", "thesis"])
+def test_a_smaller_picture_is_searched_at_the_same_angle(room, preset):
+    """Turned by 60 px of 640, or 30 px of 320, no landmark is found that is not one by chance."""
+    _, path = room.path(1)
+    coarse = scaled_camera(room.camera, 0.5)
+    features = room.features(path[0])
+    half = dataclasses.replace(features, keypoints_px=(features.keypoints_px + 0.5) / 2 - 0.5)
+    turned = path[0] @ poses.exp([0.0, 60 / room.camera.fx_px, 0.0, 0.0, 0.0, 0.0])
+    for seen, camera in ((features, room.camera), (half, coarse)):
+        matcher = Matcher(room.map, camera, load_preset(preset))
+        described = describe(seen, camera, Conditions())
+        for wTc, share in ((path[0], (0.7, 1.0)), (turned, (0.0, 0.1))):
+            matches = matcher.match(
+                described, estimator_at(room, wTc, 0.1).predict(0), None, Stopwatch()
+            )
+            assert share[0] <= len(matches) / matches.projected <= share[1]
 
 
 def test_landmarks_are_expected_where_their_row_will_see_them(room, extractor):
