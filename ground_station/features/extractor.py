@@ -32,11 +32,15 @@ class Features:
 
 
 class Extractor(Protocol):
-    """Key points and descriptors of an image. `name` and `sha256` are what a map remembers."""
+    """Key points and descriptors of an image. `name` and `sha256` are what a map remembers.
+
+    `distance_scale`: how far apart the descriptors of one point in two views are, over RootSIFT's.
+    """
 
     name: str
     sha256: str
     dimension: int
+    distance_scale: float
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:
         """Features of a grey image (H, W) uint8."""

@@ -20,6 +20,7 @@ class LearnedFeatures:
         info = network.model.info
         self.name, self.dimension = info.name, info.dimension
         self.sha256 = network.model.sha256
+        self.distance_scale = info.distance_scale
         self.max_features = max_features
         self.nms_px = settings.nms_px or info.nms_px or self.NMS_PX
         self.threshold = settings.threshold or (

@@ -16,6 +16,9 @@ LAYOUTS = ("cells", "pixels")
 MAX_BYTES = 64 << 20
 """SuperPoint's weights have 5.2 MB; a file that claims more than this is none of ours."""
 
+SCALES = 0.25, 4.0
+"""The least and the largest `distance_scale`: unit vectors are at most 2 apart."""
+
 _PREFIX = "blimp."
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _MOST_TEXT = 300
@@ -36,7 +39,8 @@ class ModelInfo:
     H and W must be multiples of `multiple`. `nms_px` and `threshold` are the distance of two key
     points and the least score that the model was made for; None: the layout's usual ones.
     `subpixel_px` is the reach of the window in which a key point is refined; 0: it stays on its
-    pixel, as SuperPoint's do.
+    pixel, as SuperPoint's do. `distance_scale`: how far apart the descriptors of one point in two
+    views are, over RootSIFT's; see `importing.scale`.
     """
 
     name: str
@@ -48,6 +52,7 @@ class ModelInfo:
     nms_px: int | None = None
     threshold: float | None = None
     subpixel_px: int = 0
+    distance_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Raises `FeatureError` with one line for a value that no model has."""
@@ -60,6 +65,7 @@ class ModelInfo:
             ("nms_px", 4 if self.nms_px is None else self.nms_px, 1, 64),
             ("threshold", 0.0 if self.threshold is None else self.threshold, 0, 1),
             ("subpixel_px", self.subpixel_px, 0, 8),
+            ("distance_scale", self.distance_scale, *SCALES),
         )
         for key, value, low, high in numbers:
             if not low <= value <= high:  # neither is NaN
@@ -83,6 +89,7 @@ class ModelInfo:
             "nms_px": None if self.nms_px is None else str(self.nms_px),
             "threshold": None if self.threshold is None else repr(self.threshold),
             "subpixel_px": str(self.subpixel_px) if self.subpixel_px else None,
+            "distance_scale": None if self.distance_scale == 1 else repr(self.distance_scale),
         }
         return {_PREFIX + key: value for key, value in values.items() if value is not None}
 
@@ -108,14 +115,12 @@ class ModelInfo:
                 raise FeatureError(f"{key} is '{text(key):.40}', not a whole number")
             return int(float(text(key)))
 
-        threshold: float | None = None
-        if _PREFIX + "threshold" in metadata:
+        def real(key: str) -> float:
             try:
-                threshold = float(text("threshold"))
+                return float(text(key))
             except ValueError:
-                raise FeatureError(
-                    f"threshold is '{text('threshold'):.40}', not a number"
-                ) from None
+                raise FeatureError(f"{key} is '{text(key):.40}', not a number") from None
+
         return cls(
             name=text("name"),
             layout=text("layout"),
@@ -124,8 +129,11 @@ class ModelInfo:
             licence=text("licence"),
             source=text("source"),
             nms_px=whole("nms_px") if _PREFIX + "nms_px" in metadata else None,
-            threshold=threshold,
+            threshold=real("threshold") if _PREFIX + "threshold" in metadata else None,
             subpixel_px=whole("subpixel_px") if _PREFIX + "subpixel_px" in metadata else 0,
+            distance_scale=(
+                real("distance_scale") if _PREFIX + "distance_scale" in metadata else 1.0
+            ),
         )
 
 

@@ -27,6 +27,7 @@ class Orb:
 
     name = "orb"
     dimension = _BITS
+    distance_scale = 2.3
 
     def __init__(self, max_features: int = 1500) -> None:
         self.max_features = max_features

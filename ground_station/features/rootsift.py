@@ -19,6 +19,7 @@ class RootSift:
 
     name = "rootsift"
     dimension = 128
+    distance_scale = 1.0
 
     def __init__(self, max_features: int = 1500) -> None:
         self.max_features = max_features

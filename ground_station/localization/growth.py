@@ -54,6 +54,7 @@ class MadeUp:
     """The extractor's name in a made-up map; takes no pictures."""
 
     name, sha256, dimension = "made-up", "0" * 64, _DIMENSION
+    distance_scale = 1.0
 
     def extract(self, image: npt.NDArray[np.uint8]) -> Features:
         """Never asked: the features are made. Raises `BenchError` if it is."""

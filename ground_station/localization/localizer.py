@@ -45,7 +45,7 @@ class Localizer:
         """Raises `MapError` when the map was built with other features than the extractor's."""
         check_features(map_.info, extractor.name, extractor.sha256)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
-        self._matcher = Matcher(map_, camera, settings)
+        self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
         self._worker: Worker[Acquired] = Worker(settings.tracking.features_lag_frames)
         self.reset()

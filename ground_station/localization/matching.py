@@ -30,6 +30,10 @@ Indices = npt.NDArray[np.intp]
 _WIDTH_PX = 640.0
 """Of the pictures for which the settings name a search radius."""
 
+_APART = np.float32(1.2)
+"""Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
+"""
+
 _REACH = 3.0
 """Standard deviations of a landmark's predicted pixel that a feature may be away."""
 
@@ -80,7 +84,15 @@ class Matches:
 class Matcher:
     """One map as seen through one camera."""
 
-    def __init__(self, map_: Map, camera: Camera, settings: LocalizerSettings) -> None:
+    def __init__(
+        self,
+        map_: Map,
+        camera: Camera,
+        settings: LocalizerSettings,
+        distance_scale: float = 1.0,
+    ) -> None:
+        """`distance_scale` is the extractor's, by which all descriptor distances are divided."""
+        self._scale = distance_scale if settings.association.scale_distances else 1.0
         self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
         self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
@@ -92,7 +104,7 @@ class Matcher:
             else None
         )
         self.thresholds = (
-            DescriptorThresholds(landmarks, settings.association)
+            DescriptorThresholds(landmarks.spread / self._scale, settings.association)
             if settings.association.learn_thresholds
             else None
         )
@@ -121,14 +133,16 @@ class Matcher:
             if radius_px is None:
                 radius = self._radius_px(points, expected)
         watch.lap("projection")
-        limits = self.thresholds.limits(projected.landmark) if self.thresholds else None
+        limits: F32 = np.asarray(settings.association.max_descriptor_distance, np.float32)
+        if self.thresholds:
+            limits = self.thresholds.limits(projected.landmark)
         rows, mode = described(landmarks.descriptor, self._modes, projected.landmark)
         shows = None
         if mode is not None:  # a landmark's modes are looked for where it is itself
             shows = np.concatenate([np.arange(len(where)), mode])
             where = where[shows]
             radius = radius[shows] if isinstance(radius, np.ndarray) else radius
-            limits = limits if limits is None else limits[shows]
+            limits = limits[shows] if limits.ndim else limits
         pairs = associate(
             seen.pinhole_px,
             seen.features.descriptors,
@@ -136,7 +150,7 @@ class Matcher:
             rows,
             settings.association,
             radius,
-            limits,
+            np.minimum(limits * np.float32(self._scale), np.maximum(limits, _APART)),
             shows=shows,
         )
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
@@ -144,7 +158,7 @@ class Matcher:
         return Matches(
             pairs.feature[best],
             projected.landmark[pairs.candidate[best]],
-            pairs.distance[best],
+            pairs.distance[best] / np.float32(self._scale),
             len(projected.landmark),
             len(pairs),
         )

@@ -122,6 +122,10 @@ class AssociationSettings:
     max_descriptor_distance: float = config.key(
         0.7, "largest L2 distance of unit descriptors", low=0, high=2
     )
+    scale_distances: bool = config.key(
+        False,
+        "distances are first divided by how much farther the model's are than RootSIFT's",
+    )
     max_ratio: float = config.key(
         1.0, "nearest over second nearest distance within the radius; 1: no test", low=0.1, high=1
     )

@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.localization.settings import AssociationSettings
-from ground_station.mapping.store import Landmarks
 
 F32 = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -45,13 +44,14 @@ class DescriptorThresholds:
     the pairs at the limits are right and falls when they are not.
     """
 
-    def __init__(self, landmarks: Landmarks, settings: AssociationSettings) -> None:
-        self._spread = landmarks.spread
+    def __init__(self, spread: F32, settings: AssociationSettings) -> None:
+        """`spread` (M,) is the landmarks' in the map, in the unit of all other distances."""
+        self._spread = spread
         self._highest = settings.max_descriptor_distance
         # Pages of zeros cost memory only where a landmark has been seen.
-        self._square = np.zeros(len(landmarks), np.float32)
-        self._right = np.zeros(len(landmarks), np.float32)
-        self._wrong = np.zeros(len(landmarks), np.float32)
+        self._square = np.zeros(len(spread), np.float32)
+        self._right = np.zeros(len(spread), np.float32)
+        self._wrong = np.zeros(len(spread), np.float32)
         self.common = self._highest - _PER_RMS * _FLOOR
 
     def limits(self, index: Indices) -> F32:

@@ -18,7 +18,9 @@ from ground_station.features.model import ModelInfo
 
 @pytest.fixture
 def path(tmp_path):
-    return made_up.write_cells(tmp_path, made_up.info(threshold=0.01, nms_px=3, subpixel_px=2))
+    return made_up.write_cells(
+        tmp_path, made_up.info(threshold=0.01, nms_px=3, subpixel_px=2, distance_scale=1.5)
+    )
 
 
 def change(path, edit):
@@ -35,7 +37,7 @@ def refused(path, reason):
 
 def test_what_was_written_is_read(path):
     found = model.read(path)
-    assert found.info == made_up.info(threshold=0.01, nms_px=3, subpixel_px=2)
+    assert found.info == made_up.info(threshold=0.01, nms_px=3, subpixel_px=2, distance_scale=1.5)
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert ModelInfo.of_metadata(found.info.metadata()) == found.info
 
@@ -59,6 +61,8 @@ def test_a_model_of_pixels_is_read(tmp_path):
         ("blimp.multiple", "12", "multiple is 12; cells need a multiple of 8"),
         ("blimp.threshold", "nan", "threshold is nan"),
         ("blimp.threshold", "some", "threshold is 'some', not a number"),
+        ("blimp.distance_scale", "nan", "distance_scale is nan"),
+        ("blimp.distance_scale", "9", "distance_scale is 9.0; allowed: 0.25 to 4.0"),
         ("blimp.nms_px", "0", "nms_px is 0; allowed: 1 to 64"),
         ("blimp.licence", "a\nb", "licence must be one line"),
         ("blimp.source", "", "source must be one line"),

@@ -21,6 +21,7 @@ class FakeExtractor:
     """Names the synthetic features; takes no pictures."""
 
     name, sha256, dimension = "synthetic", "0" * 64, DIMENSION
+    distance_scale = 1.0
 
     def extract(self, image: np.ndarray) -> Features:
         raise AssertionError("synthetic frames have no pictures")

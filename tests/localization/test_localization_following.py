@@ -112,6 +112,32 @@ def test_a_smaller_picture_is_searched_at_the_same_angle(room, preset):
             assert share[0] <= len(matches) / matches.projected <= share[1]
 
 
+def test_a_model_of_larger_distances_has_larger_limits_and_no_others_change(room):
+    """Features some 0.8 from their landmarks: beyond RootSIFT's 0.7, within a model's of 1.5."""
+    _, path = room.path(1)
+    features = room.features(path[0], outliers=0.0)
+    noise = np.random.default_rng(3).normal(0, 0.13, features.descriptors.shape)
+    moved = (features.descriptors + noise).astype(np.float32)
+    moved /= np.linalg.norm(moved, axis=1, keepdims=True)
+    features = dataclasses.replace(features, descriptors=moved)
+    expected = estimator_at(room, path[0]).predict(0)
+
+    def matches(preset, scale):
+        matcher = Matcher(room.map, room.camera, load_preset(preset), scale)
+        described = describe(features, room.camera, Conditions())
+        return matcher.match(described, expected, None, Stopwatch())
+
+    near, far = matches("default", 1.0), matches("default", 1.5)
+    assert len(near) < 0.2 * len(far) and len(far) > 0.6 * len(features)
+    own = np.linalg.norm(
+        moved[far.feature] - room.map.landmarks.descriptor[far.landmark].astype(np.float32), axis=1
+    )
+    assert far.distance == pytest.approx(own / 1.5, abs=1e-3)
+    thesis, again = matches("thesis", 1.0), matches("thesis", 1.5)
+    assert np.array_equal(thesis.feature, again.feature)
+    assert np.array_equal(thesis.distance, again.distance)
+
+
 def test_landmarks_are_expected_where_their_row_will_see_them(room, extractor):
     camera = dataclasses.replace(room.camera, readout_s=0.02)
     matcher = Matcher(room.map, camera, load_preset("default"))

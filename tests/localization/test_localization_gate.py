@@ -26,6 +26,7 @@ class Standing:
     """A camera that stands still: the features of its only view, and how often they were asked."""
 
     name, sha256, dimension = "synthetic", "0" * 64, 64
+    distance_scale = 1.0
 
     def __init__(self, room, wTc):
         self.room, self.wTc, self.asked = room, wTc, 0

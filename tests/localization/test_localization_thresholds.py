@@ -32,13 +32,13 @@ def _fly(thresholds, rng, frames, true_rms, right_share):
 
 
 def test_before_anything_was_seen_the_limit_is_the_highest_for_all_but_the_steadiest(landmarks):
-    limits = DescriptorThresholds(landmarks, SETTINGS).limits(np.arange(4000))
+    limits = DescriptorThresholds(landmarks.spread, SETTINGS).limits(np.arange(4000))
     assert limits.dtype == np.float32 and limits.shape == (4000,)
     assert (limits <= np.float32(HIGHEST)).all() and limits.min() > HIGHEST - 0.1
 
 
 def test_what_varied_more_in_the_map_may_be_farther(landmarks):
-    thresholds = DescriptorThresholds(landmarks, SETTINGS)
+    thresholds = DescriptorThresholds(landmarks.spread, SETTINGS)
     thresholds.common = 0.4
     limits = thresholds.limits(np.arange(4000))
     order = np.argsort(landmarks.spread)
@@ -49,7 +49,7 @@ def test_what_varied_more_in_the_map_may_be_farther(landmarks):
 def test_learning_drops_wrong_pairs_and_keeps_right_ones(landmarks):
     rng = np.random.default_rng(2)
     rms, share = np.full(4000, 0.25), np.where(np.arange(4000) < 2000, 0.9, 0.03)
-    thresholds = DescriptorThresholds(landmarks, SETTINGS)
+    thresholds = DescriptorThresholds(landmarks.spread, SETTINGS)
     _fly(thresholds, rng, 100, rms, share)
     good, poor = thresholds.limits(np.arange(2000)), thresholds.limits(np.arange(2000, 4000))
     assert good.mean() > poor.mean() + 0.1
@@ -61,7 +61,7 @@ def test_learning_drops_wrong_pairs_and_keeps_right_ones(landmarks):
 def test_in_other_light_all_limits_move(landmarks):
     rng = np.random.default_rng(3)
     share = np.full(4000, 0.4)
-    thresholds = DescriptorThresholds(landmarks, SETTINGS)
+    thresholds = DescriptorThresholds(landmarks.spread, SETTINGS)
     _fly(thresholds, rng, 60, np.full(4000, 0.15), share)
     before = thresholds.common
     _fly(thresholds, rng, 60, np.full(4000, 0.4), share)
@@ -69,7 +69,7 @@ def test_in_other_light_all_limits_move(landmarks):
 
 
 def test_a_landmark_that_goes_wrong_is_believed_less_and_recovers(landmarks):
-    thresholds = DescriptorThresholds(landmarks, SETTINGS)
+    thresholds = DescriptorThresholds(landmarks.spread, SETTINGS)
     thresholds.common = 0.4
     one, near = np.array([7]), np.array([0.2], np.float32)
     first = thresholds.limits(one)[0]
@@ -84,7 +84,7 @@ def test_a_landmark_that_goes_wrong_is_believed_less_and_recovers(landmarks):
 
 
 def test_nothing_and_no_numbers_teach_nothing(landmarks):
-    thresholds = DescriptorThresholds(landmarks, SETTINGS)
+    thresholds = DescriptorThresholds(landmarks.spread, SETTINGS)
     before, common = thresholds.limits(np.arange(4000)), thresholds.common
     none = np.empty(0, np.intp)
     thresholds.learn(none, np.empty(0, np.float32), np.empty(0, bool))
@@ -98,6 +98,6 @@ def test_nothing_and_no_numbers_teach_nothing(landmarks):
 
 def test_a_low_highest_distance_is_kept(landmarks):
     settings = AssociationSettings(max_descriptor_distance=0.2)
-    thresholds = DescriptorThresholds(landmarks, settings)
+    thresholds = DescriptorThresholds(landmarks.spread, settings)
     _fly(thresholds, np.random.default_rng(4), 5, np.full(4000, 0.1), np.full(4000, 0.9))
     assert (thresholds.limits(np.arange(4000)) <= np.float32(0.2)).all()

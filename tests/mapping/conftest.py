@@ -49,6 +49,7 @@ class SceneExtractor:
     name = "scene"
     sha256 = "0" * 64
     dimension = DIMENSION
+    distance_scale = 1.0
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene

@@ -230,6 +230,7 @@ def _described(model: Model) -> dict[str, Any]:
         "nms_px": info.nms_px,
         "threshold": info.threshold,
         "subpixel_px": info.subpixel_px,
+        "distance_scale": info.distance_scale,
         "bytes": len(model.data),
         "gmac_640x480": inspection.macs(model.data, info, *_SIZE_PX) / 1e9,
         "licence": info.licence,

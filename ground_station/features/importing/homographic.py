@@ -15,7 +15,9 @@ _SHIFT = 0.2
 """How far a corner of what the second picture shows lies inside the first, of its sides."""
 
 Image = npt.NDArray[np.uint8]
+F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 
 @dataclass
@@ -74,8 +76,17 @@ def correct_matches(
     there, descriptors = there[seen], first.descriptors[seen]
     if not len(there) or not len(second):
         return 0, 0
-    likeness = descriptors @ second.descriptors.T
+    one, other = mutual_nearest(descriptors, second.descriptors)
+    distance = np.linalg.norm(there[one] - second.keypoints_px[other], axis=1)
+    return int(np.count_nonzero(distance <= LIMIT_PX)), len(one)
+
+
+def mutual_nearest(first: F32, second: F32) -> tuple[Indices, Indices]:
+    """Rows (N,) of unit descriptors (A, D), and rows (N,) of (B, D), each the other's nearest.
+
+    A and B are at least 1.
+    """
+    likeness = first @ second.T
     forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
     mutual = np.flatnonzero(back[forth] == np.arange(len(forth)))
-    distance = np.linalg.norm(there[mutual] - second.keypoints_px[forth[mutual]], axis=1)
-    return int(np.count_nonzero(distance <= LIMIT_PX)), len(mutual)
+    return mutual, forth[mutual]

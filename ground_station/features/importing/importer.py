@@ -9,7 +9,7 @@ from ground_station import files
 from ground_station.features import catalogue, extractors, inspection
 from ground_station.features import model as models
 from ground_station.features.extractor import FeatureError
-from ground_station.features.importing import alike, superpoint, torch_file
+from ground_station.features.importing import alike, scale, superpoint, torch_file
 from ground_station.features.importing.weights import WeightsError
 from ground_station.features.model import Model, ModelInfo
 
@@ -39,6 +39,9 @@ def import_weights(path: str | Path, name: str | None = None, licence: str | Non
         licence=licence or info.licence,
         source=f"{info.source}; weights sha256 {weights.sha256[:16]}",
     )
+    data = graph.model(info)
+    inspection.check(inspection.parse(data), info)
+    info = replace(info, distance_scale=scale.measured(data, info))
     return add(graph.model(info), info)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.features.importing import scale
 from ground_station.features.importing.graph import Graph, fold_batch_norm
 from ground_station.features.model import ModelInfo
 from ground_station.features.training.errors import TrainingError
@@ -18,8 +20,8 @@ EPSILON = 1e-5
 
 LICENCE = "BSD-3-Clause"
 NMS_PX = 3
-THRESHOLD = 0.02
-SUBPIXEL_PX = 1
+THRESHOLD = 0.005
+SUBPIXEL_PX = 2
 
 Weights = Mapping[str, npt.NDArray[np.float32]]
 
@@ -93,5 +95,6 @@ def export(shape: Shape, weights: Weights, path: str | Path, source: str) -> Mod
     graph.output(logits, "logits", LOGITS)
     graph.output(descriptors, "descriptors", shape.dimension)
     made = info(shape, source)
+    made = replace(made, distance_scale=scale.measured(graph.model(made), made))
     graph.save(path, made)
     return made

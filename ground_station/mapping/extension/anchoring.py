@@ -31,7 +31,9 @@ class Anchoring:
         self, map_: Map, flights: Sequence[Flight], frames: Frames, settings: LocalizerSettings
     ) -> None:
         settings = replace(settings, pose=replace(settings.pose, max_observations=_ALL))
-        self._matchers = [Matcher(map_, flight.camera, settings) for flight in flights]
+        self._matchers = [
+            Matcher(map_, flight.camera, settings, flight.distance_scale) for flight in flights
+        ]
         self._frames = frames
 
     def of(self, k: int, wTc: F64, twist: F64) -> tuple[Indices, Indices]:

@@ -29,7 +29,8 @@ class Flight:
     """An input and what a localizer made of it.
 
     `source` gives the frames once more; `time_ns` (N,), of all of them, increasing; `seen`, those
-    that were tracked and what they saw; `localized` counts the frames that were solved at all.
+    that were tracked and what they saw; `localized` counts the frames that were solved at all;
+    `distance_scale` is the extractor's.
     """
 
     path: Path
@@ -38,6 +39,7 @@ class Flight:
     time_ns: I64
     seen: FlightObservations
     localized: int
+    distance_scale: float
 
     @property
     def name(self) -> str:
@@ -90,7 +92,7 @@ def localize(
     # What falls back in time was refused by the localizer as well.
     later = times > np.concatenate([[times[0] - 1], np.maximum.accumulate(times)[:-1]])
     localized = sum(estimate.localized for estimate in estimates)
-    return Flight(path, source, camera, times[later], seen, localized)
+    return Flight(path, source, camera, times[later], seen, localized, extractor.distance_scale)
 
 
 def _check_size(path: Path, size: tuple[int, int], map_: Map) -> None:

@@ -114,6 +114,7 @@ def test_frames_are_found_and_localized_in_it(built, registered, tmp_path):
 
     class Extractor:
         name, sha256, dimension = "scene", "0" * 64, built.map.info.dimension
+        distance_scale = 1.0
 
     for source, most_m in ((store.load(registered), 0.03), (small, 0.04)):
         localizer = Localizer(source, built.scene.camera, Extractor(), load_preset("default"))

@@ -52,6 +52,7 @@ class Corridor:
     """Which points are not seen by noon."""
     pictures: list[Features] = dataclasses.field(default_factory=list)
     name, sha256, dimension = "corridor", "c" * 64, DIMENSION
+    distance_scale = 1.0
 
     def extract(self, image):
         """The features of a picture by its number, as an `Extractor`."""
