@@ -1,7 +1,7 @@
 """Not a test: how right and how fast builds are, beside plain COLMAP; prints one table.
 
     .venv/bin/python tests/mapping/construction/measure_structure.py redkitchen corridor atrium \\
-        [--methods] [--flights out/cache/flights] [--json FILE]
+        [--methods] [--flights out/cache/flights] [--seed N] [--json FILE]
 
 `redkitchen`: ../shared/data/redkitchen, frames 0:500:5; our whole build, cache off, against
 pycolmap's own SIFT, exhaustive matching and incremental mapping, in one run. `corridor`: the
@@ -103,12 +103,14 @@ def of_model(name: str, images: Images, model: Any, truth: Trajectory) -> Row:
     return judged(name, images.time_ns[found.image_id - 1], found.wTc[:, :3, 3], truth)
 
 
-def flight(folder: Path, scene: str, plan: str, rate_hz: float, duration_s: float) -> Path:
-    """A flight at noon with seed 41, rendered when it is not there yet."""
-    path = folder / f"{scene}-{plan}-noon-41-{duration_s:g}-{rate_hz:g}hz.mcap"
+def flight(
+    folder: Path, scene: str, plan: str, rate_hz: float, duration_s: float, seed: int
+) -> Path:
+    """A flight at noon, rendered when it is not there yet."""
+    path = folder / f"{scene}-{plan}-noon-{seed}-{duration_s:g}-{rate_hz:g}hz.mcap"
     if not path.exists():
         wanted = SimulationSettings(
-            out=path, scene=scene, plan=plan, light="noon", seed=41, rate_hz=rate_hz,
+            out=path, scene=scene, plan=plan, light="noon", seed=seed, rate_hz=rate_hz,
             duration_s=duration_s,
         )  # fmt: skip
         with Progress(f"{path.name}, frames", None) as progress:
@@ -148,7 +150,7 @@ def methods(images: Images, pairs: Any, camera: Camera, truth: Trajectory, seed:
     return rows
 
 
-def redkitchen(_: Path, with_methods: bool) -> list[Row]:
+def redkitchen(_: Path, with_methods: bool, __: int) -> list[Row]:
     """Our build against pycolmap's own, of 100 frames."""
     settings, camera = load_settings(), load_camera(DATA / "camera.toml")
     truth = read_tum(DATA / "pseudo_groundtruth.txt")
@@ -207,12 +209,12 @@ def _pycolmaps_own(work: Path, camera: Camera, truth: Trajectory) -> Row:
     return judged("redkitchen, pycolmap's own", time_ns, centres, truth) | timing
 
 
-def corridor(flights: Path, with_methods: bool, step: int = 1) -> list[Row]:
+def corridor(flights: Path, with_methods: bool, seed: int) -> list[Row]:
     """Equal bays: what COLMAP makes of our pairs, and what we make of them."""
     settings = load_settings()
-    path = flight(flights, "corridor", "corridor", 2.0, 105.0)
+    path = flight(flights, "corridor", "corridor", 2.0, 105.0, seed)
     truth = trajectory_of(path, TRUTH_TOPIC, [])
-    images, pairs, camera = pairs_of(path, settings, f"0:100000:{step}", None)
+    images, pairs, camera = pairs_of(path, settings, None, None)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
@@ -239,10 +241,10 @@ def corridor(flights: Path, with_methods: bool, step: int = 1) -> list[Row]:
     return rows
 
 
-def atrium(flights: Path, with_methods: bool) -> list[Row]:
+def atrium(flights: Path, with_methods: bool, seed: int) -> list[Row]:
     """500 frames of the hall."""
     settings = load_settings()
-    path = flight(flights, "atrium", "mapping", 5.0, 100.0)
+    path = flight(flights, "atrium", "mapping", 5.0, 100.0, seed)
     truth = trajectory_of(path, TRUTH_TOPIC, [])
     source = open_input(path, 30.0)
     assert source.camera is not None
@@ -271,11 +273,12 @@ def main() -> int:
     parser.add_argument("rows", nargs="+", choices=tuple(ROWS))
     parser.add_argument("--methods", action="store_true")
     parser.add_argument("--flights", type=Path, default=Path("out/cache/flights"))
+    parser.add_argument("--seed", type=int, default=41, help="of the simulated flights")
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()
     done: list[Row] = []
     for name in args.rows:
-        done += ROWS[name](args.flights, args.methods)
+        done += ROWS[name](args.flights, args.methods, args.seed)
         if args.json:
             write_json(args.json, {"threads": THREADS, "rows": done})
     for row in done:
