@@ -22,7 +22,8 @@ class Orb:
     A bit becomes +1/16 or -1/16, so each vector has unit length and the squared L2 distance of two
     is h / 64, where h is the number of bits in which they differ: the order by L2 is the order by
     Hamming distance, a ratio of L2 distances is the root of the ratio of Hamming distances, and
-    a limit of 0.7 in L2 means 31 bits.
+    a limit of 0.7 in L2 means 31 bits. Half of the right matches are farther than that, so where
+    distances are scaled (the preset `default`) the limit is 1.2, or 92 bits.
     """
 
     name = "orb"
