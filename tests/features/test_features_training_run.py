@@ -52,6 +52,10 @@ def test_the_rate_goes_up_stays_and_ends_at_nought_wherever_it_branches_off():
     assert recipe.differences(replace(recipe, batch=9).as_dict()) == ["batch"]
     assert recipe.differences({"size": "wren"})[-1] == "corpus"
     assert recipe.as_long_as(branch.as_dict()).steps == 600
+    # A run of before there was a loss on places keeps the recipe's beginning of it.
+    older = {k: v for k, v in recipe.as_dict().items() if k != "place_from"}
+    assert not recipe.differences(older)
+    assert recipe.as_long_as(older).place_from == recipe.place_from
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from ground_station.features.training.pairs import PairSource
 
 _AHEAD = 2
 """Batches that each process has ready."""
+_ARRAYS = ("images", "labels", "known", "points_px", "used", "teacher", "second_from_first")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Batch:
     points_px: Tensor
     used: Tensor
     teacher: Tensor
+    second_from_first: Tensor
 
 
 class _Steps(Dataset[tuple[Tensor, ...]]):
@@ -43,8 +45,7 @@ class _Steps(Dataset[tuple[Tensor, ...]]):
     def __getitem__(self, index: int) -> tuple[Tensor, ...]:
         pairs = [self._source.pair(self._first + index, k) for k in range(self._batch)]
         return tuple(
-            torch.from_numpy(np.stack([getattr(pair, name) for pair in pairs]))
-            for name in ("images", "labels", "known", "points_px", "used", "teacher")
+            torch.from_numpy(np.stack([getattr(pair, name) for pair in pairs])) for name in _ARRAYS
         )
 
 
@@ -75,7 +76,7 @@ def batches(
         generator=torch.Generator(),  # not the one whose state checkpoints keep
     )
     for items in loader:
-        images, labels, known, points_px, used, teacher = (
+        images, labels, known, points_px, used, teacher, second_from_first = (
             item.to(device, non_blocking=on_gpu) for item in items
         )
         yield Batch(
@@ -85,4 +86,5 @@ def batches(
             points_px=points_px,
             used=used,
             teacher=teacher.float(),
+            second_from_first=second_from_first.float(),
         )

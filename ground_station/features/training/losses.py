@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ground_station.features.training.places import place_loss
 from ground_station.features.training.topology import CELL_PX
 
 _FAR = -1e4
@@ -27,6 +28,8 @@ class LossSettings:
 
     descriptor: float = 1.0
     distillation: float = 0.5
+    place: float = 1.0
+    """A pixel."""
     temperature: float = 0.06
     teacher_temperature: float = 0.10
     apart_px: float = 8.0
@@ -43,6 +46,7 @@ class Losses:
     detector: Tensor
     descriptor: Tensor
     distillation: Tensor
+    place: Tensor
     right: Tensor
 
 
@@ -118,12 +122,12 @@ def distillation_loss(
 
 def losses(
     logits: Tensor, descriptors: Tensor, labels: Tensor, known: Tensor, points_px: Tensor,
-    used: Tensor, teacher: Tensor, settings: LossSettings,
+    used: Tensor, teacher: Tensor, second_from_first: Tensor, placed: bool, settings: LossSettings,
 ) -> Losses:  # fmt: skip
     """Of a batch of B pairs. Views are in rows 2b and 2b + 1 of `logits` and `descriptors`.
 
     `labels` (2B, 65, h, w), `known` (2B, h, w), `points_px` (B, 2, P, 2), `used` (B, P), `teacher`
-    (B, P, T).
+    (B, P, T), `second_from_first` (B, 3, 3); `placed`: whether key points' places count by now.
     """
     detector = detector_loss(logits, labels, known)
     at = sampled(descriptors, points_px.flatten(0, 1)).unflatten(0, (-1, 2))
@@ -131,4 +135,8 @@ def losses(
     descriptor, right = descriptor_loss(first, second, points_px, used, settings)
     distilled = distillation_loss(first, second, teacher, points_px, used, settings)
     total = detector + settings.descriptor * descriptor + settings.distillation * distilled
-    return Losses(total, detector, descriptor, distilled, right)
+    place = torch.zeros((), device=logits.device)
+    if placed:
+        place = place_loss(logits, known, second_from_first)
+        total = total + settings.place * place
+    return Losses(total, detector, descriptor, distilled, place, right)

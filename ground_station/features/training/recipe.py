@@ -13,6 +13,8 @@ from ground_station.features.training.topology import shape_of
 HELD_OUT_SEED = 1_000_003
 """Added to the corpus' seed for the pairs that validate: other textures, other rooms."""
 
+_LENGTHS = ("steps", "decay", "warm_up", "place_from")
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -35,6 +37,8 @@ class Recipe:
     weight_decay: float = 1e-4
     average: float = 0.999
     """Of the weights that are exported: what each step leaves of the mean so far."""
+    place_from: int = 17_500
+    """The first step that also learns where between the pixels a key point is (`places`)."""
 
     def __post_init__(self) -> None:
         """Raises `TrainingError` with one line for a number that trains nothing."""
@@ -51,6 +55,7 @@ class Recipe:
             "rate": (1e-7, 1.0),
             "weight_decay": (0, 1),
             "average": (0, 0.99999),
+            "place_from": (0, 10_000_000),
         }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:  # nor NaN
@@ -81,10 +86,10 @@ class Recipe:
 
     def as_long_as(self, other: dict[str, Any]) -> Recipe:
         """The same for as many steps as another recipe, with its beginning and end."""
-        steps, decay, warm_up = (
-            int(other.get(name, getattr(self, name))) for name in ("steps", "decay", "warm_up")
+        steps, decay, warm_up, place_from = (
+            int(other.get(name, getattr(self, name))) for name in _LENGTHS
         )
-        return replace(self, steps=steps, decay=decay, warm_up=warm_up)
+        return replace(self, steps=steps, decay=decay, warm_up=warm_up, place_from=place_from)
 
     def held_out(self) -> CorpusSettings:
         """What validates."""
@@ -101,7 +106,7 @@ class Recipe:
     def differences(self, other: dict[str, Any]) -> list[str]:
         """What of another recipe is not as here, but for the length, which may be changed."""
         mine = self.as_dict()
-        free = {"steps", "decay", "warm_up", "corpus"}
+        free = {*_LENGTHS, "corpus"}
         result = [k for k in mine if k not in free and mine[k] != other.get(k)]
         corpus = other.get("corpus")
         fixed = self.corpus.fixed()

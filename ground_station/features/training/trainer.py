@@ -52,7 +52,8 @@ class Trainer:
             logits, descriptors = self.network(images)
         result = losses(
             logits, descriptors, batch.labels, batch.known, batch.points_px, batch.used,
-            batch.teacher, self._settings,
+            batch.teacher, batch.second_from_first, self.recipe.place_from <= number,
+            self._settings,
         )  # fmt: skip
         self.optimizer.zero_grad(set_to_none=True)
         result.total.backward()

@@ -6,8 +6,9 @@
 `redkitchen`: ../shared/data/redkitchen, frames 0:500:5; our whole build, cache off, against
 pycolmap's own SIFT, exhaustive matching and incremental mapping, in one run. `corridor`: the
 simulated corridor of equal bays; plain COLMAP on the same verified pairs beside ours. `atrium`: 500
-frames of the simulated hall. Flights are rendered once. `--methods` solves each row's pairs by the
-incremental and by the global method. The truth is looked at only to print how far off a map is.
+frames of the simulated hall, registered then by six points told with 5 cm of noise. Flights are
+rendered once. `--methods` solves each row's pairs by the incremental and by the global method. The
+truth is looked at only to print how far off a map is.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from typing import Any
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[1] / "registration"))
+from surveyed_points import six_points
+
 from ground_station.files import write_json
 from ground_station.geometry.alignment import align
 from ground_station.geometry.camera import Camera, load_camera
@@ -33,6 +37,7 @@ from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.verification import match
+from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import MappingSettings, load_settings
 from ground_station.mapping.sfm import colmap, global_mapping
 from ground_station.mapping.sfm.incremental import Incremental, Wanted, pipeline_options
@@ -50,6 +55,7 @@ RANGE = "0:500:5"
 THREADS = os.cpu_count() or 1
 OFF_M = 0.10
 SAME_NS = 1_000_000
+DRAWS = 20
 
 Row = dict[str, Any]
 
@@ -108,14 +114,19 @@ def flight(
 ) -> Path:
     """A flight at noon, rendered when it is not there yet."""
     path = folder / f"{scene}-{plan}-noon-{seed}-{duration_s:g}-{rate_hz:g}hz.mcap"
-    if not path.exists():
+    if not (path.exists() and points_of(path).exists()):
         wanted = SimulationSettings(
             out=path, scene=scene, plan=plan, light="noon", seed=seed, rate_hz=rate_hz,
-            duration_s=duration_s,
+            duration_s=duration_s, points=points_of(path),
         )  # fmt: skip
         with Progress(f"{path.name}, frames", None) as progress:
             simulate(wanted, lambda done, total: progress.step(total))
     return path
+
+
+def points_of(flight: Path) -> Path:
+    """Where the sights of a flight's surveyed points are."""
+    return flight.with_suffix(".points.csv")
 
 
 def pairs_of(path: Path, settings: MappingSettings, frames: str | None, camera: Camera | None):  # type: ignore[no-untyped-def]
@@ -258,6 +269,11 @@ def atrium(flights: Path, with_methods: bool, seed: int) -> list[Row]:
         rows = [judged("atrium", frames.time_ns, frames.wTc[:, :3, 3], truth)]
         rows[0] |= timing | map_.info.built["stage_s"]
         rows[0]["notes"] = "; ".join(map_.info.built["notes"])
+        true_m = truth.position_m[[truth.nearest(int(t)) for t in frames.time_ns]]
+        drawn = six_points(map_, true_m, read_pairs(points_of(path)), DRAWS)
+    rows[0]["by_six_points_median_m"] = round(float(np.median(drawn.median_m)), 4)
+    rows[0]["by_six_points_covered"] = round(float(np.mean(drawn.covered)), 3)
+    rows[0]["draws_covering_most"] = f"{np.sum(np.array(drawn.covered) >= 0.5)} of {DRAWS}"
     if with_methods:
         images, pairs, camera = pairs_of(path, settings, None, None)
         rows += methods(images, pairs, camera, truth, settings.seed)

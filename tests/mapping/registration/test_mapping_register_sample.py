@@ -11,39 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from surveyed_points import NOISE_M, far_apart, only, six_points
 
 from ground_station.mapping import store
 from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.register import transform_map
-from ground_station.mapping.registration.sights import Sights, read_pairs
+from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.registration.uncertainty import describe
 from ground_station.recording.flight import trajectory_of
 
 SAMPLE = Path(__file__).parents[3] / "maps" / "atrium"
-NOISE_M = 0.05
 DRAWS = 20
-
-
-def only(sights: Sights, chosen: list[int]) -> Sights:
-    """The sights of some of the points."""
-    kept = np.flatnonzero(np.isin(sights.point, chosen))
-    place = {p: k for k, p in enumerate(chosen)}
-    return Sights(
-        [sights.points[p] for p in chosen],
-        sights.world_m[chosen],
-        np.array([place[p] for p in sights.point[kept].tolist()]),
-        [sights.image[k] for k in kept],
-        sights.pixel_px[kept],
-    )
-
-
-def far_apart(places: np.ndarray, count: int) -> list[int]:
-    """Points that a person would survey: each the farthest from those before."""
-    chosen = [int(np.argmax(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
-    while len(chosen) < count:
-        gaps = np.linalg.norm(places[:, None] - places[chosen][None], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(gaps)))
-    return sorted(chosen)
 
 
 @pytest.fixture(scope="module")
@@ -55,19 +33,10 @@ def sample():
 
 def test_six_points_with_five_centimetres_of_noise(sample):
     map_, truth_m, sights = sample
-    six = only(sights, far_apart(sights.world_m, 6))
-    rng = np.random.default_rng(0)
-    medians, covered, points = [], [], []
-    for _ in range(DRAWS):
-        told = six.world_m + NOISE_M * rng.normal(size=six.world_m.shape)
-        found = by_sights(map_, dataclasses.replace(six, world_m=told), 0)
-        points.append(found.report["points"])
-        off = np.linalg.norm(found.fit.apply(map_.keyframes.wTc[:, :3, 3]) - truth_m, axis=1)
-        medians.append(np.median(off))
-        covered.append(np.mean(off <= found.uncertainty.radius_m(truth_m)))
-    assert np.median(medians) < 0.06, medians
-    assert np.sum(np.equal(points, 6)) >= 19  # a point is left out by chance in one of a hundred
-    assert np.mean(covered) >= 0.85, covered
+    drawn = six_points(map_, truth_m, sights, DRAWS)
+    assert np.median(drawn.median_m) < 0.06, drawn.median_m
+    assert np.sum(np.equal(drawn.points, 6)) >= 19  # one in a hundred is left out by chance
+    assert np.mean(drawn.covered) >= 0.85, drawn.covered
 
 
 def test_one_of_six_that_is_three_metres_off_is_named(sample):
