@@ -56,16 +56,20 @@ class MatchSettings:
         "auto", "exhaustive: every pair is compared", choices=("auto", "exhaustive")
     )
     exhaustive_max: int = config.key(
-        160, "auto: up to so many images, every pair is compared", unit="images", low=2, high=2000
+        64, "auto: up to so many images, every pair is compared", unit="images", low=2, high=2000
     )
     neighbours: int = config.key(
-        12, "above that: each image with so many that follow it", unit="images", low=1, high=1000
+        12,
+        "above that: each image with some of so many that follow it",
+        unit="images",
+        low=1,
+        high=1000,
     )
     similar: int = config.key(
-        20, "above that: and with so many that look like it", unit="images", low=0, high=1000
+        8, "above that: and with so many that look like it", unit="images", low=0, high=1000
     )
     covisible: int = config.key(
-        10,
+        4,
         "above that: and with so many that share strong links with it, but were not compared",
         unit="images",
         low=0,

@@ -45,8 +45,8 @@ def choose_pairs(
     """Pairs (i, j), i < j, of images to match, sorted.
 
     All of them where the settings say so, and up to `exhaustive_max` images. Otherwise each image
-    with its `neighbours` followers in the same of `sequences` (all one by default), and with the
-    `similar` images nearest by `vlad`.
+    with `steps` of up to `neighbours` images ahead in the same of `sequences` (all one by default),
+    and with the `similar` images nearest by `vlad` that are no neighbours.
     """
     n = len(descriptors)
     if is_exhaustive(n, settings):
@@ -55,7 +55,7 @@ def choose_pairs(
     way = np.zeros(n, dtype=np.int64) if sequence is None else sequence
     following = index[None, :] - index[:, None]
     neighbours = (np.abs(following) <= settings.neighbours) & (way[:, None] == way)
-    chosen = neighbours & (following > 0)
+    chosen = neighbours & np.isin(following, steps(settings.neighbours))
     if settings.similar:
         images = vlad(descriptors, seed)
         similarity = images @ images.T
@@ -64,6 +64,15 @@ def choose_pairs(
         rows = np.repeat(index, nearest.shape[1])
         chosen |= _upper(rows, nearest.ravel(), n) & ~neighbours
     return _listed(chosen)
+
+
+def steps(reach: int) -> list[int]:
+    """How far ahead an image is compared: 1, 2, 3, 4, 6, 8, 12, 16, 24 … up to `reach` images.
+
+    What lies between two of them shows little that they do not; where it does, it is `covisible`.
+    """
+    doubled = (base << k for k in range(reach.bit_length()) for base in (2, 3))
+    return [1, *sorted(step for step in doubled if step <= reach)]
 
 
 def covisible_pairs(

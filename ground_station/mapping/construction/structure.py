@@ -26,6 +26,9 @@ from ground_station.progress import Progress
 _FOLDED = 0.1
 """Share of images in the wrong place, or without one although their neighbours have one, from which
 on the rest of the model is doubtful, too."""
+_FIRST_ITERATIONS = 15
+"""Of the adjustment that finds what does not fit; with that gone, the next one goes to the end."""
+_ITERATIONS = 50
 _NEARLY_ALL = 0.95
 """Share of the images that the global method must place for `auto` to be content with it."""
 
@@ -233,10 +236,11 @@ def adjust_and_filter(
     Robust bundle adjustment, then observations above `max_error_px` and points below `min_track`
     or `min_tri_angle_deg` go; twice, because the first round's outliers bend the second's poses.
     """
-    for _ in range(2):
+    for iterations in (_FIRST_ITERATIONS, _ITERATIONS):
         colmap.adjust(
-            reconstruction, loss_px=sfm.loss_px, refine_camera=sfm.refine_camera, threads=threads
-        )
+            reconstruction, loss_px=sfm.loss_px, refine_camera=sfm.refine_camera, threads=threads,
+            max_iterations=iterations,
+        )  # fmt: skip
         drop_misfits(reconstruction, sfm)
     model = colmap.to_arrays(reconstruction)
     if not len(model.point_id):

@@ -60,10 +60,15 @@ def pipeline_options(wanted: Wanted) -> pycolmap.IncrementalPipelineOptions:
     options.ba_refine_focal_length = wanted.refine_camera
     options.ba_refine_principal_point = False
     options.ba_refine_extra_params = False
-    # Constant intrinsics let the global adjustment run more rarely without drift.
-    options.ba_global_frames_ratio = 1.3
-    options.ba_global_points_ratio = 1.3
-    options.ba_global_max_refinements = 3
+    # Constant intrinsics let the global adjustment run more rarely without drift, and nothing needs
+    # the last digit on the way: the finished model is adjusted until it stands.
+    options.ba_global_frames_ratio = 1.5
+    options.ba_global_points_ratio = 1.5
+    options.ba_global_max_refinements = 2
+    options.ba_global_max_num_iterations = 15
+    options.ba_global_function_tolerance = 1e-4
+    options.ba_local_max_refinements = 1
+    options.ba_local_function_tolerance = 1e-3
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     options.mapper.abs_pose_max_error = 6.0

@@ -24,6 +24,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it
+
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1] / "registration"))

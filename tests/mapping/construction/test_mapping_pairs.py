@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ground_station.mapping.construction.pairs import choose_pairs, covisible_pairs, sequences, vlad
+from ground_station.mapping.construction.pairs import (
+    choose_pairs,
+    covisible_pairs,
+    sequences,
+    steps,
+    vlad,
+)
 from ground_station.mapping.settings import MatchSettings
 
 RNG = np.random.default_rng(5)
@@ -32,6 +38,15 @@ def test_neighbours_are_of_one_sequence():
     settings = MatchSettings(exhaustive_max=2, neighbours=2, similar=0)
     pairs = choose_pairs(_images(7), settings, 0, np.array([0, 0, 0, 1, 1, 1, 1]))
     assert pairs == [(0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5), (4, 6), (5, 6)]
+
+
+def test_far_neighbours_are_compared_ever_more_rarely():
+    assert [steps(reach) for reach in (1, 2, 5)] == [[1], [1, 2], [1, 2, 3, 4]]
+    assert steps(30) == [1, 2, 3, 4, 6, 8, 12, 16, 24]
+    settings = MatchSettings(exhaustive_max=2, neighbours=7, similar=0)
+    pairs = choose_pairs(_images(12), settings, 0)
+    assert {j - i for i, j in pairs} == {1, 2, 3, 4, 6}
+    assert [j for i, j in pairs if i == 2] == [3, 4, 5, 6, 8]
 
 
 def test_images_of_two_inputs_that_look_alike_are_compared():
