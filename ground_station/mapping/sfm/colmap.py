@@ -233,7 +233,7 @@ def to_arrays(model: Reconstruction) -> Model:
         names.append(image.name)
         wTc[k, :3] = image.cam_from_world().inverse().matrix()
         index = np.asarray(image.get_observation_point2D_idxs(), dtype=np.int64)
-        points = [image.points2D[int(i)] for i in index]
+        points = image.get_observation_points2D()
         images.append(np.full(len(index), k))
         features.append(index)
         seen.append(np.array([point.point3D_id for point in points], dtype=np.int64))
