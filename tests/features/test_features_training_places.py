@@ -4,7 +4,7 @@ stepping down it brings two views' points together. With torch only."""
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+torch = pytest.importorskip("torch", reason="training's tests need torch, an optional extra")
 
 from ground_station.features import detection  # noqa: E402
 from ground_station.features.training.places import (  # noqa: E402
@@ -32,7 +32,7 @@ def logits(points: list[tuple[float, float]]) -> "torch.Tensor":
 def loss_of(first, second, matrix=SHIFT, known=None):
     both = torch.cat([logits(first), logits(second)])
     known = torch.ones(2, 8, 10) if known is None else known
-    return float(place_loss(both, known, matrix))
+    return place_loss(both, known, matrix).item()
 
 
 def test_peaks_are_refined_as_extraction_refines_them():
@@ -72,11 +72,11 @@ def test_down_the_gradient_two_views_points_come_together():
     both.requires_grad_(True)
     known = torch.ones(2, 8, 10)
     before = place_loss(both, known, SHIFT)
-    assert 0.4 < float(before) < 1
+    assert 0.4 < before.item() < 1
     optimizer = torch.optim.SGD([both], lr=2.0)
     for _ in range(40):
         optimizer.zero_grad()
         loss = place_loss(both, known, SHIFT)
         loss.backward()
         optimizer.step()
-    assert float(loss) < 0.3 * float(before)
+    assert loss.item() < 0.3 * before.item()

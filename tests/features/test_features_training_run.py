@@ -21,7 +21,8 @@ CORPUS = CorpusSettings(
     seed=3, pictures=4, rooms=0, warps=1, points=60, per_shard=2, rows=128, columns=160
 )
 TINY = Recipe(
-    corpus=CORPUS, rows=64, columns=96, batch=2, points=16, steps=6, warm_up=2, decay=2
+    corpus=CORPUS, rows=64, columns=96, batch=2, points=16, steps=6, warm_up=2, decay=2,
+    place_from=3,
 )  # fmt: skip
 
 
@@ -214,6 +215,17 @@ def test_arithmetic_of_fewer_bits_trains_the_same_weights_but_for_their_last_dig
     assert [line["bfloat16"] for line in log if line["kind"] == "recipe"] == [True]
     with pytest.raises(TrainingError, match="precision is 'half'; allowed: auto, float32"):
         train(made, tmp_path / "other", precision="half")
+
+
+def test_key_points_places_count_from_their_step_on(made, straight, tmp_path):
+    def place(folder):
+        return curve.read(folder / "log.jsonl")[-2]["place"]
+
+    train(made, tmp_path / "late", replace(TINY, place_from=6))
+    assert place(tmp_path / "late") == 0 < place(straight)
+    ours, theirs = last(tmp_path / "late"), last(straight)
+    name = next(k for k in theirs.arrays if k.startswith("network.") and theirs.arrays[k].ndim == 4)
+    assert (ours.arrays[name] != theirs.arrays[name]).any()
 
 
 def test_another_recipe_does_not_go_on(made, straight):

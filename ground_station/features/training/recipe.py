@@ -14,6 +14,7 @@ HELD_OUT_SEED = 1_000_003
 """Added to the corpus' seed for the pairs that validate: other textures, other rooms."""
 
 _LENGTHS = ("steps", "decay", "warm_up", "place_from")
+"""When what begins and ends: a run may be made longer or shorter while it goes."""
 
 
 @dataclass(frozen=True)
