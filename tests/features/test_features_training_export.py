@@ -3,10 +3,12 @@
 import numpy as np
 import onnx
 import pytest
+import torch_files
 import training_models
 
 from ground_station.features import model
 from ground_station.features.cells import CellFeatures
+from ground_station.features.importing import importer
 from ground_station.features.inference import Network
 from ground_station.features.settings import LearnedSettings
 from ground_station.features.training import export, images
@@ -77,6 +79,23 @@ def test_normalisation_is_folded_into_the_weights(tmp_path):
     logits, descriptors = shape.build(Reference(weights), picture[0].astype(np.float64))
     assert said["logits"][0] == pytest.approx(logits, abs=1e-3)
     assert said["descriptors"][0] == pytest.approx(descriptors, abs=1e-3)
+
+
+def test_superpoints_size_comes_in_again_as_magic_leaps_file(tmp_path, monkeypatch):
+    """Trained and folded, written as torch.save of 2018 did, imported: the network that it was."""
+    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
+    shape = SHAPES["superpoint"]
+    weights = training_models.weights(shape, seed=3)
+    assert [name for name, s in SHAPES.items() if s.importable] == ["superpoint"]
+    export.export(shape, weights, tmp_path / "own.onnx", "a test")
+    (tmp_path / "own.pth").write_bytes(torch_files.legacy_of(export.folded(shape, weights)))
+    brought = importer.import_weights(tmp_path / "own.pth", None)
+    assert brought.info.name == "superpoint"
+    picture = np.random.default_rng(1).random((1, 1, 64, 96)).astype(np.float32)
+    said, own = (Network(m).run(picture) for m in (brought, model.read(tmp_path / "own.onnx")))
+    for name in ("logits", "descriptors"):
+        assert said[name].shape[2:] == (8, 12)
+        assert said[name] == pytest.approx(own[name], abs=1e-5 * float(np.abs(own[name]).max()))
 
 
 class Reference:

@@ -265,6 +265,28 @@ def test_the_file_says_what_torch_says(torch, tmp_path, size):
         assert np.abs(said[name] - ours.numpy()).max() <= 1e-4 * scale
 
 
+def test_weights_of_superpoints_size_are_a_file_that_the_import_takes(
+    torch, made, tmp_path, monkeypatch
+):
+    """torch writes it, our own reader of torch's files brings it in, and it is the same network."""
+    from ground_station.features import model
+    from ground_station.features.importing import importer
+    from ground_station.features.inference import Network
+
+    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
+    run = tmp_path / "run"
+    train(made, run, replace(TINY, size="superpoint", steps=2, warm_up=0, decay=1))
+    own, brought = (
+        Network(m).run(np.full((1, 1, 32, 48), 0.5, np.float32))
+        for m in (
+            model.read(run / "wren-superpoint.onnx"),
+            importer.import_weights(run / "wren-superpoint.pth", None),
+        )
+    )
+    for name, value in own.items():
+        assert value == pytest.approx(brought[name], abs=1e-5 * float(np.abs(value).max()))
+
+
 def test_the_losses_are_least_where_they_should_be(torch):
     from ground_station.features.training.losses import (
         LossSettings,

@@ -13,7 +13,7 @@ from ground_station.features.importing import scale
 from ground_station.features.importing.graph import Graph, fold_batch_norm
 from ground_station.features.model import ModelInfo
 from ground_station.features.training.errors import TrainingError
-from ground_station.features.training.topology import LOGITS, Conv, Shape
+from ground_station.features.training.topology import LOGITS, Conv, Shape, layers
 
 EPSILON = 1e-5
 """Of the batch normalisations, in training and where they are folded."""
@@ -23,7 +23,8 @@ NMS_PX = 3
 THRESHOLD = 0.005
 SUBPIXEL_PX = 2
 
-Weights = Mapping[str, npt.NDArray[np.float32]]
+Array = npt.NDArray[np.float32]
+Weights = Mapping[str, Array]
 
 
 def info(shape: Shape, source: str) -> ModelInfo:
@@ -41,30 +42,46 @@ def info(shape: Shape, source: str) -> ModelInfo:
     )
 
 
+def folded(shape: Shape, weights: Weights) -> dict[str, Array]:
+    """`LAYER.weight` (out, in, k, k) and `LAYER.bias` (out,) of all layers, in their order.
+
+    Batch normalisations are folded into the convolutions before them: of SuperPoint's size this is
+    Magic Leap's layout. Raises `TrainingError` as `export`.
+    """
+    result: dict[str, Array] = {}
+    for layer in layers(shape):
+        weight, bias = _folded(layer, weights)
+        result |= {f"{layer.name}.weight": weight, f"{layer.name}.bias": bias}
+    return result
+
+
+def _folded(layer: Conv, weights: Weights) -> tuple[Array, Array]:
+    def take(name: str, *shape: int) -> Array:
+        if name not in weights:
+            raise TrainingError(f"the weights lack '{name}'")
+        array = weights[name]
+        if array.shape != shape:
+            raise TrainingError(f"'{name}' is {array.shape}; this network has {shape}")
+        return array
+
+    n, name = layer.channels_out, layer.name
+    weight = take(f"{name}.weight", n, layer.channels_in, layer.size, layer.size)
+    if not layer.norm:
+        return weight, take(f"{name}.bias", n)
+    scale, shift, mean, variance = (
+        take(f"{name}.norm.{term}", n) for term in ("weight", "bias", "mean", "var")
+    )
+    return fold_batch_norm(weight, None, scale, shift, mean, variance, EPSILON)
+
+
 class _OnnxOperations:
     """The graph's nodes; batch normalisations are folded into the convolutions before them."""
 
     def __init__(self, graph: Graph, weights: Weights) -> None:
         self._graph, self._weights = graph, weights
 
-    def _take(self, name: str, *shape: int) -> npt.NDArray[np.float32]:
-        if name not in self._weights:
-            raise TrainingError(f"the weights lack '{name}'")
-        array = self._weights[name]
-        if array.shape != shape:
-            raise TrainingError(f"'{name}' is {array.shape}; this network has {shape}")
-        return array
-
     def conv(self, layer: Conv, x: str) -> str:
-        n, name = layer.channels_out, layer.name
-        weight = self._take(f"{name}.weight", n, layer.channels_in, layer.size, layer.size)
-        if layer.norm:
-            scale, shift, mean, variance = (
-                self._take(f"{name}.norm.{term}", n) for term in ("weight", "bias", "mean", "var")
-            )
-            weight, bias = fold_batch_norm(weight, None, scale, shift, mean, variance, EPSILON)
-        else:
-            bias = self._take(f"{name}.bias", n)
+        weight, bias = _folded(layer, self._weights)
         return self._graph.conv(x, weight, bias, stride=layer.stride, padding=layer.size // 2)
 
     def relu(self, x: str) -> str:

@@ -27,8 +27,9 @@ from ground_station.features.settings import LearnedSettings
 from ground_station.features.training import checkpoint, corpus, curve, teacher, validation
 from ground_station.features.training.batches import batches
 from ground_station.features.training.errors import TrainingError
-from ground_station.features.training.export import export
+from ground_station.features.training.export import export, folded
 from ground_station.features.training.losses import Losses
+from ground_station.features.training.network import FeatureNetwork, write_weights
 from ground_station.features.training.pairs import Pair, PairSource
 from ground_station.features.training.recipe import Recipe, finite, is_due, pairs_seen
 from ground_station.features.training.trainer import Trainer
@@ -85,8 +86,9 @@ def train(
 ) -> dict[str, Any]:
     """Runs a recipe in a folder and returns the last figures.
 
-    The folder then holds `checkpoints/`, `log.jsonl`, `curve.png` and the model's file. Raises
-    `TrainingError` where it holds a run already and `resume` is not set, or another recipe's.
+    The folder then holds `checkpoints/`, `log.jsonl`, `curve.png` and the model's file, of
+    SuperPoint's size also its weights in Magic Leap's layout. Raises `TrainingError` where it holds
+    a run already and `resume` is not set, or another recipe's.
     """
     device = machine.chosen()
     torch.set_num_threads(machine.threads)
@@ -237,7 +239,10 @@ class _Run:
         """Exports the weights' mean, holds the file to torch's outputs, and judges it."""
         pairs = pairs_seen(self.recipe, step)
         source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs; teacher ALIKE, BSD-3"
-        export(self.trainer.shape, self.trainer.weights(), self.model, source)
+        weights, shape = self.trainer.weights(), self.trainer.shape
+        export(shape, weights, self.model, source)
+        if shape.importable:
+            write_weights(self.model.with_suffix(".pth"), folded(shape, weights))
         network = Network(model.read(self.model), threads=self.machine.threads)
         self.compare(network)
         extractor = CellFeatures(network, _MOST_POINTS, LearnedSettings())
@@ -252,8 +257,6 @@ class _Run:
 
     def compare(self, network: Network) -> None:
         """Raises `TrainingError` where the file does not say what torch says."""
-        from ground_station.features.training.network import FeatureNetwork
-
         with torch.random.fork_rng(devices=[]):  # the first weights are drawn for nothing
             mean = FeatureNetwork(self.trainer.shape)
         mean.load_state_dict({k: v.cpu() for k, v in self.trainer.mean.items()})

@@ -64,6 +64,8 @@ class Shape:
     dimension: int
     multiple: int
     build: Callable[[Operations, Any], tuple[Any, Any]]
+    importable: bool = False
+    """Its weights, folded, are what `blimp models import` knows: Magic Leap's names and shapes."""
 
 
 def _wren(o: Operations, image: Any) -> tuple[Any, Any]:
@@ -110,7 +112,7 @@ def _superpoint(o: Operations, image: Any) -> tuple[Any, Any]:
 
 SHAPES = {
     "wren": Shape("wren", 64, 16, _wren),
-    "superpoint": Shape("wren-superpoint", 256, 8, _superpoint),
+    "superpoint": Shape("wren-superpoint", 256, 8, _superpoint, importable=True),
 }
 
 
