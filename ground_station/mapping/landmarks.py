@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from ground_station.mapping.sfm.colmap import Model
 from ground_station.mapping.store import Landmarks
@@ -81,8 +82,10 @@ def make_landmarks(model: Model, descriptors: F32) -> Landmarks:
     count = len(model.position)
     n = np.bincount(model.point, minlength=count)
     weight = 1.0 / np.maximum(n, 1)
-    mean = np.zeros((count, descriptors.shape[1]))
-    np.add.at(mean, model.point, descriptors)
+    sights = np.arange(len(model.point))
+    tracks = csr_array((np.ones(len(sights), np.float32), (model.point, sights)),
+                       shape=(count, len(sights)))  # fmt: skip
+    mean = tracks @ descriptors
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     square = np.sum((descriptors - mean[model.point]) ** 2, axis=1)
     spread = np.sqrt(np.bincount(model.point, square, count) * weight)

@@ -112,8 +112,7 @@ def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: in
     """
     for _ in range(2):
         adjust_points(reconstruction, loss_px=sfm.loss_px, threads=threads)
-        drop_misfits(reconstruction, sfm)
-    model = colmap.to_arrays(reconstruction)
+        model = drop_misfits(reconstruction, sfm)
     if not len(model.point_id):
         raise MapError(
             f"no landmark is seen by {sfm.min_track} images at {sfm.min_tri_angle_deg} degrees "

@@ -149,12 +149,15 @@ def adjust(
     refine_camera: bool,
     threads: int = 0,
     max_iterations: int = 50,
+    tolerance: float = 1e-6,
 ) -> bool:
     """Bundle adjustment of all poses and points with a Cauchy loss of scale `loss_px`.
 
-    Returns whether it converged within `max_iterations`.
+    It ends when a step lowers the cost by no more than the share `tolerance`. Returns whether that
+    was within `max_iterations`.
     """
     options = adjustment_options(loss_px, threads, max_iterations)
+    options.ceres.solver_options.function_tolerance = tolerance
     options.refine_focal_length = refine_camera
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
@@ -284,9 +287,10 @@ def drop_observations(
 
 
 def drop_points(model: Reconstruction, point_ids: npt.ArrayLike) -> None:
-    """Takes points out of a model."""
+    """Takes points out of a model; those that went with their sights are gone already."""
     for point_id in np.asarray(point_ids).tolist():
-        model.delete_point3D(point_id)
+        if model.exists_point3D(point_id):
+            model.delete_point3D(point_id)
 
 
 def compact(model: Reconstruction) -> Reconstruction:

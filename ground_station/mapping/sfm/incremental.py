@@ -64,7 +64,7 @@ def pipeline_options(wanted: Wanted) -> pycolmap.IncrementalPipelineOptions:
     # the last digit on the way: the finished model is adjusted until it stands.
     options.ba_global_frames_ratio = 1.5
     options.ba_global_points_ratio = 1.5
-    options.ba_global_max_refinements = 2
+    options.ba_global_max_refinements = 1
     options.ba_global_max_num_iterations = 15
     options.ba_global_function_tolerance = 1e-4
     options.ba_local_max_refinements = 1

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import corridor_geometry as geometry
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.alignment import Alignment
+from ground_station.mapping import landmarks
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.placing import loops, merging
@@ -100,6 +103,20 @@ def test_models_that_split_become_one_by_the_pairs_between_them(corridor, tmp_pa
     found = structure.adjust_and_filter(models[0], MappingSettings().sfm, 1)
     assert found.names == corridor.images.names
     assert np.bincount(found.point).min() >= MappingSettings().sfm.min_track
+
+
+def test_what_is_left_without_misfits_is_the_model_itself(corridor, tmp_path):
+    model = _reconstruction(corridor, tmp_path)._solve("all", corridor.pairs)[0][0]
+    before = colmap.to_arrays(model)
+    error = np.linalg.norm(landmarks.residuals_px(before), axis=1)
+    strict = replace(MappingSettings().sfm, max_error_px=float(np.median(error)), min_track=4)
+    left, there = structure.drop_misfits(model, strict), colmap.to_arrays(model)
+    for name in ("point_id", "position", "image_id", "wTc", "image", "feature", "point"):
+        assert np.array_equal(getattr(left, name), getattr(there, name)), name
+    assert np.array_equal(left.pixel_px, there.pixel_px) and left.names == there.names
+    assert np.linalg.norm(landmarks.residuals_px(left), axis=1).max() <= strict.max_error_px
+    assert np.bincount(left.point).min() >= 4
+    assert 0 < len(left.point) <= len(error) / 2 and 0 < len(left.point_id) < len(before.point_id)
 
 
 def test_models_without_a_pair_between_them_are_reported_by_name(corridor, tmp_path):

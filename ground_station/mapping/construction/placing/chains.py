@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.workers import Threads
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -77,7 +78,7 @@ def in_order(sequence: I64, pairs: Mapping[Pair, TwoView]) -> npt.NDArray[np.boo
 
 
 def in_front(
-    pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64
+    pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64, threads: int = 1
 ) -> dict[Pair, TwoView]:
     """The pairs that may be links, without matches that lie behind the camera.
 
@@ -85,22 +86,23 @@ def in_front(
     it would have moved against the camera's way. `pixels` (N, 2) of each image are undistorted. A
     flow of a few pixels says nothing.
     """
-    kept = {}
-    for (i, j), view in pairs.items():
-        if j - i > REACH:
-            continue
-        p = np.ascontiguousarray(pixels[i][view.matches[:, 0]])
-        q = np.ascontiguousarray(pixels[j][view.matches[:, 1]])
-        _, R, t, _ = cv2.recoverPose(view.essential, p, q, camera_matrix)
-        far = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(camera_matrix).T @ R.T
-        far = far @ camera_matrix.T  # where it would be seen at infinity
-        x = far[:, :2] / far[:, 2:]
-        nearer = (camera_matrix @ t).ravel()
-        flow = q - x
-        against = np.sum(flow * (nearer[:2] - x * nearer[2]), axis=1) < 0
-        behind = against & (np.linalg.norm(flow, axis=1) > _STILL_PX)
-        kept[i, j] = dataclasses.replace(view, matches=view.matches[~behind])
-    return kept
+    near = {(i, j): view for (i, j), view in pairs.items() if j - i <= REACH}
+    items = ((view, pixels[i], pixels[j], camera_matrix) for (i, j), view in near.items())
+    return dict(zip(near, Threads(threads).map(_in_front, items), strict=True))
+
+
+def _in_front(view: TwoView, first_px: F64, second_px: F64, camera_matrix: F64) -> TwoView:
+    p = np.ascontiguousarray(first_px[view.matches[:, 0]])
+    q = np.ascontiguousarray(second_px[view.matches[:, 1]])
+    _, R, t, _ = cv2.recoverPose(view.essential, p, q, camera_matrix)
+    far = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(camera_matrix).T @ R.T
+    far = far @ camera_matrix.T  # where it would be seen at infinity
+    x = far[:, :2] / far[:, 2:]
+    nearer = (camera_matrix @ t).ravel()
+    flow = q - x
+    against = np.sum(flow * (nearer[:2] - x * nearer[2]), axis=1) < 0
+    behind = against & (np.linalg.norm(flow, axis=1) > _STILL_PX)
+    return dataclasses.replace(view, matches=view.matches[~behind])
 
 
 def links(
