@@ -210,6 +210,7 @@ class Incremental:
         demands = copy.copy(self._mapping)
         demands.init_min_num_inliers = self._mapping.init_min_num_inliers >> ((level + 1) // 2)
         demands.init_min_tri_angle = self._mapping.init_min_tri_angle / 2 ** (level // 2)
+        demands.num_threads = 1  # of several, the pair whose thread was ready first would win
         status = pycolmap.IncrementalPipelineStatus
         for _ in range(self._options.init_num_trials):
             pycolmap.set_random_seed(self._seed)

@@ -169,3 +169,13 @@ def test_a_model_that_the_disk_did_not_take_is_told(tmp_path, monkeypatch):
     with pytest.raises(MapError, match=r"points3D\.bin: was not written whole; is the disk full\?"):
         Snapshots(tmp_path / "kept").save("00-0", Full())
     assert Snapshots(tmp_path / "kept").names() == []
+
+
+def test_the_first_pair_does_not_depend_on_which_thread_is_ready_first(database, tmp_path):
+    found = set()
+    for _ in range(20):
+        mapping = Incremental(database, tmp_path, Wanted(0, 4, False, 1.5, FRAMES), lambda: None)
+        pair = mapping._first_pair(mapping._mapper([]), 1)
+        assert pair is not None
+        found.add(tuple(sorted(pair.reg_image_ids())))
+    assert len(found) == 1
