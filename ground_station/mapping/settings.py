@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ground_station.features.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 from pi_firmware.wire import config
 
@@ -66,8 +67,13 @@ class MatchSettings:
         high=1000,
     )
     similar: int = config.key(
-        8, "above that: and with so many that look like it", unit="images", low=0, high=1000
-    )
+        8, "above that: and with so many that look like it, of RootSIFT", unit="images", low=0,
+        high=1000,
+    )  # fmt: skip
+    similar_others: int = config.key(
+        20, "the same of other features, whose key points are less exact: more pairs to average",
+        unit="images", low=0, high=1000,
+    )  # fmt: skip
     covisible: int = config.key(
         4,
         "above that: and with so many that share strong links with it, but were not compared",
@@ -106,6 +112,12 @@ class MatchSettings:
     min_inlier_ratio: float = config.key(
         0.4, "verified matches over all, of a pair far apart in time", low=0.0, high=1.0
     )
+
+    def of(self, features: str) -> MatchSettings:
+        """These settings for features of that name: of all but RootSIFT what `_others` say."""
+        if features == RootSift.name:
+            return self
+        return replace(self, ratio=self.ratio_others, similar=self.similar_others)
 
 
 @dataclass(frozen=True)

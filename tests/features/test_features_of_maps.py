@@ -74,14 +74,20 @@ def test_a_map_is_built_with_a_model_by_name_on_several_threads(bird):
         assert np.array_equal(features.keypoints_px, alone.extract(picture).keypoints_px)
 
 
-def test_lowes_ratio_is_rootsifts_and_other_features_have_their_own(bird, monkeypatch):
-    ratios = []
+def test_ratio_and_pairs_are_rootsifts_and_other_features_have_their_own(bird, monkeypatch):
+    ratios, similar = [], []
+    choose = verification.choice.choose_pairs
+
+    def chosen(descriptors, settings, *others):
+        similar.append(settings.similar)
+        return choose(descriptors, settings, *others)
 
     def matches(first, second, ratio):
         ratios.append(ratio)
         return np.empty((0, 2), np.int32)
 
     monkeypatch.setattr(verification, "mutual_matches", matches)
+    monkeypatch.setattr(verification.choice, "choose_pairs", chosen)
     rng = np.random.default_rng(0)
     camera = replace(THESIS_CAMERA, width_px=96, height_px=64)
     pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(2)]
@@ -91,4 +97,6 @@ def test_lowes_ratio_is_rootsifts_and_other_features_have_their_own(bird, monkey
         found = images.extract(frames, camera, settings, 1, 2)
         with pytest.raises(MapError, match="no two of the 2 images overlap"):
             verification.match(found, camera, settings, 1)
-    assert ratios == [settings.match.ratio, settings.match.ratio_others] == [0.8, 0.95]
+    wanted = settings.match
+    assert ratios == [wanted.ratio, wanted.ratio_others] == [0.8, 0.95]
+    assert similar == [wanted.similar, wanted.similar_others] == [8, 20]

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import MapError
-from ground_station.features.rootsift import RootSift
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
 from ground_station.mapping.construction import pairs as choice
@@ -44,14 +43,13 @@ class Rules:
 
 def rules_of(settings: MappingSettings, far: bool) -> Rules:
     """The settings' rules for neighbours in time, or for images far apart."""
-    wanted = settings.match
     # Lowe's 0.8 is for SIFT. Of ALIKE's matches in the sample's mapping flight it leaves a third:
     # 47 verified pairs of 32 pictures, where 0.95 leaves 111.
-    ratio = wanted.ratio if settings.features == RootSift.name else wanted.ratio_others
+    wanted = settings.match.of(settings.features)
     if not far:
-        return Rules(ratio, wanted.error_px, wanted.planar_ratio, wanted.min_inliers)
+        return Rules(wanted.ratio, wanted.error_px, wanted.planar_ratio, wanted.min_inliers)
     return Rules(
-        ratio,
+        wanted.ratio,
         wanted.error_px,
         wanted.planar_ratio,
         wanted.min_inliers_far,
@@ -77,15 +75,16 @@ def match(
     """
     descriptors = [features.descriptors for features in images.features]
     sequence = choice.sequences(images.names, images.time_ns)
-    chosen = choice.choose_pairs(descriptors, settings.match, settings.seed, sequence)
+    wanted = settings.match.of(settings.features)
+    chosen = choice.choose_pairs(descriptors, wanted, settings.seed, sequence)
     workers = workers or Threads(threads)
     sides = list(zip(descriptors, images.pinhole_px, strict=True))
     with workers.shared(sides) as shared:
         run = _Comparison(images, shared, camera, settings, sequence, cache, workers)
         verified = run.compare(chosen, "matching, pairs")
-        if settings.match.covisible and not choice.is_exhaustive(len(descriptors), settings.match):
+        if wanted.covisible and not choice.is_exhaustive(len(descriptors), wanted):
             linked = {pair: len(view.matches) for pair, view in verified.items()}
-            more = choice.covisible_pairs(len(descriptors), chosen, linked, settings.match)
+            more = choice.covisible_pairs(len(descriptors), chosen, linked, wanted)
             verified |= run.compare(more, "matching, pairs seen together")
     if cache:
         cache.flush()

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from ground_station.features.rootsift import RootSift
 from ground_station.mapping.construction.matching import mutual_matches, verify
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.extension.frames import Frames
@@ -77,14 +76,13 @@ def match_frames(
     threads: int,
 ) -> list[tuple[Pair, I32]]:
     """Matches (N, 2) of the pairs that share a geometry, verified as in a build."""
-    match, matrix = settings.match, info.camera.matrix
-    ratio = match.ratio if info.features == RootSift.name else match.ratio_others
+    match, matrix = settings.match.of(info.features), info.camera.matrix
     pixels = [frames.pixel_px[a:b] for a, b in itertools.pairwise(frames.offset.tolist())]
 
     def one(pair: Pair) -> tuple[Pair, I32 | None]:
         i, j = pair
         matches = mutual_matches(
-            frames.features[i].descriptors, frames.features[j].descriptors, ratio
+            frames.features[i].descriptors, frames.features[j].descriptors, match.ratio
         )
         if len(matches) < match.min_inliers:
             return pair, None

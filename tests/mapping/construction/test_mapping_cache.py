@@ -291,6 +291,7 @@ def _with(**changes):
         ({"match__similar": 5}, [False, False, False]),
         ({"match__covisible": 5}, [False, False, False]),
         ({"match__ratio_others": 0.9}, [False, False, False]),
+        ({"match__similar_others": 5}, [False, False, False]),
         ({"learned__threshold": 0.1}, [False, False, False]),
         ({"sfm__min_track": 4}, [False, False, False]),
         ({"seed": 5}, [False, False, False]),
