@@ -120,6 +120,7 @@ class Payload:
             raise
         if self.cut_reason:
             announce(messages.EVENT_SOURCE_CUT, self.cut_reason)
+        self._battery.stop()  # what ended the flight is told before its end
         name = messages.EVENT_STOPPED if stop.is_set() else messages.EVENT_END_OF_STREAM
         announce(name, str(self.counters))
 

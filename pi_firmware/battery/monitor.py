@@ -71,7 +71,12 @@ class Monitor:
             self._thread.start()
 
     def stop(self) -> None:
-        """Ends the thread and releases the gauge; waits no longer than a hung bus is worth."""
+        """Ends the thread and releases the gauge; waits no longer than a hung bus is worth.
+
+        A second call does nothing: a thread that hangs keeps its gauge.
+        """
+        if self._end.is_set():
+            return
         self._end.set()
         thread, self._thread = self._thread, None
         if thread is None:

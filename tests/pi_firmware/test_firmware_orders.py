@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from flying import ALL_FRAMES, Flying, numbers
 
 from ground_station.stream import commands
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware import settings
+from pi_firmware.payload import Payload
+from pi_firmware.recording import Recorder
 from pi_firmware.wire import messages
 from pi_firmware.wire.recording import RecordingReader
 
@@ -159,3 +165,35 @@ def test_a_critical_battery_ends_recording_and_flight_and_then_the_board(
     (path,) = card.glob("*.mcap")
     reader = RecordingReader(path)
     assert list(reader.video()) and not reader.cut
+
+
+def test_what_ended_the_flight_is_told_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = Recorder.close
+
+    def slowly(recorder: Recorder) -> None:
+        time.sleep(1.0)  # a card that takes its time, longer than the encoder takes to end
+        closed(recorder)
+
+    monkeypatch.setattr(Recorder, "close", slowly)
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+        payload = Payload(
+            settings.load(
+                None,
+                [
+                    "camera.uri=test:",
+                    f"telemetry.connect={json.dumps(listener.endpoints)}",
+                    "battery.uri=i2c:ina219@fake:0x40?percentage=0.02",
+                    "battery.period_s=0.1",
+                    "battery.shutdown_command=[]",
+                ],
+            )
+        )
+        try:
+            payload.run(threading.Event())
+        finally:
+            payload.close()
+        ended = messages.EVENT_STOPPED
+        state = listener.wait("blimp-1", lambda s: any(e.name == ended for e in s.events), LIMIT_S)
+    assert state is not None
+    names = [event.name for event in state.events]
+    assert names.index(messages.EVENT_BATTERY_CRITICAL) < names.index(ended)
