@@ -18,7 +18,7 @@ from ground_station.experiments.declaration import (
     MapSpec,
     changed,
 )
-from ground_station.experiments.material import file_name
+from ground_station.experiments.flights import file_name
 from ground_station.experiments.program import code_sha256
 from ground_station.features import extractors
 from ground_station.localization.settings import LocalizerSettings, load_preset

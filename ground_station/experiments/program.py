@@ -10,10 +10,12 @@ from pathlib import Path
 _ROOT = Path(__file__).resolve().parents[1]
 
 ROOMS = {
-    "flight": ("simulator", "geometry"),
-    "map": ("mapping", "features", "geometry", "recording"),
-    "run": ("experiments/measure.py", "experiments/alter.py", "localization", "mapping/store.py",
-            "mapping/descriptors.py", "mapping/compression", "features", "geometry", "recording"),
+    "flight": ("experiments/flights.py", "simulator", "geometry"),
+    "map": ("experiments/maps.py", "experiments/material.py", "mapping", "features", "geometry",
+            "recording"),
+    "run": ("experiments/measure.py", "experiments/alter.py", "experiments/material.py",
+            "evaluation/ate.py", "localization", "mapping/store.py", "mapping/descriptors.py",
+            "mapping/compression", "features", "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""
 

@@ -39,7 +39,7 @@ def work(job: Job, folder: Path, data: Path) -> None:
 
 
 def _fly(job: FlightJob, store: Store) -> None:
-    from ground_station.experiments.material import fly
+    from ground_station.experiments.flights import fly
 
     path = store.flight(job.name)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,7 +47,7 @@ def _fly(job: FlightJob, store: Store) -> None:
 
 
 def _build(job: MapJob, store: Store, data: Path) -> None:
-    from ground_station.experiments.material import build, moved
+    from ground_station.experiments.maps import build, moved
 
     folder = store.map(job.key)
     part = folder.with_name(f"{folder.name}.making")

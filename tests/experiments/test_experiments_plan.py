@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from ground_station.errors import InputError
 from ground_station.experiments import declaration, plan, program
+from ground_station.experiments.maps import evenly
 from ground_station.experiments.plan import FlightJob, MapJob, RunJob
 from ground_station.mapping.settings import MappingSettings
 
@@ -109,3 +111,18 @@ def test_comments_and_docstrings_do_not_make_another_program():
     other = program._meaning("def f(a):\n    return a + 2\n")
     assert plain == told != other
     assert len({program.code_sha256(kind) for kind in program.ROOMS}) == 3
+
+
+@pytest.mark.parametrize("total", [600, 500, 250, 138, 137])
+def test_a_map_has_the_images_asked_for_from_the_first_to_the_last(total):
+    chosen = sorted(evenly(total, 137))
+    assert len(chosen) == 137 and chosen[0] == 0 and chosen[-1] == total - 1
+    steps = {b - a for a, b in pairwise(chosen)}
+    assert max(steps) - min(steps) <= 1
+    assert evenly(total, 0) == evenly(total, total + 1) == set(range(total))
+    assert evenly(total, 1) == {0}
+
+
+def test_rooms_of_the_program_are_there():
+    for room in {room for rooms in program.ROOMS.values() for room in rooms}:
+        assert (program._ROOT / room).exists(), room

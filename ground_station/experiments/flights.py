@@ -1,0 +1,36 @@
+"""Simulated flights, each made once and kept under a name that tells it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ground_station.experiments.declaration import Flight
+from ground_station.simulator.simulate import SimulationSettings, simulate
+
+
+def file_name(flight: Flight, seed: int) -> str:
+    """What a simulated flight's recording is called: all that it depends on but the program."""
+    rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
+    air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
+    return (
+        f"{flight.scene}-{flight.plan}-{flight.light}-{seed}"
+        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}.mcap"
+    )
+
+
+def fly(flight: Flight, seed: int, path: Path) -> None:
+    """Simulates a flight into a recording, written whole or not at all."""
+    settings = SimulationSettings(
+        out=path,
+        scene=flight.scene,
+        plan=flight.plan,
+        light=flight.light,
+        seed=seed,
+        duration_s=flight.duration_s,
+        rate_hz=flight.rate_hz,
+        bitrate_kbps=flight.bitrate_kbps or None,
+        draught_m_s=flight.draught_m_s,
+    )
+    if simulate(settings).interrupted:
+        path.unlink(missing_ok=True)
+        raise KeyboardInterrupt
