@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Flies, maps, localizes, reports; 1 where the default is not better in some row.
+    """Flies, maps, localizes, reports; 1 where the default is not better, or a claim not kept.
 
     Raises `BlimpError` for what a person can mend. Real video that is not there is left out with
     a line, unless it was asked for by name.
@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ground_station.errors import InputError
     from ground_station.experiments import (
+        claims,
         declaration,
         plan,
         readme,
@@ -89,5 +90,8 @@ def run(args: argparse.Namespace) -> int:
         print(tables.text(experiment), end="\n\n")
     print(report.conditions(document))
     print(tables.verdict(document))
+    for claim in document["claims"]:
+        if claim["kept"] is not False:  # the others stand in the verdict
+            print(claims.line(claim))
     print(f"{args.out / 'report.html'}\n{args.out / 'results.json'}\n{args.out / 'results.md'}")
-    return 1 if document["worse"] else 0
+    return 0 if report.good(document) else 1

@@ -16,6 +16,9 @@ SHIPPED = Path(__file__).with_name("experiments.toml")
 PRESETS = ("thesis", "default")
 """Both localize the same frames, in this order of columns."""
 
+FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "gap_s")
+"""Of a run, one number each, that are averaged over the seeds."""
+
 T = TypeVar("T")
 Table = Mapping[str, Any]
 
@@ -90,6 +93,32 @@ class Figures:
 
 
 @dataclass(frozen=True)
+class Times:
+    """What the thesis printed of a frame's time, seconds, in words: over several maps, on a GPU."""
+
+    features: str = config.key("", "extraction")
+    projection: str = config.key("", "of landmarks")
+    association: str = config.key("", "by pixel and descriptor")
+    pose: str = config.key("", "the factor graph")
+    total: str = config.key("", "in all")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What this project says of a row's figure: at most `most`, or so many times another row's."""
+
+    text: str = config.key("", "as shown")
+    row: str = config.key("", "EXPERIMENT.CASE that it is about")
+    preset: str = config.key("default", "of the localizer", choices=PRESETS)
+    figure: str = config.key("position_m", "of the row", choices=FIGURES)
+    statistic: str = config.key("mean", "over the seeds", choices=("mean", "max"))
+    against: str = config.key(
+        "", "EXPERIMENT.CASE whose figure is the unit; none: the figure's own"
+    )
+    most: float = config.key(0.0, "bound", low=0.0)
+
+
+@dataclass(frozen=True)
 class Case:
     """One row: a map, a flight and settings; both presets localize it, once for each seed."""
 
@@ -113,15 +142,17 @@ class Experiment:
     question: str
     thesis: str
     level: str
+    times: Times
     cases: list[Case] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """All experiments, and the seeds of their flights."""
+    """All experiments, the seeds of their flights, and what is claimed of those that are wanted."""
 
     seeds: tuple[int, ...]
     experiments: list[Experiment]
+    claims: list[Claim] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -131,6 +162,7 @@ class _Row:
     title: str = config.key("", "as shown")
     question: str = config.key("", "what is asked")
     thesis_source: str = config.key("", "where the thesis has its figures")
+    thesis_times: Times = config.table(Times)
     level: str = config.key("", "what the cases vary")
     presets: list[str] = config.key(list(PRESETS), "which of the localizer's", choices=None)
     map: MapSpec = config.table(MapSpec)
@@ -147,8 +179,9 @@ def load(path: str | Path = SHIPPED, only: list[str] | None = None) -> Declarati
     """
     document = config.read(path)
     where = str(path)
-    for key in sorted(set(document) - {"seeds", "default", "experiment"}):
-        raise ConfigError(f"{where}: unknown key '{key}' (known here: seeds, default, experiment)")
+    for key in sorted(set(document) - _TOP):
+        known = ", ".join(sorted(_TOP))
+        raise ConfigError(f"{where}: unknown key '{key}' (known here: {known})")
     seeds = document.get("seeds", [1, 2, 3, 4, 5])
     if not (
         isinstance(seeds, list)
@@ -164,9 +197,29 @@ def load(path: str | Path = SHIPPED, only: list[str] | None = None) -> Declarati
             known = ", ".join(declared)
             raise InputError(f"there is no experiment '{name:.60}' (there are: {known})")
     default = _table(document, "default", where)
-    return Declaration(
-        tuple(seeds), [_experiment(name, declared[name], default, where) for name in names]
-    )
+    experiments = [_experiment(name, declared[name], default, where) for name in names]
+    claims = _claims(_table(document, "claim", where), declared, where)
+    return Declaration(tuple(seeds), experiments, claims)
+
+
+_TOP = {"seeds", "default", "experiment", "claim"}
+
+
+def _claims(tables: Table, declared: Table, where: str) -> list[Claim]:
+    """Claims in the order of the file; raises `ConfigError` for one of a row that is not there."""
+    found = []
+    for name, table in tables.items():
+        at = f"{where}: claim '{name}'"
+        if not isinstance(table, Mapping):
+            raise ConfigError(f"{at} must be a table")
+        claim = config.from_mapping(table, Claim, where=at)
+        for key, row in (("row", claim.row), ("against", claim.against)):
+            experiment, _, case = row.partition(".")
+            known = case in _table(_table(declared, experiment, where), "case", where)
+            if (row or key == "row") and not known:
+                raise ConfigError(f"{at}: '{key}' names '{row:.60}', and there is no such row")
+        found.append(claim)
+    return found
 
 
 def without_missing(declared: Declaration, data: Path) -> tuple[Declaration, list[str]]:
@@ -194,7 +247,9 @@ def _experiment(name: str, table: Any, default: Table, where: str) -> Experiment
     own = {key: value for key, value in table.items() if key != "case"}
     base = merged(default, own)
     head = config.from_mapping(_without_localizer(base), _Row, where=where)
-    experiment = Experiment(name, head.title or name, head.question, head.thesis_source, head.level)
+    experiment = Experiment(
+        name, head.title or name, head.question, head.thesis_source, head.level, head.thesis_times
+    )
     for case, changes in cases.items():
         if not isinstance(changes, Mapping):
             raise ConfigError(f"{where}, case '{case}' must be a table")

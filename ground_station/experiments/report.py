@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ground_station.experiments import pictures, tables
+from ground_station.experiments import claims, pictures, tables
 from ground_station.files import write_json, write_text
 from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
@@ -29,7 +29,7 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
     experiments = [
         {
             "head": e,
-            "table": tables.table(e),
+            "tables": [table for table in (tables.table(e), tables.times(e)) if table],
             "pictures": _pictures(e, plan),
             "settings": [_setting(case) for case in e["cases"]],
             "failed": [
@@ -46,7 +46,8 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
         _TEMPLATE,
         title="The experiments of the thesis, flown again",
         verdict=tables.verdict(document),
-        good=not document["worse"],
+        good=good(document),
+        claims=[claims.line(claim) for claim in document["claims"]],
         document=document,
         experiments=experiments,
         printed=PRINTED,
@@ -57,11 +58,22 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
 def markdown(document: dict[str, Any]) -> str:
     """All tables, after the verdict."""
     parts = [tables.verdict(document), conditions(document), PRINTED]
+    parts += ["\n".join(f"- {claims.line(claim)}" for claim in document["claims"])]
     for experiment in document["experiments"]:
         title = f"### {experiment['title']}"
         question = experiment["question"]
-        parts += [title + (f"\n\n{question}" if question else ""), tables.markdown(experiment)]
-    return "\n\n".join(part.strip("\n") for part in parts) + "\n"
+        parts += [
+            title + (f"\n\n{question}" if question else ""),
+            tables.markdown(tables.table(experiment)),
+        ]
+        if where_time_went := tables.times(experiment):
+            parts.append(tables.markdown(where_time_went))
+    return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
+
+
+def good(document: dict[str, Any]) -> bool:
+    """Whether the default is the better one in all rows and no claim is broken."""
+    return not document["worse"] and all(c["kept"] is not False for c in document["claims"])
 
 
 def conditions(document: dict[str, Any]) -> str:

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.experiments.declaration import Case, Declaration
+from ground_station.experiments import claims
+from ground_station.experiments.declaration import FIGURES, Case, Declaration
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
 
-FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s")
-"""Of a run, one number each, that are averaged over the seeds."""
 _COVERAGE = 0.005
 """A smaller share localized by more than this is worse."""
 
@@ -32,6 +31,7 @@ def summarise(
                 "title": experiment.title,
                 "question": experiment.question,
                 "thesis_source": experiment.thesis,
+                "thesis_times": asdict(experiment.times),
                 "level": experiment.level,
                 "cases": cases,
             }
@@ -43,12 +43,17 @@ def summarise(
         for reason in c["worse"]
     ]
     flown = declaration.seeds[:1] if about["quick"] else declaration.seeds
-    return about | {"seeds": list(flown), "worse": worse, "experiments": experiments}
+    return about | {
+        "seeds": list(flown),
+        "worse": worse,
+        "claims": claims.judge(declaration.claims, experiments),
+        "experiments": experiments,
+    }
 
 
 def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
     found = {
-        preset: [(store.read(key) or {"failed": "not measured"}) for key in keys]
+        preset: [_told(store.read(key), case) for key in keys]
         for preset, keys in plan.runs[case.experiment, case.name].items()
     }
     presets = {preset: aggregate(runs) for preset, runs in found.items()}
@@ -64,6 +69,21 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         "presets": presets,
         "worse": worse(presets),
     }
+
+
+def _told(run: dict[str, Any] | None, case: Case) -> dict[str, Any]:
+    """A run with the longest time without a pose, its ends included; or that it was not measured.
+
+    With a gap as long as the flight where no frame was localized.
+    """
+    if run is None:
+        return {"failed": claims.NOT_MEASURED}
+    if "failed" in run:
+        return run
+    length_s = run["frames"] * case.alter.every / case.flight.rate_hz
+    times_s = (run.get("series") or {}).get("time_s") or []
+    gap_s = np.max(np.diff([0.0, *times_s, max([length_s, *times_s])]))
+    return run | {"gap_s": float(gap_s)}
 
 
 def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -102,21 +122,23 @@ def statistics(values: Sequence[float | None]) -> dict[str, float | int] | None:
 
 
 def _common(found: dict[str, list[dict[str, Any]]], presets: dict[str, Any]) -> None:
-    """Adds `common_m`: the error over the frames that both presets localized, seed by seed.
+    """Adds `common_m` and `common_deg`: errors over the frames that both presets localized.
 
     A localizer that gives up when it gets hard has the smaller error over its own frames.
     """
     if set(found) != {"thesis", "default"}:
         return
-    values: dict[str, list[float | None]] = {preset: [] for preset in found}
-    for pair in zip(*found.values(), strict=True):
-        series = [run.get("series") or {"time_s": [], "position_m": []} for run in pair]
-        both = set(series[0]["time_s"]) & set(series[1]["time_s"])
-        for preset, one in zip(found, series, strict=True):
-            errors = [e for t, e in zip(one["time_s"], one["position_m"], strict=True) if t in both]
-            values[preset].append(float(np.sqrt(np.mean(np.square(errors)))) if errors else None)
-    for preset in found:
-        presets[preset]["common_m"] = statistics(values[preset])
+    for key, name in (("common_m", "position_m"), ("common_deg", "rotation_deg")):
+        values: dict[str, list[float | None]] = {preset: [] for preset in found}
+        for pair in zip(*found.values(), strict=True):
+            series = [run.get("series") or {"time_s": [], name: []} for run in pair]
+            both = set(series[0]["time_s"]) & set(series[1]["time_s"])
+            for preset, one in zip(found, series, strict=True):
+                errors = [e for t, e in zip(one["time_s"], one[name], strict=True) if t in both]
+                rmse = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
+                values[preset].append(rmse)
+        for preset in found:
+            presets[preset][key] = statistics(values[preset])
 
 
 def worse(presets: dict[str, Any]) -> list[str]:
@@ -134,10 +156,10 @@ def worse(presets: dict[str, Any]) -> list[str]:
         )
     for name, common, unit, factor in (
         ("position_m", "common_m", "cm", 100.0),
-        ("rotation_deg", None, "°", 1.0),
+        ("rotation_deg", "common_deg", "°", 1.0),
     ):
         # Over the frames of both, where that can be said: over its own, who gives up looks good.
-        key = common if common and ours.get(common) and theirs.get(common) else name
+        key = common if ours.get(common) and theirs.get(common) else name
         a, b = ours.get(key), theirs.get(key)
         if b is not None and (a is None or not a["mean"] < b["mean"]):
             told = "none" if a is None else f"{factor * a['mean']:.2f} {unit}"

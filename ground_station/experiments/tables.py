@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from ground_station.experiments import claims
 from ground_station.presentation.text import columns
 
 NONE = "–"
@@ -38,21 +39,41 @@ def table(experiment: dict[str, Any]) -> list[list[str]]:
     return [[line[k] for k in used] for line in lines]
 
 
-def markdown(experiment: dict[str, Any]) -> str:
-    """The table in Markdown, under its title."""
-    head, *rows = [[escaped(cell) for cell in line] for line in table(experiment)]
+def times(experiment: dict[str, Any]) -> list[list[str]]:
+    """Head and rows of where a frame's time went, beside what the thesis printed; [] if nothing."""
+    printed = experiment["thesis_times"]
+    if not any(printed.values()):
+        return []
+    runs = [
+        (f"{case['title']}, {name}", case["presets"].get(preset, {}).get("stage_s", {}))
+        for case in experiment["cases"]
+        for preset, name in NAMES.items()
+    ]
+    head = ["median of a frame, s", "thesis's own*", *(title for title, _ in runs)]
+    rows = [
+        [stage, text or NONE, *(f"{of[stage]:.4f}" if stage in of else NONE for _, of in runs)]
+        for stage, text in printed.items()
+    ]
+    return [head, *rows]
+
+
+def markdown(table: list[list[str]]) -> str:
+    """A table in Markdown."""
+    head, *rows = [[escaped(cell) for cell in line] for line in table]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     lines += [f"| {' | '.join(row)} |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
 def text(experiment: dict[str, Any]) -> str:
-    """The table for a console."""
-    return "\n".join([experiment["title"], *("  " + line for line in columns(table(experiment)))])
+    """The tables for a console."""
+    found = [one for one in (table(experiment), times(experiment)) if one]
+    lines = ["  " + line for one in found for line in columns(one)]
+    return "\n".join([experiment["title"], *lines])
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """The first paragraph: where the default is not the better one, or that there is no such row.
+    """The first paragraph: where the default is not the better one, and claims that are not kept.
 
     Rows that were not compared are counted, so that silence says nothing.
     """
@@ -60,18 +81,21 @@ def verdict(document: dict[str, Any]) -> str:
     compared = [case for case in cases if set(case["presets"]) == set(NAMES)]
     not_better = [case for case in compared if case["worse"]]
     others = len(cases) - len(compared)
-    alone = f" {others} more rows have one preset only." if others else ""
     if not compared:
-        return f"Nothing was compared.{alone}"
-    if not not_better:
-        return (
+        said = "Nothing was compared."
+    elif not not_better:
+        said = (
             f"In all {len(compared)} rows the default is better than the preset thesis in position "
-            f"and rotation, and localizes no smaller share of the frames.{alone}"
+            "and rotation, and localizes no smaller share of the frames."
         )
-    return (
-        f"In {len(not_better)} of {len(compared)} rows the default is not better than the preset "
-        f"thesis: {'; '.join(document['worse'])}.{alone}"
-    )
+    else:
+        said = (
+            f"In {len(not_better)} of {len(compared)} rows the default is not better than the "
+            f"preset thesis: {'; '.join(document['worse'])}."
+        )
+    alone = [f"{others} more rows have one preset only."] if others else []
+    broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
+    return " ".join([said, *alone, *broken])
 
 
 def escaped(cell: str) -> str:

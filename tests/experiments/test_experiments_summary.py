@@ -57,8 +57,9 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
     assert case["presets"]["thesis"]["common_m"]["mean"] == pytest.approx(0.02)
     assert case["presets"]["default"]["common_m"]["mean"] == pytest.approx(0.01)
     assert case["presets"]["thesis"]["localized"] == 0.5
-    # Of the rotation nothing is known frame by frame in common, and it is said.
-    assert [reason.split()[0] for reason in case["worse"]] == ["rotation"]
+    assert case["presets"]["thesis"]["common_deg"]["mean"] == pytest.approx(0.2)
+    assert case["presets"]["default"]["common_deg"]["mean"] == pytest.approx(0.1)
+    assert case["worse"] == []
 
 
 @pytest.mark.parametrize(
@@ -120,3 +121,25 @@ def test_the_page_holds_all_it_shows_and_escapes_names(tmp_path):
     assert "http" not in page.replace("http-equiv", "")
     assert "Light &lt;b&gt;" in page and "<b>" not in page
     assert json.loads((tmp_path / "out" / "results.json").read_text())["seeds"] == [1, 2]
+
+
+def test_the_longest_time_without_a_pose_counts_the_flight_s_ends(tmp_path):
+    # 45 frames at the 15 Hz of an atrium's flight: three seconds; poses from 0.1 s on, till 0.3 s.
+    run = kept_runs.run([None, 0.1, None, 0.1, *[None] * 41])
+    lost = kept_runs.run([None] * 45)
+    found = document(tmp_path, {"thesis": [lost, lost], "default": [run, run]})
+    presets = found["experiments"][0]["cases"][0]["presets"]
+    assert presets["default"]["gap_s"]["max"] == pytest.approx(2.7)
+    assert presets["thesis"]["gap_s"]["max"] == pytest.approx(3.0)
+
+
+def test_times_stand_beside_the_thesis_s_words_for_them(tmp_path):
+    runs = {"thesis": [kept_runs.run([0.1])] * 2, "default": [kept_runs.run([0.01])] * 2}
+    plain = document(tmp_path, runs)["experiments"][0]
+    assert tables.times(plain) == [] and "median of a frame" not in tables.text(plain)
+    told = plain | {"thesis_times": plain["thesis_times"] | {"total": "0.261, 0.256"}}
+    head, *rows = tables.times(told)
+    assert head == ["median of a frame, s", "thesis's own*", "noon, preset thesis", "noon, default"]
+    assert rows[0] == ["features", "–", "0.0200", "0.0200"]
+    assert rows[-1] == ["total", "0.261, 0.256", "0.0500", "0.0500"]
+    assert "0.261, 0.256" in tables.text(told)

@@ -1,0 +1,115 @@
+"""What the project says of itself is held against figures, and a broken claim is said first."""
+
+from __future__ import annotations
+
+import kept_runs
+import pytest
+
+from ground_station.experiments import claims, declaration, report, summary, tables
+from ground_station.experiments.plan import Plan
+from ground_station.experiments.store import Store
+from pi_firmware.wire.errors import ConfigError
+
+FLIGHTS = """seeds = [1, 2]
+[experiment.light]
+[experiment.light.case.noon]
+[experiment.light.case.sunset]
+[claim.c]
+text = "Sunset is no worse"
+row = "light.sunset"
+"""
+POSITION = "most = 0.05"
+RATIO = 'against = "light.noon"\nmost = 2.0'
+NOON, SUNSET = [0.01] * 4, [0.03] * 4
+
+
+def document(tmp_path, claim, sunset, noon=None):
+    """Of two rows, of whose default two seeds have those runs; the thesis's were worse."""
+    path = tmp_path / "e.toml"
+    path.write_text(f"{FLIGHTS}{claim}\n")
+    declared, store, runs = declaration.load(path), Store(tmp_path / "store"), {}
+    noon = [kept_runs.run(NOON)] * 2 if noon is None else noon
+    theirs = [kept_runs.run([0.4] * 4)] * 2
+    for case, ours in (("noon", noon), ("sunset", sunset)):
+        runs["light", case] = {}
+        for preset, rows in (("thesis", theirs), ("default", ours)):
+            keys = [f"{case}{preset}{k}" for k in range(len(rows))]
+            runs["light", case][preset] = keys
+            for key, row in zip(keys, rows, strict=True):
+                store.write(key, row)
+    about = {"machine": {"cores": 2}, "jobs": 2, "quick": False}
+    return summary.summarise(declared, Plan({}, {}, runs), store, about)
+
+
+@pytest.mark.parametrize(
+    ("claim", "kept", "told"),
+    [
+        (POSITION, True, "kept, 0.03 m (at most 0.05 m)"),
+        ("most = 0.02", False, "not kept, 0.03 m (at most 0.02 m)"),
+        (RATIO, False, "not kept, 3 times (at most 2 times)"),
+        ('against = "light.noon"\nmost = 4.0', True, "kept, 3 times (at most 4 times)"),
+        ('figure = "rotation_deg"\nmost = 0.2', False, "not kept, 0.3 ° (at most 0.2 °)"),
+        ('preset = "thesis"\nmost = 0.3', False, "not kept, 0.4 m"),
+    ],
+)
+def test_a_claim_is_kept_or_not_by_its_row(tmp_path, claim, kept, told):
+    found = document(tmp_path, claim, [kept_runs.run(SUNSET)] * 2)
+    (one,) = found["claims"]
+    assert one["kept"] is kept and told in claims.line(one)
+    assert report.good(found) is kept
+    assert (told in tables.verdict(found)) is (not kept)
+    assert told in report.markdown(found)
+
+
+def test_a_claim_of_every_seed_falls_with_the_worst(tmp_path):
+    runs = [kept_runs.run([0.01] * 4), kept_runs.run([0.07] * 4)]
+    assert document(tmp_path, POSITION, runs)["claims"][0]["kept"] is True  # 4 cm in the mean
+    worst = document(tmp_path, f'statistic = "max"\n{POSITION}', runs)["claims"][0]
+    assert worst["kept"] is False and worst["value"] == pytest.approx(0.07)
+
+
+def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
+    claim = 'figure = "recovery_s"\nmost = 1.0'
+    found = {"recovery_s": 0.4}
+    runs = [kept_runs.run(SUNSET) | found, kept_runs.run(SUNSET)]
+    (one,) = document(tmp_path, claim, runs)["claims"]
+    assert one["kept"] is False and "no figure in some run" in claims.line(one)
+    runs[1] |= found
+    assert document(tmp_path, claim, runs)["claims"][0]["kept"] is True
+
+
+def test_what_was_not_measured_is_neither_kept_nor_broken(tmp_path):
+    good, failed = kept_runs.run(NOON), {"failed": "no two images overlap"}
+    (one,) = document(tmp_path, POSITION, [good, failed])["claims"]
+    assert one["kept"] is None and claims.line(one).endswith("not measured.")
+    (one,) = document(tmp_path, RATIO, [good, good], noon=[failed, good])["claims"]
+    assert one["kept"] is None
+
+
+def test_claims_of_experiments_that_are_not_wanted_are_left_out():
+    declared = declaration.load(declaration.SHIPPED, ["illumination"])
+    assert {claim.row for claim in declared.claims} > {"illumination.sunset"}
+    experiments = [{"name": "motion", "cases": []}]
+    assert claims.judge(declared.claims, experiments) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('row = "light.dawn"', "'row' names 'light.dawn', and there is no such row"),
+        ('row = "light"', "'row' names 'light', and there is no such row"),
+        ("", "'row' names '', and there is no such row"),
+        ('row = "light.noon"\nagainst = "a.b"', "'against' names 'a.b', and there is no such row"),
+        ('row = "light.noon"\nfigure = "price"', "price"),
+        ('row = "light.noon"\nmost = nan', "most"),
+        ('row = "light.noon"\nmuch = 1', "much"),
+    ],
+)
+def test_a_claim_of_nothing_is_refused_by_name(tmp_path, text, words):
+    path = tmp_path / "e.toml"
+    path.write_text(f"[experiment.light.case.noon]\n[claim.c]\n{text}\n")
+    with pytest.raises(ConfigError, match=words):
+        declaration.load(path)
+    path.write_text("claim.c = 3\n[experiment.light.case.noon]\n")
+    with pytest.raises(ConfigError, match="claim 'c' must be a table"):
+        declaration.load(path)
