@@ -9,7 +9,7 @@ EXAMPLE = """\
 examples:
   blimp experiments                       all of them; stopped and started again it goes on
   blimp experiments illumination motion   some of them
-  blimp experiments --quick               one seed, short flights: to see that all works
+  blimp experiments --quick               one seed, short flights, small maps: to see that all works
   blimp experiments --list
 
 What is flown stands in experiments.toml beside this command's module; --file takes another. Flights
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("names", nargs="*", metavar="NAME", help="experiments (default: all)")
     add("--list", action="store_true", help="say which there are, and nothing else")
     add("--file", type=Path, metavar="TOML", help="experiments (default: the shipped)")
-    add("--quick", action="store_true", help="one seed and short flights")
+    add("--quick", action="store_true", help="one seed, short flights, maps of few images")
     add("--jobs", type=int, default=0, metavar="N", help="side by side (0: one a core)")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR",
         help="folder of real video, redkitchen/ (../shared/data)")  # fmt: skip

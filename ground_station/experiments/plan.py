@@ -23,9 +23,13 @@ from ground_station.experiments.program import code_sha256
 from ground_station.features import extractors
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.mapping.settings import MappingSettings
+from ground_station.recording.frames import FrameRange
+from ground_station.recording.open import parse_range
 
 QUICK_S = 6.0
 """Length of a flight with --quick."""
+QUICK_IMAGES = 137
+"""Most images of a map with --quick, and all that is simulated of its flight."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,8 @@ def make(
 ) -> Plan:
     """The jobs of experiments; raises `ConfigError` or `InputError` before anything is worked.
 
-    `quick`: one seed, short flights. Real pictures have one seed, for they are flown once.
+    `quick`: one seed, short flights, maps of few images. Real pictures have one seed, for they are
+    flown once.
     """
     plan = Plan({}, {}, {})
     for experiment in declaration.experiments:
@@ -103,10 +108,10 @@ def _runs(
 ) -> list[str]:
     where = f"experiment '{case.experiment}', case '{case.name}', preset '{preset}'"
     settings = changed(load_preset(preset), case.localizer, where)
-    map_job = _map(plan, case, mapping, data)
-    flight = case.flight
-    if quick and flight.simulated:
-        flight = replace(flight, duration_s=min(flight.duration_s, QUICK_S))
+    spec, flight = case.map, case.flight
+    if quick:
+        spec, flight = _thinned(spec), _shortened(flight)
+    map_job = _map(plan, spec, mapping, data)
     seeds = declaration.seeds[:1] if quick or not flight.simulated else declaration.seeds
     keys = []
     for seed in seeds:
@@ -132,8 +137,28 @@ def _runs(
     return keys
 
 
-def _map(plan: Plan, case: Case, mapping: MappingSettings, data: Path) -> MapJob:
-    spec, needs, recording = case.map, [], None
+def _shortened(flight: Flight) -> Flight:
+    """Its first seconds; of real pictures as many as that is."""
+    if flight.simulated:
+        return replace(flight, duration_s=min(flight.duration_s, QUICK_S))
+    wanted = parse_range(flight.range) if flight.range else FrameRange()
+    stop = wanted.start + round(QUICK_S * flight.rate_hz) * wanted.step
+    stop = stop if wanted.stop is None else min(stop, wanted.stop)
+    return replace(flight, range=f"{wanted.start}:{stop}:{wanted.step}")
+
+
+def _thinned(spec: MapSpec) -> MapSpec:
+    """Of few images, and none is simulated that is not among them."""
+    if not spec.flight.simulated:
+        return spec
+    images = min(spec.images or QUICK_IMAGES, QUICK_IMAGES)
+    rate_hz = min(spec.flight.rate_hz, images / spec.flight.duration_s)
+    return replace(spec, images=images, flight=replace(spec.flight, rate_hz=rate_hz))
+
+
+def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> MapJob:
+    needs: list[str] = []
+    recording = None
     if spec.flight.simulated:
         flown = _flight(plan, spec.flight, spec.seed)
         recording = flown.name

@@ -11,7 +11,7 @@ from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
-QUICK = "Quick: one seed and short flights, to see that all works."
+QUICK = "Quick: one seed, short flights and maps of few images, to see that all works."
 PRINTED = (
     "* as the thesis printed it: another building, another camera. No ratio is taken against it."
 )
