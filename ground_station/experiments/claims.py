@@ -8,6 +8,8 @@ from typing import Any
 from ground_station.experiments.declaration import Claim
 
 NOT_MEASURED = "not measured"
+_UNITS = {"m": " m", "deg": "°", "s": " s", "95": ""}
+"""By the end of a figure's name."""
 
 
 def judge(claims: Sequence[Claim], experiments: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -27,9 +29,10 @@ def judge(claims: Sequence[Claim], experiments: Sequence[dict[str, Any]]) -> lis
         if None not in values:
             value = values[0] if len(values) == 1 else _ratio(*values)
         measured = not any(_unmeasured(cases[key], claim) for key in named)
-        kept = value is not None and value <= claim.most if measured else None
-        found.append({"text": claim.text, "value": value, "most": claim.most, "kept": kept,
-                      "unit": "times" if claim.against else _unit(claim.figure)})  # fmt: skip
+        kept = value is not None and _within(value, claim) if measured else None
+        unit = " times" if claim.against else _UNITS[claim.figure.rpartition("_")[2]]
+        found.append({"text": claim.text, "value": value, "most": claim.most, "least": claim.least,
+                      "kept": kept, "unit": unit})  # fmt: skip
     return found
 
 
@@ -38,9 +41,10 @@ def line(claim: dict[str, Any]) -> str:
     if claim["kept"] is None:
         return f"{claim['text']}: {NOT_MEASURED}."
     unit = claim["unit"]
-    told = "no figure in some run" if claim["value"] is None else f"{claim['value']:.3g} {unit}"
+    told = "no figure in some run" if claim["value"] is None else f"{claim['value']:.3g}{unit}"
     word = "kept" if claim["kept"] else "not kept"
-    return f"{claim['text']}: {word}, {told} (at most {claim['most']:g} {unit})."
+    side, bound = ("most", claim["most"]) if claim["least"] is None else ("least", claim["least"])
+    return f"{claim['text']}: {word}, {told} (at {side} {bound:g}{unit})."
 
 
 def _key(row: str) -> tuple[str, str]:
@@ -66,5 +70,6 @@ def _unmeasured(case: dict[str, Any], claim: Claim) -> bool:
     return row is None or bool(row["failed"])
 
 
-def _unit(figure: str) -> str:
-    return {"m": "m", "deg": "°", "s": "s"}[figure.rpartition("_")[2]]
+def _within(value: float, claim: Claim) -> bool:
+    above = claim.least is None or value >= claim.least
+    return above and (claim.most is None or value <= claim.most)

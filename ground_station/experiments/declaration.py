@@ -16,7 +16,7 @@ SHIPPED = Path(__file__).with_name("experiments.toml")
 PRESETS = ("thesis", "default")
 """Both localize the same frames, in this order of columns."""
 
-FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "gap_s")
+FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "gap_s", "inside_95")
 """Of a run, one number each, that are averaged over the seeds."""
 
 T = TypeVar("T")
@@ -105,17 +105,21 @@ class Times:
 
 @dataclass(frozen=True)
 class Claim:
-    """What this project says of a row's figure: at most `most`, or so many times another row's."""
+    """What this project says of a row's figure, itself or as a multiple of another row's.
+
+    One bound, `most` or `least`, must be given.
+    """
 
     text: str = config.key("", "as shown")
     row: str = config.key("", "EXPERIMENT.CASE that it is about")
     preset: str = config.key("default", "of the localizer", choices=PRESETS)
     figure: str = config.key("position_m", "of the row", choices=FIGURES)
-    statistic: str = config.key("mean", "over the seeds", choices=("mean", "max"))
+    statistic: str = config.key("mean", "over the seeds", choices=("mean", "min", "max"))
     against: str = config.key(
         "", "EXPERIMENT.CASE whose figure is the unit; none: the figure's own"
     )
-    most: float = config.key(0.0, "bound", low=0.0)
+    most: float | None = config.key(None, "upper bound", low=0.0)
+    least: float | None = config.key(None, "lower bound", low=0.0)
 
 
 @dataclass(frozen=True)
@@ -218,6 +222,8 @@ def _claims(tables: Table, declared: Table, where: str) -> list[Claim]:
             known = case in _table(_table(declared, experiment, where), "case", where)
             if (row or key == "row") and not known:
                 raise ConfigError(f"{at}: '{key}' names '{row:.60}', and there is no such row")
+        if (claim.most is None) == (claim.least is None):
+            raise ConfigError(f"{at}: one of 'most' and 'least' must be given")
         found.append(claim)
     return found
 

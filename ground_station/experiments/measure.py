@@ -38,8 +38,8 @@ def measure(
 ) -> dict[str, Any]:
     """Localizes a flight from its true first pose; plain values for the report.
 
-    `series` has for each localized frame: time (s), position in the world (m), both errors.
-    Errors are of the unaligned poses; None where no frame was localized.
+    `series` has for each localized frame: time since the flight's first frame (s), position in the
+    world (m), both errors. Errors are of the unaligned poses; None where no frame was localized.
     """
     features = replace(settings.features, extractor=OF_THE_MAP)
     settings = replace(settings, features=features)
@@ -47,6 +47,7 @@ def measure(
     localizer = Localizer(map_, camera, extractor_for(map_.info, features), settings)
     lossy = alteration.packet_loss > 0 and flight.recording is not None
     arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
+    start_ns = next(iter(flight.frames)).time_ns
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     for frame in altered(flight.frames, alteration, arrived):
@@ -68,19 +69,18 @@ def measure(
         "keyframes": len(map_.keyframes),
         "stage_s": _stages(estimates),
         "recovery_s": _recovery_s(estimates, flight.truth, alteration),
-        **_errors(estimates, flight.truth),
+        **_errors(estimates, flight.truth, start_ns),
         **_smoothed(smoothed, flight.truth),
     }
 
 
-def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory) -> dict[str, Any]:
+def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory, start_ns: int) -> dict[str, Any]:
     found = _pairs(results.trajectory(estimates), truth)
     nothing = ("position_m", "rotation_deg", "position_zhang_m", "aligned_m", "p95_m")
     if found is None:
         return dict.fromkeys(nothing) | {"series": {}, "consistency": None}
     estimate, true = found
     errors = ate.errors(estimate, true)
-    start_ns = int(truth.time_ns[0])
     return {
         **errors.rmse(),
         "aligned_m": _aligned_m(estimate, true),

@@ -42,17 +42,17 @@ def table_in(readme: str) -> str | None:
 def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
     """Makes a run the one that README shows, and keeps its figures without the single frames.
 
-    Raises `InputError` for a quick run, for one in which something failed or was not measured, and
-    for a README without the markers.
+    A map that could not be built is a result. Raises `InputError` for a quick run, for one in which
+    something was not measured or its process ended, and for a README without the markers.
     """
     if document["quick"]:
         raise InputError("a quick run is not what README shows; run them whole")
     for e in document["experiments"]:
         for case in e["cases"]:
             for preset, row in case["presets"].items():
-                if row["failed"]:
+                if row["accidents"]:
                     raise InputError(
-                        f"{e['title']}, {case['title']}, {preset}: {row['failed'][0]}; "
+                        f"{e['title']}, {case['title']}, {preset}: {row['accidents'][0]}; "
                         "such a run is not accepted"
                     )
     text = readme.read_text()

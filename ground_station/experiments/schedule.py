@@ -96,16 +96,16 @@ def _until_broken(
 def _fail(store: Store, job: Job) -> None:
     if isinstance(job, FlightJob):  # nothing can go on without it
         raise GroundStationError(f"{job.name}: its process ended {_TRIES} times")
-    store.write(job.key, {"failed": f"its process ended {_TRIES} times"})
+    store.write(job.key, {"failed": f"its process ended {_TRIES} times", "accident": True})
 
 
 def _spread_failures(plan: Plan, store: Store, open_: dict[str, Job]) -> None:
     """A run in a map that cannot be built fails for the map's reason, without being tried."""
     for key in list(open_):
         for need in plan.needs[key]:
-            reason = None if need in open_ else store.failure(plan.jobs[need])
-            if reason is not None:
-                store.write(key, {"failed": reason})
+            failure = None if need in open_ else store.failure(plan.jobs[need])
+            if failure is not None:
+                store.write(key, failure)
                 del open_[key]
                 break
 

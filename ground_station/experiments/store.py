@@ -51,9 +51,12 @@ class Store:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, result)
 
-    def failure(self, job: Job) -> str | None:
-        """Why a job gave nothing, None where it gave something or was not tried."""
+    def failure(self, job: Job) -> dict[str, Any] | None:
+        """What is kept of a job that gave nothing, None where it gave something or was not tried.
+
+        `failed` says why; with `accident` it says nothing of the map or the localizer.
+        """
         if isinstance(job, RunJob | MapJob):
-            reason = (self.read(job.key) or {}).get("failed")
-            return None if reason is None else str(reason)
+            kept = self.read(job.key)
+            return kept if kept is not None and "failed" in kept else None
         return None

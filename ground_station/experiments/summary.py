@@ -72,18 +72,20 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
 
 
 def _told(run: dict[str, Any] | None, case: Case) -> dict[str, Any]:
-    """A run with the longest time without a pose, its ends included; or that it was not measured.
+    """A run with what is derived from it; or that it was not measured.
 
-    With a gap as long as the flight where no frame was localized.
+    `gap_s` is the longest time without a pose, the flight's ends included, and its whole length
+    where no frame was localized; `inside_95` the share of poses whose errors fit their covariance.
     """
     if run is None:
-        return {"failed": claims.NOT_MEASURED}
+        return {"failed": claims.NOT_MEASURED, "accident": True}
     if "failed" in run:
         return run
     length_s = run["frames"] * case.alter.every / case.flight.rate_hz
     times_s = (run.get("series") or {}).get("time_s") or []
     gap_s = np.max(np.diff([0.0, *times_s, max([length_s, *times_s])]))
-    return run | {"gap_s": float(gap_s)}
+    inside = (run.get("consistency") or {}).get("inside_95")
+    return run | {"gap_s": float(gap_s), "inside_95": inside}
 
 
 def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -95,7 +97,8 @@ def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     frames = sum(run["frames"] for run in good)
     result: dict[str, Any] = {
         "runs": list(runs),
-        "failed": [run["failed"] for run in runs if "failed" in run],
+        "failed": [str(run["failed"]) for run in runs if "failed" in run],
+        "accidents": [str(run["failed"]) for run in runs if run.get("accident")],
         "localized": sum(run["localized"] for run in good) / frames if frames else None,
         "landmarks": good[0]["landmarks"] if good else None,
         "keyframes": good[0]["keyframes"] if good else None,

@@ -122,7 +122,7 @@ def figures(case: dict[str, Any], preset: str) -> str:
         return NONE
     position = _spread(preset, "position_m", 100.0, " cm")(case)
     if position == NONE:
-        return "no frame localized"
+        return "no map" if case["presets"][preset]["failed"] else "no frame localized"
     rotation = _spread(preset, "rotation_deg", 1.0, "°")(case)
     return f"{position}, {rotation}, {_localized(preset)(case)} localized"
 

@@ -48,8 +48,10 @@ def document(tmp_path, claim, sunset, noon=None):
         ("most = 0.02", False, "not kept, 0.03 m (at most 0.02 m)"),
         (RATIO, False, "not kept, 3 times (at most 2 times)"),
         ('against = "light.noon"\nmost = 4.0', True, "kept, 3 times (at most 4 times)"),
-        ('figure = "rotation_deg"\nmost = 0.2', False, "not kept, 0.3 ° (at most 0.2 °)"),
+        ('figure = "rotation_deg"\nmost = 0.2', False, "not kept, 0.3° (at most 0.2°)"),
         ('preset = "thesis"\nmost = 0.3', False, "not kept, 0.4 m"),
+        ('figure = "inside_95"\nleast = 0.9', True, "kept, 0.95 (at least 0.9)"),
+        ('figure = "inside_95"\nleast = 0.96', False, "not kept, 0.95 (at least 0.96)"),
     ],
 )
 def test_a_claim_is_kept_or_not_by_its_row(tmp_path, claim, kept, told):
@@ -102,6 +104,8 @@ def test_claims_of_experiments_that_are_not_wanted_are_left_out():
         ('row = "light.noon"\nagainst = "a.b"', "'against' names 'a.b', and there is no such row"),
         ('row = "light.noon"\nfigure = "price"', "price"),
         ('row = "light.noon"\nmost = nan', "most"),
+        ('row = "light.noon"', "one of 'most' and 'least' must be given"),
+        ('row = "light.noon"\nmost = 1\nleast = 0', "one of 'most' and 'least' must be given"),
         ('row = "light.noon"\nmuch = 1', "much"),
     ],
 )

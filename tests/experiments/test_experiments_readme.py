@@ -60,10 +60,22 @@ def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_p
     with pytest.raises(InputError, match="quick"):
         readme.accept(document | {"quick": True}, page, accepted)
     broken = json.loads(json.dumps(document))
-    broken["experiments"][0]["cases"][0]["presets"]["default"]["failed"] = ["no map"]
-    with pytest.raises(InputError, match="Light, noon, default: no map"):
+    row = broken["experiments"][0]["cases"][0]["presets"]["default"]
+    row["failed"] = row["accidents"] = ["its process ended 2 times"]
+    with pytest.raises(InputError, match="Light, noon, default: its process ended 2 times"):
         readme.accept(broken, page, accepted)
     assert not accepted.exists()
+
+
+def test_a_map_that_could_not_be_built_is_a_result_and_stands_in_readme(tmp_path, document):
+    page = tmp_path / "README.md"
+    page.write_text(f"{readme.BEGIN}\n{readme.END}\n")
+    row = document["experiments"][0]["cases"][0]["presets"]["default"]
+    row |= {"failed": ["no two images overlap"], "localized": None, "position_m": None}
+    readme.accept(document, page, tmp_path / "accepted.json")
+    assert "| Light: noon | 20.0 cm | 10.00 cm, 1.00°, 100.0 % localized | no map |" in (
+        page.read_text()
+    )
 
 
 def test_readme_shows_the_accepted_run_of_the_shipped_experiments_or_none():

@@ -122,7 +122,10 @@ def test_a_process_that_dies_once_costs_nothing_and_twice_its_own_job(tmp_path):
     assert sorted(done(once)) == ["f", "m", "r0", "r1", "r2"]
     carry_out(a_plan(), Store(twice), twice, 1, dies)
     assert sorted(done(twice)) == ["f", "m", "r0", "r2"]
-    assert Store(twice).read("r1") == {"failed": "its process ended 2 times"}
+    assert Store(twice).read("r1") == {
+        "failed": "its process ended 2 times",
+        "accident": True,
+    }
 
 
 def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):

@@ -292,17 +292,29 @@ def test_a_maps_pose_that_is_no_rigid_motion_is_refused_by_name(rotation):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_numbers_by_chance_give_a_fit_that_admits_it_or_one_line(seed):
+def test_numbers_by_chance_are_refused_with_one_line(seed):
     rng = np.random.default_rng(seed)
     rotation = Rotation.random(30, random_state=seed).as_matrix()
     chance = poses.pose(rotation, rng.normal(size=(30, 3)))
     trajectory = Trajectory.from_poses(np.arange(30) * STEP_NS, chance)
-    try:
-        found = by_trajectory(model_of(walk(), random_similarity(1)), trajectory, 0)
-    except BlimpError as error:
-        assert "\n" not in str(error)
-    else:
-        assert found.report["residual_rms_m"] > 0.3 and found.report["residual_rms_deg"] > 20
+    with pytest.raises(BlimpError) as caught:
+        by_trajectory(model_of(walk(), random_similarity(1)), trajectory, 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_that_is_inside_out_is_refused_and_a_poor_trajectory_is_taken():
+    rng = np.random.default_rng(3)
+    wTc = walk()
+    wTc[:, :3, 3] = rng.normal(size=(len(wTc), 3))
+    map_, middle = model_of(wTc, random_similarity(3)), wTc[:, :3, 3].mean(axis=0)
+    spread_m = np.sqrt(np.mean((wTc[:, :3, 3] - middle) ** 2))
+    poor = by_trajectory(map_, trajectory_of(wTc, sigma_m=0.3 * spread_m), 0)
+    assert poor.report["sigma_m"] == pytest.approx(0.3 * spread_m, rel=0.3)
+    mirrored = wTc.copy()
+    mirrored[:, :3, 3] = 2 * middle - wTc[:, :3, 3]
+    turned = trajectory_of(mirrored, offset=turned_by(175.0))
+    with pytest.raises(MapError, match="the map has not the shape of the trajectory"):
+        by_trajectory(map_, turned, 0)
 
 
 def test_a_zero_quaternion_and_an_empty_trajectory_are_refused():
