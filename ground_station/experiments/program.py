@@ -15,6 +15,7 @@ ROOMS = {
             "recording"),
     "run": ("experiments/measure.py", "experiments/alter.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "mapping/store.py", "mapping/descriptors.py",
+            "mapping/registration/accuracy.py", "mapping/registration/uncertainty.py",
             "mapping/compression", "features", "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""

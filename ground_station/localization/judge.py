@@ -18,7 +18,7 @@ class Evidence:
     """What speaks for or against a solved frame.
 
     `inliers` of `observations`; `spread` of the inliers (RMS over the image's diagonal);
-    `residual_px` the inliers' RMS; `covariance` (6, 6) of the pose as it is published;
+    `residual_px` the inliers' RMS; `covariance` (6, 6) of the pose in the map;
     `innovation` the squared Mahalanobis distance from the prediction, NaN without one; `support_ns`
     the time of the features it rests on: its keyframe's, or its own; `sharpness` against the frames
     before, 0 to 1.

@@ -21,10 +21,16 @@ from ground_station.localization.following import Followed
 from ground_station.localization.judge import Judge
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.matching import Described, Matcher, describe
-from ground_station.localization.publishing import evidence_of, publish, published_covariance
+from ground_station.localization.publishing import (
+    covariance_in_map,
+    covariance_in_world,
+    evidence_of,
+    publish,
+)
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
+from ground_station.mapping.registration.accuracy import accuracy
 from ground_station.mapping.store import Map, check_features
 from pi_firmware.wire.entropy import entropy_bits
 
@@ -42,8 +48,9 @@ class Localizer:
     def __init__(
         self, map_: Map, camera: Camera, extractor: Extractor, settings: LocalizerSettings
     ) -> None:
-        """Raises `MapError` when the map was built with other features than the extractor's."""
+        """Raises `MapError` when the map has other features, or says no numbers of its accuracy."""
         check_features(map_.info, extractor.name, extractor.sha256)
+        self._accuracy = accuracy(map_.info)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
@@ -339,12 +346,12 @@ class Localizer:
         state = believed or solution.state
         assert state is not None
         self._seen = attempt.observations.landmark[solution.inlier]
-        covariance = published_covariance(
-            state.covariance, solution.information, self.settings.covariance
-        )
+        settings = self.settings.covariance
+        in_map = covariance_in_map(state.covariance, solution.information, settings)
         support_ns = followed.support_ns if followed else attempt.time_ns
-        evidence = evidence_of(attempt, solution, covariance, self.camera, support_ns)
+        evidence = evidence_of(attempt, solution, in_map, self.camera, support_ns)
         verdict, reason = self._judge.solved(attempt.time_ns, evidence)
+        covariance = covariance_in_world(in_map, self._accuracy, state.wTc, settings.map)
         return publish(
             attempt, verdict, reason, found=state, covariance=covariance,
             relocalized=relocalized, tracked=followed is not None,

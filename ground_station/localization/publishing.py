@@ -12,14 +12,13 @@ from ground_station.localization.judge import Evidence
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.relocalization import spread
 from ground_station.localization.settings import CovarianceSettings
+from ground_station.mapping.registration.accuracy import Accuracy
 
 Array = npt.NDArray[np.float64]
 
 
-def published_covariance(
-    covariance: Array, information: Array, settings: CovarianceSettings
-) -> Array:
-    """The pose's covariance (6, 6) as it goes out: scaled, and with what frames share added.
+def covariance_in_map(covariance: Array, information: Array, settings: CovarianceSettings) -> Array:
+    """The pose's covariance (6, 6) in the map: scaled, and with what frames share added.
 
     A filter takes the errors of two frames for independent; the errors of the landmarks they both
     see are not. Those move the pose as the sights of one frame alone would: by the inverse of their
@@ -34,6 +33,15 @@ def published_covariance(
     return np.asarray(published)
 
 
+def covariance_in_world(in_map: Array, of_map: Accuracy, wTc: Array, share: float) -> Array:
+    """The pose's covariance (6, 6) as it goes out: in the map, and the map's own in the world.
+
+    The first cannot know how the map is bent and how well it is registered, and the more images a
+    map has, the smaller it is beside that. `share` is of the map's deviations.
+    """
+    return np.asarray(in_map + share**2 * of_map.at(wTc)) if share > 0 else in_map
+
+
 def evidence_of(
     attempt: Attempt,
     solution: Solution,
@@ -43,7 +51,7 @@ def evidence_of(
 ) -> Evidence:
     """What speaks for a solved frame, whose observations the attempt holds.
 
-    `covariance` (6, 6) is the published one.
+    `covariance` (6, 6) is the one in the map, about which alone a localizer can do something.
     """
     seen = attempt.observations
     residual = solution.residual_px[solution.inlier]

@@ -346,6 +346,10 @@ class CovarianceSettings:
         0.0, "share of the deviations by the frame's own sights that all frames have in common",
         low=0, high=10,
     )  # fmt: skip
+    map: float = config.key(
+        0.0, "share of the map's own deviations, by its registration in map.toml, that is added",
+        low=0, high=10,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from ground_station.localization.estimator import FilterEstimator, PoseEstimator
 from ground_station.localization.following import Followed, better, catch_up
 from ground_station.localization.kinematics import no_solution
 from ground_station.localization.matching import Matcher, describe
-from ground_station.localization.publishing import published_covariance
+from ground_station.localization.publishing import covariance_in_map, covariance_in_world
 from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
 from ground_station.localization.tracking import Keyframe
+from ground_station.mapping.registration.accuracy import Accuracy
 
 HERE = np.array([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
 
@@ -191,9 +192,17 @@ def test_what_frames_share_is_added_to_what_is_published():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(12, 12))
     covariance, information = A @ A.T, np.diag(np.arange(1.0, 13.0))
-    plain = published_covariance(covariance, information, CovarianceSettings())
+    plain = covariance_in_map(covariance, information, CovarianceSettings())
     assert np.array_equal(plain, covariance[:6, :6])
-    more = published_covariance(covariance, information, CovarianceSettings(scale=2.0, shared=0.5))
+    more = covariance_in_map(covariance, information, CovarianceSettings(scale=2.0, shared=0.5))
     assert np.allclose(more, 4 * plain + 0.25 * np.diag(1 / np.arange(1.0, 7.0)))
-    singular = published_covariance(covariance, np.zeros((12, 12)), CovarianceSettings(shared=0.5))
+    singular = covariance_in_map(covariance, np.zeros((12, 12)), CovarianceSettings(shared=0.5))
     assert np.isinf(singular).all()
+
+
+def test_the_maps_own_errors_are_added_by_their_share():
+    covariance, wTc = np.diag(np.arange(1.0, 7.0)), np.eye(4)
+    of_map = Accuracy(sigma_rad=0.1, sigma_m=2.0)
+    assert np.array_equal(covariance_in_world(covariance, of_map, wTc, 0.0), covariance)
+    more = covariance_in_world(covariance, of_map, wTc, 0.5)
+    assert np.allclose(more - covariance, np.diag([0.0025] * 3 + [1.0] * 3))

@@ -52,6 +52,25 @@ def test_a_sequence_is_tracked_within_centimetres(room, extractor, preset):
     assert rms[0] < 0.015 and rms[1] < 0.2
 
 
+def test_what_a_map_is_off_is_in_the_covariance_and_degrades_nothing(room, extractor):
+    times, path = room.path(2)
+    seen = room.features(path[0])
+
+    def of(preset, **registration):
+        room.map.info.registration = registration
+        localizer = make(room, extractor, preset)
+        localizer.set_initial_pose(path[0], int(times[0]))
+        return localizer.process_features(int(times[0]), seen)
+
+    plain, bent = of("default"), of("default", sigma_m=0.5, sigma_deg=3.0)
+    more = np.diag([np.radians(3.0) ** 2] * 3 + [0.25] * 3)
+    assert np.allclose(bent.covariance, plain.covariance + more)
+    assert bent.state is plain.state is State.TRACKING  # about a map nothing can be done in flight
+    assert np.array_equal(of("thesis", sigma_m=0.5).covariance, of("thesis").covariance)
+    with pytest.raises(MapError, match="registration: 'sigma_m'"):
+        of("default", sigma_m=[1, 2])
+
+
 def test_the_given_first_pose_is_a_prediction_and_no_result(room, extractor):
     localizer = make(room, extractor)
     times, path = room.path(2)
