@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
         claims,
         declaration,
         plan,
+        quick,
         readme,
         report,
         schedule,
@@ -72,11 +73,13 @@ def run(args: argparse.Namespace) -> int:
         declared, missing = declaration.without_missing(declared, args.data)
         for line in missing:
             print(f"blimp experiments: left out: {line}", file=sys.stderr, flush=True)
+    if args.quick:
+        declared = quick.shortened(declared)
     toml = args.sample / "mapping.toml"
     mapping = load_settings(toml if toml.is_file() else None)
     store = Store(args.out)
     jobs = args.jobs or machine()["cores"]
-    planned = plan.make(declared, mapping, args.data, quick=args.quick)
+    planned = plan.make(declared, mapping, args.data)
     schedule.carry_out(planned, store, args.data, jobs)
     about = {"machine": machine(), "jobs": jobs, "quick": args.quick}
     document = summary.summarise(declared, planned, store, about)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,6 @@ from ground_station.experiments.program import code_sha256
 from ground_station.features import extractors
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.mapping.settings import MappingSettings
-from ground_station.recording.frames import FrameRange
-from ground_station.recording.open import parse_range
-
-QUICK_S = 6.0
-"""Length of a flight with --quick."""
-QUICK_IMAGES = 137
-"""Most images of a map with --quick, and all that is simulated of its flight."""
 
 
 @dataclass(frozen=True)
@@ -79,19 +72,16 @@ class Plan:
     runs: dict[tuple[str, str], dict[str, list[str]]]
 
 
-def make(
-    declaration: Declaration, mapping: MappingSettings, data: Path, *, quick: bool = False
-) -> Plan:
+def make(declaration: Declaration, mapping: MappingSettings, data: Path) -> Plan:
     """The jobs of experiments; raises `ConfigError` or `InputError` before anything is worked.
 
-    `quick`: one seed, short flights, maps of few images. Real pictures have one seed, for they are
-    flown once.
+    Real pictures have one seed, for they are flown once.
     """
     plan = Plan({}, {}, {})
     for experiment in declaration.experiments:
         for case in experiment.cases:
             _check_features(case)
-            mine = {preset: _runs(plan, case, preset, declaration, mapping, data, quick)
+            mine = {preset: _runs(plan, case, preset, declaration, mapping, data)
                     for preset in case.presets}  # fmt: skip
             plan.runs[case.experiment, case.name] = mine
     return plan
@@ -104,15 +94,12 @@ def _runs(
     declaration: Declaration,
     mapping: MappingSettings,
     data: Path,
-    quick: bool,
 ) -> list[str]:
     where = f"experiment '{case.experiment}', case '{case.name}', preset '{preset}'"
     settings = changed(load_preset(preset), case.localizer, where)
     spec, flight = case.map, case.flight
-    if quick:
-        spec, flight = _thinned(spec), _shortened(flight)
     map_job = _map(plan, spec, mapping, data)
-    seeds = declaration.seeds[:1] if quick or not flight.simulated else declaration.seeds
+    seeds = declaration.seeds if flight.simulated else declaration.seeds[:1]
     keys = []
     for seed in seeds:
         needs = [map_job.key]
@@ -135,25 +122,6 @@ def _runs(
              tuple(needs))  # fmt: skip
         keys.append(key)
     return keys
-
-
-def _shortened(flight: Flight) -> Flight:
-    """Its first seconds; of real pictures as many as that is."""
-    if flight.simulated:
-        return replace(flight, duration_s=min(flight.duration_s, QUICK_S))
-    wanted = parse_range(flight.range) if flight.range else FrameRange()
-    stop = wanted.start + round(QUICK_S * flight.rate_hz) * wanted.step
-    stop = stop if wanted.stop is None else min(stop, wanted.stop)
-    return replace(flight, range=f"{wanted.start}:{stop}:{wanted.step}")
-
-
-def _thinned(spec: MapSpec) -> MapSpec:
-    """Of few images, and none is simulated that is not among them."""
-    if not spec.flight.simulated:
-        return spec
-    images = min(spec.images or QUICK_IMAGES, QUICK_IMAGES)
-    rate_hz = min(spec.flight.rate_hz, images / spec.flight.duration_s)
-    return replace(spec, images=images, flight=replace(spec.flight, rate_hz=rate_hz))
 
 
 def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> MapJob:

@@ -6,12 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.experiments import claims, pictures, tables
+from ground_station.experiments.quick import FLIGHT_S, IMAGES
 from ground_station.files import write_json, write_text
 from ground_station.mapping.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
-QUICK = "Quick: one seed, short flights and maps of few images, to see that all works."
+QUICK = (
+    f"Quick: one seed, the flights' first {FLIGHT_S:g} s and maps of at most {IMAGES} images, "
+    "whatever a row is called; to see that all works."
+)
 PRINTED = (
     "* as the thesis printed it: another building, another camera. No ratio is taken against it."
 )

@@ -42,9 +42,8 @@ def summarise(
         for c in e["cases"]
         for reason in c["worse"]
     ]
-    flown = declaration.seeds[:1] if about["quick"] else declaration.seeds
     return about | {
-        "seeds": list(flown),
+        "seeds": list(declaration.seeds),
         "worse": worse,
         "claims": claims.judge(declaration.claims, experiments),
         "experiments": experiments,

@@ -10,7 +10,6 @@ import pytest
 
 from ground_station.errors import InputError
 from ground_station.experiments import declaration, plan, program
-from ground_station.experiments.declaration import Flight
 from ground_station.experiments.maps import evenly
 from ground_station.experiments.plan import FlightJob, MapJob, RunJob
 from ground_station.mapping.settings import MappingSettings
@@ -77,41 +76,6 @@ def test_a_changed_setting_makes_only_what_it_touches_anew(declared):
     assert keys(first, MapJob) == keys(third, MapJob)
     assert keys(first, FlightJob) == keys(third, FlightJob)
     assert not keys(first, RunJob) & keys(third, RunJob)
-
-
-def test_quick_has_one_seed_short_flights_and_maps_of_which_nothing_is_flown_in_vain(declared):
-    (experiment, _) = declared.experiments
-    large = [
-        replace(
-            case,
-            map=replace(case.map, images=513, flight=Flight(duration_s=50.0, rate_hz=12.0)),
-        )
-        for case in experiment.cases
-    ]
-    declared = replace(declared, experiments=[replace(experiment, cases=large)])
-    quick = plan.make(declared, MappingSettings(), Path("none"), quick=True)
-    assert {job.seed for job in of(quick, RunJob)} == {1}
-    assert {job.flight.duration_s for job in of(quick, RunJob)} == {plan.QUICK_S}
-    (mapped,) = of(quick, MapJob)
-    assert mapped.spec.images == plan.QUICK_IMAGES
-    flown = mapped.spec.flight
-    assert flown.duration_s == 50.0
-    assert flown.duration_s * flown.rate_hz == pytest.approx(plan.QUICK_IMAGES)
-
-
-def test_quick_takes_the_first_seconds_of_real_pictures(declared, tmp_path):
-    folder = tmp_path / "hall"
-    folder.mkdir()
-    (tmp_path / "t.txt").touch()
-    (tmp_path / "c.toml").touch()
-    case = declared.experiments[0].cases[0]
-    for given, taken in (("500:1000", "500:680:1"), ("500:600:2", "500:600:2"), ("", "0:180:1")):
-        real = Flight(folder="hall", truth="t.txt", camera="c.toml", range=given, rate_hz=30.0)
-        one = replace(case, flight=real, map=replace(case.map, flight=real, images=0))
-        only = replace(declared, experiments=[replace(declared.experiments[0], cases=[one])])
-        quick = plan.make(only, MappingSettings(), tmp_path, quick=True)
-        assert {job.flight.range for job in of(quick, RunJob)} == {taken}
-        assert {job.spec.flight.range for job in of(quick, MapJob)} == {given}
 
 
 def test_unknown_features_are_refused_before_anything_is_flown(declared):
