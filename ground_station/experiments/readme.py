@@ -18,18 +18,19 @@ NAME = "accepted.json"
 
 
 def render(document: dict[str, Any]) -> str:
-    """One table of all rows of experiments that are no series of levels, and the verdict."""
-    head = ["experiment", "thesis's own*", "preset thesis", "default"]
-    rows = [
-        [f"{e['title']}: {case['title']}", tables.printed(case), *_presets(case)]
-        for e in document["experiments"]
-        if not e["level"]
-        for case in e["cases"]
-    ]
-    lines = ["| " + " | ".join(tables.escaped(cell) for cell in row) + " |" for row in rows]
-    table = ["| " + " | ".join(head) + " |", "|---|---|---|---|", *lines]
-    parts = [tables.verdict(document), "\n".join(table), f"{conditions(document)} {PRINTED}"]
-    return "\n\n".join(parts) + "\n"
+    """The verdict, a table of all rows that are no levels, and one with a line for each series."""
+    rows = [["experiment", "thesis's own*", *tables.NAMES.values(), "inside 95 %"]]
+    series = [["position error, over the frames localized", *tables.NAMES.values()]]
+    for e in document["experiments"]:
+        if e["level"]:
+            series.append([f"{e['title']} ({e['level']})", *(_levels(e, p) for p in tables.NAMES)])
+            continue
+        for case in e["cases"]:
+            title, printed = f"{e['title']}: {case['title']}", tables.printed(case)
+            rows.append([title, printed, *_presets(case), tables.inside(case)])
+    parts = [tables.markdown(table).rstrip() for table in (rows, series) if len(table) > 1]
+    said = f"{conditions(document)} {PRINTED}"
+    return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 
 
 def table_in(readme: str) -> str | None:
@@ -95,6 +96,12 @@ def read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise GroundStationError(f"{path}: {error}") from None
     return dict(document)
+
+
+def _levels(experiment: dict[str, Any], preset: str) -> str:
+    return "; ".join(
+        f"{case['title']}: {tables.in_short(case, preset)}" for case in experiment["cases"]
+    )
 
 
 def _presets(case: dict[str, Any]) -> list[str]:

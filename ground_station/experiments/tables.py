@@ -11,6 +11,9 @@ from ground_station.presentation.text import columns
 NONE = "–"
 NAMES = {"thesis": "preset thesis", "default": "default"}
 
+_ALL = 0.995
+"""A share localized that is shown as 100 %."""
+
 Cell = Callable[[dict[str, Any]], str]
 
 
@@ -28,7 +31,7 @@ def table(experiment: dict[str, Any]) -> list[list[str]]:
     head += [
         ("on frames of both", _both),
         ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
-        ("inside 95 %", _inside),
+        ("inside 95 %", inside),
         ("found again after", _spread("default", "recovery_s", 1.0, " s")),
         ("ms a frame", _time),
         ("landmarks", _landmarks),
@@ -127,6 +130,16 @@ def figures(case: dict[str, Any], preset: str) -> str:
     return f"{position}, {rotation}, {_localized(preset)(case)} localized"
 
 
+def in_short(case: dict[str, Any], preset: str) -> str:
+    """Mean position error of one preset, and its share localized where that is not all."""
+    row = case["presets"].get(preset, {})
+    found = row.get("position_m")
+    if found is None:
+        return NONE
+    share = "" if row["localized"] > _ALL else f" of {100 * row['localized']:.0f} %"
+    return f"{100 * found['mean']:.1f} cm{share}"
+
+
 def _spread(preset: str, key: str, factor: float, unit: str) -> Cell:
     def cell(case: dict[str, Any]) -> str:
         found = case["presets"].get(preset, {}).get(key)
@@ -158,7 +171,8 @@ def _both(case: dict[str, Any]) -> str:
     return f"{theirs:.2f} → {ours:.2f} cm"
 
 
-def _inside(case: dict[str, Any]) -> str:
+def inside(case: dict[str, Any]) -> str:
+    """Share of the default's poses that lie inside their 95 % ellipsoid."""
     found = case["presets"].get("default", {}).get("consistency")
     return NONE if found is None else f"{100 * found['inside_95']:.1f} %"
 
