@@ -177,9 +177,10 @@ def _hues(count: int) -> list[str]:
 def _broken(
     time_s: Sequence[float], values: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """With a NaN where the next localized frame comes a second later: no line over a gap."""
+    """With a NaN where more than two frames are missing: no line over a gap."""
     t = np.asarray(time_s, np.float64)
-    gaps = np.flatnonzero(np.diff(t) > 1.0) + 1
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > 3.5 * np.median(steps)) + 1 if len(steps) else np.empty(0, int)
     return np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan)
 
 

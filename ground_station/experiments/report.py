@@ -33,7 +33,7 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
     experiments = [
         {
             "head": e,
-            "tables": [table for table in (tables.table(e), tables.times(e)) if table],
+            "tables": tables.every(e),
             "pictures": _pictures(e, plan),
             "settings": [_setting(case) for case in e["cases"]],
             "failed": [
@@ -66,12 +66,8 @@ def markdown(document: dict[str, Any]) -> str:
     for experiment in document["experiments"]:
         title = f"### {experiment['title']}"
         question = experiment["question"]
-        parts += [
-            title + (f"\n\n{question}" if question else ""),
-            tables.markdown(tables.table(experiment)),
-        ]
-        if where_time_went := tables.times(experiment):
-            parts.append(tables.markdown(where_time_went))
+        parts.append(title + (f"\n\n{question}" if question else ""))
+        parts += [tables.markdown(table) for table in tables.every(experiment)]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
 

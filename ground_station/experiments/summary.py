@@ -150,24 +150,25 @@ def worse(presets: dict[str, Any]) -> list[str]:
     theirs, ours = presets["thesis"], presets["default"]
     reasons = []
     if ours["failed"]:
-        reasons.append(f"it failed: {ours['failed'][0]}")
+        which = "both" if theirs["failed"] else "it"
+        reasons.append(f"{which} failed: {ours['failed'][0]}")
     if not theirs["failed"] and (theirs["localized"] or 0) > (ours["localized"] or 0) + _COVERAGE:
         reasons.append(
             f"{100 * (ours['localized'] or 0):.1f} % of the frames are localized, by the thesis's "
             f"method {100 * theirs['localized']:.1f} %"
         )
     for name, common, unit, factor in (
-        ("position_m", "common_m", "cm", 100.0),
+        ("position_m", "common_m", " cm", 100.0),
         ("rotation_deg", "common_deg", "°", 1.0),
     ):
         # Over the frames of both, where that can be said: over its own, who gives up looks good.
         key = common if ours.get(common) and theirs.get(common) else name
         a, b = ours.get(key), theirs.get(key)
         if b is not None and (a is None or not a["mean"] < b["mean"]):
-            told = "none" if a is None else f"{factor * a['mean']:.2f} {unit}"
+            told = "none" if a is None else f"{factor * a['mean']:.3f}{unit}"
             what = name.split("_")[0]
             reasons.append(
-                f"{what} error {told}, the thesis's method {factor * b['mean']:.2f} {unit}"
+                f"{what} error {told}, the thesis's method {factor * b['mean']:.3f}{unit}"
             )
     return reasons
 

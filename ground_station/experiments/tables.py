@@ -17,32 +17,52 @@ _ALL = 0.995
 Cell = Callable[[dict[str, Any]], str]
 
 
-def table(experiment: dict[str, Any]) -> list[list[str]]:
-    """Head and rows of an experiment's table; a column only where some case has a figure."""
-    cases = experiment["cases"]
-    head: list[tuple[str, Cell]] = [(experiment["level"] or "case", lambda c: str(c["title"]))]
-    head.append(("thesis's own*", printed))
+def every(experiment: dict[str, Any]) -> list[list[list[str]]]:
+    """The tables of an experiment: errors, what else was asked, times; none without a figure."""
+    return [table for table in (_errors(experiment), _further(experiment), _times(experiment))
+            if table]  # fmt: skip
+
+
+def _errors(experiment: dict[str, Any]) -> list[list[str]]:
+    """Both presets beside what the thesis printed."""
+    head: list[tuple[str, Cell]] = [("thesis's own*", printed)]
     for preset, name in NAMES.items():
         head += [
             (f"{name}: position", _spread(preset, "position_m", 100.0, " cm")),
             ("rotation", _spread(preset, "rotation_deg", 1.0, "°")),
             ("localized", _localized(preset)),
         ]
-    head += [
-        ("on frames of both", _both),
-        ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
-        ("inside 95 %", inside),
-        ("found again after", _spread("default", "recovery_s", 1.0, " s")),
-        ("ms a frame", _time),
-        ("landmarks", _landmarks),
-    ]
+    return _of_cases(experiment, head)
+
+
+def _further(experiment: dict[str, Any]) -> list[list[str]]:
+    """Of the default, where nothing else is said."""
+    return _of_cases(
+        experiment,
+        [
+            ("on frames of both", _both),
+            ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
+            ("inside 95 %", inside),
+            ("found again after", _spread("default", "recovery_s", 1.0, " s")),
+            ("ms a frame", _time),
+            ("landmarks", _landmarks),
+        ],
+    )
+
+
+def _of_cases(experiment: dict[str, Any], head: list[tuple[str, Cell]]) -> list[list[str]]:
+    """A row for each case; a column only where some case has a figure."""
+    cases = experiment["cases"]
     rows = [[cell(case) for _, cell in head] for case in cases]
-    used = [k for k in range(len(head)) if k == 0 or any(row[k] != NONE for row in rows)]
+    used = [k for k in range(len(head)) if any(row[k] != NONE for row in rows)]
+    if not used:
+        return []
     lines = [[title for title, _ in head], *rows]
-    return [[line[k] for k in used] for line in lines]
+    first = [experiment["level"] or "case", *(str(case["title"]) for case in cases)]
+    return [[name, *(line[k] for k in used)] for name, line in zip(first, lines, strict=True)]
 
 
-def times(experiment: dict[str, Any]) -> list[list[str]]:
+def _times(experiment: dict[str, Any]) -> list[list[str]]:
     """Head and rows of where a frame's time went, beside what the thesis printed; [] if nothing."""
     printed = experiment["thesis_times"]
     if not any(printed.values()):
@@ -70,8 +90,7 @@ def markdown(table: list[list[str]]) -> str:
 
 def text(experiment: dict[str, Any]) -> str:
     """The tables for a console."""
-    found = [one for one in (table(experiment), times(experiment)) if one]
-    lines = ["  " + line for one in found for line in columns(one)]
+    lines = ["  " + line for table in every(experiment) for line in columns(table)]
     return "\n".join([experiment["title"], *lines])
 
 

@@ -65,8 +65,8 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
 @pytest.mark.parametrize(
     ("theirs", "ours", "words"),
     [
-        ([0.02] * 4, [0.05] * 4, "position error 5.00 cm, the thesis's method 2.00 cm"),
-        ([0.02] * 4, [0.02] * 4, "position error 2.00 cm, the thesis's method 2.00 cm"),
+        ([0.02] * 4, [0.05] * 4, "position error 5.000 cm, the thesis's method 2.000 cm"),
+        ([0.02] * 4, [0.02] * 4, "position error 2.000 cm, the thesis's method 2.000 cm"),
         ([0.05] * 4, [0.02, 0.02, None, None], "50.0 % of the frames are localized"),
         ([0.05] * 4, [None] * 4, "position error none"),
     ],
@@ -89,6 +89,9 @@ def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
     report.write(found, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text()
     assert "no two images overlap" in page and "not measured" in page
+    (tmp_path / "both").mkdir()
+    both = document(tmp_path / "both", {"thesis": [None, None], "default": [None, None]})
+    assert any("both failed: not measured" in line for line in both["worse"])
 
 
 def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):
@@ -104,12 +107,15 @@ def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):
 def test_the_thesis_s_own_figure_stands_in_a_column_and_in_no_ratio(tmp_path):
     good = [kept_runs.run([0.01] * 4)] * 2
     found = document(tmp_path, {"thesis": [kept_runs.run([0.1] * 4)] * 2, "default": good})
-    head, row = tables.table(found["experiments"][0])
+    (head, row), (further, told) = tables.every(found["experiments"][0])
     assert row[head.index("thesis's own*")] == "20.0 cm"
+    assert row[head.index("default: position")] == "1.00 ± 0.00 cm"
+    assert told[further.index("inside 95 %")] == "95.0 %" and told[0] == row[0] == "noon"
+    assert "found again after" not in further  # nothing was covered
     text = report.markdown(found)
     assert report.PRINTED in text and "seeds 1, 2" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in lines} == {len(head) + 1}
+    assert [line.count("|") - 1 for line in lines] == [len(head)] * 3 + [len(further)] * 3
 
 
 def test_the_page_holds_all_it_shows_and_escapes_names(tmp_path):
@@ -136,9 +142,9 @@ def test_the_longest_time_without_a_pose_counts_the_flight_s_ends(tmp_path):
 def test_times_stand_beside_the_thesis_s_words_for_them(tmp_path):
     runs = {"thesis": [kept_runs.run([0.1])] * 2, "default": [kept_runs.run([0.01])] * 2}
     plain = document(tmp_path, runs)["experiments"][0]
-    assert tables.times(plain) == [] and "median of a frame" not in tables.text(plain)
+    assert len(tables.every(plain)) == 2 and "median of a frame" not in tables.text(plain)
     told = plain | {"thesis_times": plain["thesis_times"] | {"total": "0.261, 0.256"}}
-    head, *rows = tables.times(told)
+    head, *rows = tables.every(told)[-1]
     assert head == ["median of a frame, s", "thesis's own*", "noon, preset thesis", "noon, default"]
     assert rows[0] == ["features", "–", "0.0200", "0.0200"]
     assert rows[-1] == ["total", "0.261, 0.256", "0.0500", "0.0500"]
