@@ -83,8 +83,13 @@ def _told(run: dict[str, Any] | None, case: Case) -> dict[str, Any]:
     length_s = run["frames"] * case.alter.every / case.flight.rate_hz
     times_s = (run.get("series") or {}).get("time_s") or []
     gap_s = np.max(np.diff([0.0, *times_s, max([length_s, *times_s])]))
-    inside = (run.get("consistency") or {}).get("inside_95")
-    return run | {"gap_s": float(gap_s), "inside_95": inside}
+    told: dict[str, Any] = {
+        "gap_s": float(gap_s),
+        "inside_95": (run.get("consistency") or {}).get("inside_95"),
+    }
+    if not run["localized"]:
+        told["smoothed_m"] = None  # what a smoother then has is the pose it was given
+    return run | told
 
 
 def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -132,11 +132,12 @@ def test_the_page_holds_all_it_shows_and_escapes_names(tmp_path):
 def test_the_longest_time_without_a_pose_counts_the_flight_s_ends(tmp_path):
     # 45 frames at the 15 Hz of an atrium's flight: three seconds; poses from 0.1 s on, till 0.3 s.
     run = kept_runs.run([None, 0.1, None, 0.1, *[None] * 41])
-    lost = kept_runs.run([None] * 45)
+    lost = kept_runs.run([None] * 45) | {"smoothed_m": 0.0}  # of the first pose, that was given
     found = document(tmp_path, {"thesis": [lost, lost], "default": [run, run]})
     presets = found["experiments"][0]["cases"][0]["presets"]
     assert presets["default"]["gap_s"]["max"] == pytest.approx(2.7)
     assert presets["thesis"]["gap_s"]["max"] == pytest.approx(3.0)
+    assert presets["thesis"]["smoothed_m"] is None and presets["default"]["smoothed_m"] is not None
 
 
 def test_times_stand_beside_the_thesis_s_words_for_them(tmp_path):
