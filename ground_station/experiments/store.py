@@ -13,7 +13,7 @@ from ground_station.files import write_json
 
 @dataclass(frozen=True)
 class Store:
-    """A folder with `flights`, `maps` and `runs`; each entry is whole or not there."""
+    """A folder with `flights`, `maps` and `runs`, each entry whole or not there, and a `cache`."""
 
     folder: Path
 
@@ -24,6 +24,11 @@ class Store:
     def map(self, key: str) -> Path:
         """A map's folder."""
         return self.folder / "maps" / key
+
+    @property
+    def cache(self) -> Path:
+        """The folder of what maps are made of, kept beyond the end of a killed build."""
+        return self.folder / "cache"
 
     def result(self, key: str) -> Path:
         """A run's figures, or why a map or a run failed."""

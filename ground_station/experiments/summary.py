@@ -154,6 +154,8 @@ def worse(presets: dict[str, Any]) -> list[str]:
         return []
     theirs, ours = presets["thesis"], presets["default"]
     reasons = []
+    if not (ours["localized"] or theirs["localized"] or ours["failed"] or theirs["failed"]):
+        reasons.append("neither localizes a frame")
     if ours["failed"]:
         which = "both" if theirs["failed"] else "it"
         reasons.append(f"{which} failed: {ours['failed'][0]}")

@@ -55,7 +55,7 @@ def _build(job: MapJob, store: Store, data: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     recording = store.flight(job.recording) if job.recording else None
     try:
-        build(job.spec, recording, data, job.settings, part)
+        build(job.spec, recording, data, job.settings, part, store.cache)
         moved(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

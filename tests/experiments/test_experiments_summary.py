@@ -69,6 +69,7 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
         ([0.02] * 4, [0.02] * 4, "position error 2.000 cm, the thesis's method 2.000 cm"),
         ([0.05] * 4, [0.02, 0.02, None, None], "50.0 % of the frames are localized"),
         ([0.05] * 4, [None] * 4, "position error none"),
+        ([None] * 4, [None] * 4, "neither localizes a frame"),
     ],
 )
 def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, ours, words):

@@ -1,0 +1,85 @@
+"""A small experiment from nothing to its report: flown, mapped, localized, and all of it again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from ground_station.cli import main
+
+TEXT = """
+seeds = [3]
+[default.flight]
+duration_s = 2.0
+rate_hz = 5.0
+[default.map]
+images = 14
+seed = 3
+[default.map.flight]
+plan = "loop"
+duration_s = 7.0
+rate_hz = 3.0
+[experiment.path]
+level = "covered for, s"
+[experiment.path.case."0"]
+[experiment.path.case."1"]
+alter.dark_from_s = 0.5
+alter.dark_s = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A folder with experiments."""
+    folder = tmp_path_factory.mktemp("experiments")
+    (folder / "e.toml").write_text(TEXT)
+    return folder
+
+
+def run(folder, capfd):
+    """Of the command in the folder; its status, its results and what it printed."""
+    words = ["experiments", "--file", str(folder / "e.toml"), "--out", str(folder / "out")]
+    status = main([*words, "--jobs", "1"])
+    said = capfd.readouterr()
+    return status, json.loads((folder / "out" / "results.json").read_text()), said.out + said.err
+
+
+def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd):
+    status, first, _ = run(flown, capfd)
+    whole, covered = first["experiments"][0]["cases"]
+    for preset in ("thesis", "default"):
+        row = whole["presets"][preset]
+        assert row["failed"] == [] and row["keyframes"] == 14 and row["landmarks"] > 300
+        assert row["localized"] >= 0.8 and row["position_m"]["mean"] < 0.15, row["position_m"]
+    ours = whole["presets"]["default"]
+    assert ours["position_m"]["mean"] < 0.05 and ours["consistency"]["inside_95"] > 0.5
+    assert ours["smoothed_m"]["mean"] < 0.05
+    dark = covered["presets"]["default"]
+    assert dark["runs"][0]["seen"] == 10 and dark["runs"][0]["localized"] <= 6
+    assert dark["gap_s"]["mean"] > 0.9
+    assert status == (1 if first["worse"] else 0)
+    page = (flown / "out" / "report.html").read_text()
+    assert "covered for, s" in page and "data:image/png" in page
+
+    shutil.rmtree(flown / "out" / "maps")
+    shutil.rmtree(flown / "out" / "runs")
+    again, second, said = run(flown, capfd)
+    assert "features of 14 of 14 images" in said  # of the build that was lost
+    assert again == status and "experiments, jobs: 5" in said
+    for one, other in zip(_runs(first), _runs(second), strict=True):
+        assert one["localized"] == other["localized"]
+        assert one["position_m"] == pytest.approx(other["position_m"], abs=1e-4)
+        assert one["rotation_deg"] == pytest.approx(other["rotation_deg"], abs=1e-3)
+    third, _, said = run(flown, capfd)
+    assert third == status and "experiments, jobs: 0 in" in said  # all is there
+
+
+def _runs(document):
+    return [
+        run
+        for case in document["experiments"][0]["cases"]
+        for row in case["presets"].values()
+        for run in row["runs"]
+    ]
