@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     a line, unless it was asked for by name.
     """
     import sys
+    from dataclasses import replace
 
     from ground_station.errors import InputError
     from ground_station.experiments import (
@@ -77,6 +78,9 @@ def run(args: argparse.Namespace) -> int:
         declared = quick.shortened(declared)
     toml = args.sample / "mapping.toml"
     mapping = load_settings(toml if toml.is_file() else None)
+    # The order of sums over several threads is left to chance, and maps of few or doubtful matches
+    # come out otherwise then; the cores are busy with other jobs anyway.
+    mapping = replace(mapping, threads=1)
     store = Store(args.out)
     jobs = args.jobs or machine()["cores"]
     planned = plan.make(declared, mapping, args.data)
