@@ -83,7 +83,8 @@ def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> npt.NDArr
 
     A unit goes in packets of `PACKET_BYTES`; one that misses a packet is useless, and so is all
     after it up to the next IDR, because each picture is predicted from the one before. There is no
-    retransmission and no error correction, as in the product.
+    retransmission and no error correction, as in the product; but the product asks for an IDR at
+    each loss, which a recording cannot give, so a live link loses less.
     """
     rng = np.random.default_rng(seed)
     whole = False
