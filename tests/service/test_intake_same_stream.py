@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 from intake_stand import Stand, eventually
+
+from ground_station.service.intake.payloads import Payload
+from ground_station.service.intake.recording import GroundRecorder
+from ground_station.service.settings import RecordingSettings
+from ground_station.stream.assembly import ReceivedFrame
+from ground_station.stream.counters import Counters
 
 
 def test_a_session_with_the_ssrc_of_the_one_before_counts_from_its_own_beginning(
@@ -23,3 +32,47 @@ def test_a_session_with_the_ssrc_of_the_one_before_counts_from_its_own_beginning
             assert account["received"] == shown
             assert account["sent"] == shown + account["withheld"] + account["lost"]
         assert {note.ssrc for note, _ in stand.heard.of("blimp-1")} == {77}
+
+
+def test_its_first_frames_lost_it_is_told_by_its_word() -> None:
+    recorder = GroundRecorder(RecordingSettings(folder=""), lambda *_: None)
+    recorder.close()
+    stream = SimpleNamespace(ssrc=77, counters=Counters(), bytes=0)
+    payload = Payload("blimp-1", None, lambda *_: None, recorder)
+    payload.follow(stream)  # type: ignore[arg-type]
+    listener = SimpleNamespace(clock=lambda _: None, round_trip_s=lambda _: None)
+
+    def received() -> int:
+        note = payload.note(None, listener, encrypted=False)  # type: ignore[arg-type]
+        return note.frames["received"]
+
+    def take(sequence: int, arrival_ns: int) -> None:
+        stream.counters = replace(stream.counters, decoded=stream.counters.decoded + 1)
+        payload.take(
+            ReceivedFrame(
+                image=np.zeros((4, 4), np.uint8),
+                sequence=sequence,
+                time_ns=arrival_ns,
+                clock_ns=arrival_ns,
+                arrival_ns=arrival_ns,
+                entropy_bits=7.0,
+                sharpness=1.0,
+                exposure_s=None,
+                gain=None,
+                heartbeat=False,
+                ssrc=77,
+            )
+        )
+
+    s = 1_000_000_000
+    for number in range(5):
+        take(number, 100 * s + number * s // 10)
+    take(5, 103 * s)  # a stutter alone is no new session
+    assert received() == 6
+    payload.started_ns = 104 * s
+    take(9, 105 * s)
+    take(10, 105 * s + s // 10)
+    assert received() == 2
+    payload.started_ns = 105 * s + s // 8  # its word came late
+    take(11, 105 * s + s // 5)
+    assert received() == 3

@@ -27,6 +27,8 @@ Say = Callable[[str, str, Note], None]
 _WINDOW_S = 2.0
 _FRESH_S = 3.0
 """A payload whose telemetry is gone lives as long as its frames come."""
+_RESTART_NS = 500_000_000
+"""A payload that starts anew is silent for at least so long."""
 _LATE_NS, _EARLY_NS = 10_000_000_000, 1_000_000_000
 """A capture that would lie so long before its arrival, or after it: a clock was just set."""
 
@@ -43,12 +45,14 @@ class Payload:
         self.stream: Stream | None = None
         """The newest; it may have ended."""
         self.clock: Callable[[], Offset | None] = lambda: None
+        self.started_ns = 0
+        """When it said that a session starts; of this machine's clock."""
         self._say, self._recorder = say, recorder
         self._pictures = PictureWriter(folder, payload_id) if folder is not None else None
         self._lock = threading.Lock()  # two streams overlap for a moment when it starts anew
         self._frame_s = float("-inf")
         self._first: tuple[int, int, int] | None = None
-        self._last_sequence = -1
+        self._last_sequence, self._last_ns = -1, 0
         self._base = Counters()
         """Of the stream, before the payload's newest session: one may keep its SSRC."""
         self._before: int | None = None
@@ -67,17 +71,27 @@ class Payload:
             if self._first is None or self._first[0] != frame.ssrc:
                 units = self.stream.counters.access_units if self.stream else 1
                 self._first = (frame.ssrc, frame.sequence, units)
-            elif frame.sequence <= self._last_sequence and self.stream is not None:
+            elif self._began_anew(frame) and self.stream is not None:
                 counters = self.stream.counters
                 self._base = dataclasses.replace(
                     counters, access_units=counters.access_units - 1, decoded=counters.decoded - 1
                 )
                 self._first = (frame.ssrc, frame.sequence, 1)
                 self._before, self._dropped = None, 0
-            self._last_sequence = frame.sequence
+            self._last_sequence, self._last_ns = frame.sequence, frame.arrival_ns
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
         self._recorder.frame(self.id, frame, log_ns)
+
+    def _began_anew(self, frame: ReceivedFrame) -> bool:
+        """Whether a frame is the first of a session.
+
+        Its number tells, but where as many were lost at the start as the session before had: there
+        its word does, in the silence between the two.
+        """
+        silent = frame.arrival_ns - self._last_ns > _RESTART_NS
+        said = silent and self._last_ns < self.started_ns <= frame.arrival_ns
+        return said or frame.sequence <= self._last_sequence
 
     def _show(self, frame: ReceivedFrame, capture_ns: int | None) -> None:
         if self._pictures is None:

@@ -217,6 +217,9 @@ class Intake:
 
     def _pass_on(self, payload_id: str, event: messages.Event) -> None:
         level = _LEVELS.get(event.name, notes.INFO)
+        payload = self._roster.get(payload_id)
+        if payload is not None and event.name == messages.EVENT_STARTED:
+            payload.started_ns = time.time_ns()
         name, text = event.name[:_NAME_LENGTH], event.text[:_TEXT_LENGTH]
         self._event("payload", level, name, text, payload_id)
 
