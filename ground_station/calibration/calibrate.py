@@ -16,6 +16,7 @@ from ground_station.calibration.gather import Gathered
 from ground_station.calibration.lens import Fit, Points
 from ground_station.calibration.readout import Readout, readout_of
 from ground_station.calibration.views import View, views_of
+from ground_station.errors import CameraError
 from ground_station.geometry.camera import Camera
 
 Array = npt.NDArray[np.float64]
@@ -23,6 +24,8 @@ Array = npt.NDArray[np.float64]
 MAX_VIEWS = 40
 _POOR = 3.0
 """A view whose corners are off by so many times what is usual is left out."""
+_BETTER = 0.8
+"""Of the five parameters' misfit: a fisheye, which has a number less, does so by no chance."""
 _TURNS = 2
 """Lens and readout, each with the other's: the second changes neither by a tenth of its sigma."""
 
@@ -85,19 +88,49 @@ class Result:
 
 
 def calibrate(
-    gathered: Gathered, finder: BoardFinder, timed: list[bool], most_views: int = MAX_VIEWS
+    gathered: Gathered,
+    finder: BoardFinder,
+    timed: list[bool],
+    most_views: int = MAX_VIEWS,
+    model: str = "opencv5",
 ) -> Result:
     """The camera by what was seen; raises `CalibrationError` naming what is missing.
 
-    `timed` says of each input whether its frames' times can be trusted.
+    `timed` says of each input whether its frames' times can be trusted. Where the five parameters
+    of the `model` misfit and a fisheye fits, a note or the refusal says so.
     """
     verdict.check_seen(gathered, finder)
-    size_px, height_px = gathered.size_px, gathered.size_px[1]
-    middle_m = finder.points_m.mean(axis=0)
     seen = views_of(gathered.sightings, finder.points_m, timed)
+    verdict.check_sharp(seen, selection.sharp(seen))
+    try:
+        result = _calibrated(seen, finder, gathered.size_px, most_views, model)
+    except CalibrationError as error:
+        if model == "fisheye":
+            raise
+        try:
+            other = _calibrated(seen, finder, gathered.size_px, most_views, "fisheye")
+        except (CalibrationError, CameraError):
+            raise error from None
+        raise CalibrationError(
+            f"{error}; a fisheye fits these views, corners {other.fit.rms_px:.2f} px off (RMS): "
+            "calibrate with --model fisheye"
+        ) from None
+    if model != "fisheye" and (rms := _rms_as_fisheye(result)) < _BETTER * result.fit.rms_px:
+        result.notes.append(
+            f"a fisheye fits these views better, corners {rms:.2f} px off instead of "
+            f"{result.fit.rms_px:.2f}: calibrate with --model fisheye"
+        )
+    return result
+
+
+def _calibrated(
+    seen: list[View], finder: BoardFinder, size_px: tuple[int, int], most_views: int, model: str
+) -> Result:
+    """The camera of one lens model; raises `CalibrationError`."""
+    height_px = size_px[1]
+    middle_m = finder.points_m.mean(axis=0)
     usable = selection.sharp(seen)
-    verdict.check_sharp(seen, usable)
-    theta = _first(usable, size_px, finder.points_m)
+    theta = _first(usable, size_px, finder.points_m, model)
     choose = _Chooser(usable, size_px, finder.points_m, most_views)
     views, fit = choose(theta, None)
     fit, views, left_out = _without_poor(fit, views, height_px, None)
@@ -127,21 +160,36 @@ def calibrate(
     )
 
 
+def _rms_as_fisheye(result: Result) -> float:
+    """How far the corners of a result's views are off as a fisheye sees them; inf where it runs."""
+    height_px, readout_s = result.size_px[1], result.camera.readout_s or None
+    points = [view.points(height_px, readout_s) for view in result.views]
+    theta = lens.first_guess(points, result.size_px, "fisheye")
+    located, poses = _located(theta, points)
+    if len(located) < verdict.MIN_VIEWS:
+        return np.inf
+    try:
+        return lens.adjust([points[k] for k in located], theta, poses).rms_px
+    except CalibrationError:
+        return np.inf
+
+
 def _outline_m(points_m: Array) -> Array:
     """The board's outermost corners (4, 2), metres."""
     low, high = points_m[:, :2].min(axis=0), points_m[:, :2].max(axis=0)
     return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
-def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: Array) -> Array:
-    """A lens (9,) to choose views by: of a few that are unlike each other."""
+def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: Array, model: str) -> Array:
+    """A lens (D,) to choose views by: of a few that are unlike each other."""
     begin = selection.spread(usable, size_px, _outline_m(points_m))
     points = [usable[k].points(size_px[1], None) for k in begin]
-    theta = lens.first_guess(points, size_px)
+    theta = lens.first_guess(points, size_px, model)
     few, poses = _located(theta, points)
     if len(few) < verdict.MIN_VIEWS:
         return theta
-    return lens.adjust([points[k] for k in few], theta, poses, lens.weak_prior(size_px)).theta
+    prior = lens.weak_prior(size_px, model)
+    return lens.adjust([points[k] for k in few], theta, poses, prior).theta
 
 
 @dataclass(frozen=True)

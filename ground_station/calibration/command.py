@@ -28,7 +28,8 @@ is refused, with what is missing. (A folder called board: ./board.)"""
 
 _OF_BOARD = ("paper", "squares", "square_mm")
 _OF_VIEWS = (
-    "board", "square_mm_measured", "range", "rate_hz", "seconds", "views", "json", "report",
+    "board", "model", "square_mm_measured", "range", "rate_hz", "seconds", "views", "json",
+    "report",
 )  # fmt: skip
 _HINTS_S = 5.0
 _MOST_VIEWS = 200
@@ -51,6 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                           help="side of a square (as large as fits)")  # fmt: skip
     views = parser.add_argument_group("to calibrate")
     views.add_argument("--board", type=Path, metavar="BOARD.toml", help="the board's file")
+    views.add_argument(
+        "--model", choices=("opencv5", "fisheye"),
+        help="of the lens: five parameters (default), or a fisheye's, for more than about 110°",
+    )  # fmt: skip
     views.add_argument(
         "--square-mm-measured", metavar="MM", help="a square's side on the paper, or WIDTHxHEIGHT"
     )
@@ -148,7 +153,7 @@ def _calibrate(args: argparse.Namespace) -> int:
             _say(f"note: {note}")
     if gathered.interrupted:
         _say(f"interrupted: calibrating with the {gathered.frames} frames so far")
-    result = calibrate(gathered, finder, timed, most)
+    result = calibrate(gathered, finder, timed, most, args.model or "opencv5")
     results.write_camera(args.out, result, board)
     print(results.table(result, gathered.frames))
     for note in result.notes:

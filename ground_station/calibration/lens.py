@@ -1,9 +1,10 @@
 """The lens from views of the board: weighted, robust bundle adjustment with poses eliminated.
 
-Zhang's method (PAMI 2000): OpenCV's closed form begins, then all views' poses and the nine numbers
-of the lens are adjusted together (Levenberg–Marquardt). Poses are eliminated by the Schur
-complement (Triggs et al. 2000, section 6.1), so that what is left is the lens's own information:
-its inverse is the covariance that says whether the views determine it.
+Zhang's method (PAMI 2000): OpenCV's closed form begins, then all views' poses and the numbers of
+the lens are adjusted together (Levenberg–Marquardt): nine of the five-parameter model, eight of
+the fisheye, and how many there are says which it is. A fisheye begins as an equidistant lens. Poses
+are eliminated by the Schur complement (Triggs et al. 2000, section 6.1), so that what is left is
+the lens's own information: its inverse is the covariance that says whether the views determine it.
 """
 
 from __future__ import annotations
@@ -19,12 +20,18 @@ import numpy.typing as npt
 
 from ground_station.calibration.errors import CalibrationError
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens_models import MODELS, KannalaBrandt
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-"""The lens's numbers, in the order of OpenCV's Jacobian."""
+NAMES = {model: ("fx_px", "fy_px", "cx_px", "cy_px", *kind.NAMES) for model, kind in MODELS.items()}
+"""Each model's numbers, in the order of OpenCV's Jacobian."""
+_MODEL = {len(names): model for model, names in NAMES.items()}
+_ACROSS_DEG = (90, 110, 130, 150, 170, 190)
+"""Fields of view across the picture that a fisheye is begun with."""
+_STEEPEST = math.tan(math.radians(80.0))
+"""On the plane z = 1, corners farther out have no useful place to find a pose by."""
 
 _HUBER = 2.0
 """Deviations from which a corner counts less."""
@@ -49,9 +56,9 @@ class Points:
 class Fit:
     """An adjusted lens.
 
-    `theta` (9,) as in `NAMES`, `poses` (V, 6) rotation vectors and translations cTb, `residuals`
-    V times (N, 2) seen minus projected, pixels, `used` V times (N,). `information` (9, 9) of the
-    lens at unit variance, `covariance` (9, 9), `sigma` the deviation of a corner by that of its
+    `theta` (D,) as in `names`, `poses` (V, 6) rotation vectors and translations cTb, `residuals`
+    V times (N, 2) seen minus projected, pixels, `used` V times (N,). `information` (D, D) of the
+    lens at unit variance, `covariance` (D, D), `sigma` the deviation of a corner by that of its
     view (1 where views' deviations were right).
     """
 
@@ -64,11 +71,22 @@ class Fit:
     sigma: float
 
     @property
+    def model(self) -> str:
+        """As in the camera's file."""
+        return model_of(self.theta)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers."""
+        return NAMES[self.model]
+
+    @property
     def deviations(self) -> dict[str, float]:
         """The standard deviation of each number; infinite where nothing determines it."""
         with np.errstate(invalid="ignore"):
             values = np.sqrt(np.diag(self.covariance))
-        return {n: float(v) for n, v in zip(NAMES, np.nan_to_num(values, nan=np.inf), strict=True)}
+        values = np.nan_to_num(values, nan=np.inf)
+        return {name: float(value) for name, value in zip(self.names, values, strict=True)}
 
     @property
     def rms_px(self) -> float:
@@ -82,8 +100,14 @@ class Fit:
 
     def camera(self, size_px: tuple[int, int], readout_s: float = 0.0) -> Camera:
         """As the camera's file has it; raises `CameraError` for numbers that are none."""
-        values: dict[str, Any] = dict(zip(NAMES, map(float, self.theta), strict=True))
-        return Camera(width_px=size_px[0], height_px=size_px[1], readout_s=readout_s, **values)
+        values: dict[str, Any] = dict(zip(self.names, map(float, self.theta), strict=True))
+        values |= {"width_px": size_px[0], "height_px": size_px[1], "model": self.model}
+        return Camera(readout_s=readout_s, **values)
+
+
+def model_of(theta: Array) -> str:
+    """The model of a lens (D,), as in the camera's file."""
+    return _MODEL[len(theta)]
 
 
 def rms(residuals: Array) -> float:
@@ -98,7 +122,13 @@ def matrix(theta: Array) -> Array:
 
 
 def project(theta: Array, pose: Array, points_m: Array) -> tuple[Array, Array, Array]:
-    """Pixels (N, 2) of board points, and their derivatives by pose (2N, 6) and lens (2N, 9)."""
+    """Pixels (N, 2) of board points, and their derivatives by pose (2N, 6) and lens (2N, D)."""
+    if model_of(theta) == "fisheye":
+        px, jacobian = cv2.fisheye.projectPoints(
+            points_m.reshape(-1, 1, 3), pose[:3], pose[3:], matrix(theta), theta[4:]
+        )
+        J = np.asarray(jacobian, np.float64)
+        return np.asarray(px, np.float64).reshape(-1, 2), J[:, 8:14], J[:, :8]
     px, jacobian = cv2.projectPoints(points_m, pose[:3], pose[3:], matrix(theta), theta[4:])
     J = np.asarray(jacobian, np.float64)
     return np.asarray(px, np.float64).reshape(-1, 2), J[:, :6], J[:, 6:15]
@@ -106,8 +136,15 @@ def project(theta: Array, pose: Array, points_m: Array) -> tuple[Array, Array, A
 
 def locate(theta: Array, view: Points) -> Array | None:
     """The board's pose (6,) in a view, None where there is none in front of the camera."""
+    points, px, K, numbers = view.points_m, view.px, matrix(theta), theta[4:]
+    if model_of(theta) == "fisheye":
+        rays = KannalaBrandt(*numbers).rays(px, K)
+        steep = np.hypot(rays[:, 0], rays[:, 1]) > _STEEPEST * rays[:, 2]
+        kept = np.isfinite(rays[:, 2]) & ~steep
+        points, px = points[kept], rays[kept, :2] / rays[kept, 2:]
+        K, numbers = np.eye(3), np.zeros(5)
     try:
-        ok, rvec, tvec = cv2.solvePnP(view.points_m, view.px, matrix(theta), theta[4:])
+        ok, rvec, tvec = cv2.solvePnP(points, px, K, numbers)
     except cv2.error:
         return None
     pose = np.concatenate([rvec.ravel(), tvec.ravel()]) if ok else np.full(6, np.nan)
@@ -115,15 +152,24 @@ def locate(theta: Array, view: Points) -> Array | None:
 
 
 def information(theta: Array, pose: Array, view: Points) -> Array:
-    """What one view tells of the lens (9, 9) when its pose is not known."""
+    """What one view tells of the lens (D, D) when its pose is not known."""
     _, Jp, Jl = project(theta, pose, view.points_m)
     U, C, V = Jp.T @ Jp, Jp.T @ Jl, Jl.T @ Jl
     return np.asarray((V - C.T @ np.linalg.lstsq(U, C, rcond=None)[0]) / view.sigma_px**2)
 
 
-def first_guess(views: Sequence[Points], size_px: tuple[int, int]) -> Array:
-    """A lens (9,) to begin with: Zhang's closed form for the focal length, no distortion."""
+def first_guess(views: Sequence[Points], size_px: tuple[int, int], model: str = "opencv5") -> Array:
+    """A lens (D,) to begin with: Zhang's closed form for the focal length, no distortion.
+
+    Of a fisheye that closed form knows nothing: of equidistant lenses, the one that fits best.
+    """
     centre = [(size_px[0] - 1) / 2, (size_px[1] - 1) / 2]
+    if model == "fisheye":
+        lenses = [
+            np.array([f, f, *centre, 0, 0, 0, 0])
+            for f in size_px[0] / np.radians(np.array(_ACROSS_DEG, np.float64))
+        ]
+        return min(lenses, key=lambda theta: _misfit_px(theta, views))
     points = [view.points_m.astype(np.float32) for view in views]
     px = [view.px.astype(np.float32) for view in views]
     focal = float(size_px[0])
@@ -136,14 +182,25 @@ def first_guess(views: Sequence[Points], size_px: tuple[int, int]) -> Array:
     return np.array([focal, focal, *centre, 0, 0, 0, 0, 0])
 
 
-def weak_prior(size_px: tuple[int, int]) -> Array:
-    """Information (9,) of what any lens is like, which keeps a first adjustment from running off.
+def _misfit_px(theta: Array, views: Sequence[Points]) -> float:
+    """How far corners are off in the middle one of views, each at its own pose; inf without any."""
+    off = [math.inf]
+    for view in views:
+        if (pose := locate(theta, view)) is not None:
+            off.append(rms(view.px - project(theta, pose, view.points_m)[0]))
+        else:
+            off.append(math.inf)
+    return float(np.median(off))
+
+
+def weak_prior(size_px: tuple[int, int], model: str = "opencv5") -> Array:
+    """Information (D,) of what any lens is like, which keeps a first adjustment from running off.
 
     Principal point within a tenth of the width, mild distortion.
     """
     w = size_px[0]
-    deviations = np.array([10 * w, 10 * w, 0.1 * w, 0.1 * w, 0.5, 0.5, 0.01, 0.01, 0.5])
-    return 1 / deviations**2
+    mild = [0.2] * 4 if model == "fisheye" else [0.5, 0.5, 0.01, 0.01, 0.5]
+    return np.asarray(1 / np.array([10 * w, 10 * w, 0.1 * w, 0.1 * w, *mild]) ** 2)
 
 
 def adjust(
@@ -151,10 +208,10 @@ def adjust(
 ) -> Fit:
     """The lens and poses of least robust squares from a beginning; gross corners do not count.
 
-    `prior` (9,) is information about `theta`'s beginning, None for none. Raises `CalibrationError`
+    `prior` (D,) is information about `theta`'s beginning, None for none. Raises `CalibrationError`
     when it runs off.
     """
-    problem = _Problem(views, theta, np.zeros(9) if prior is None else prior)
+    problem = _Problem(views, theta, np.zeros(len(theta)) if prior is None else prior)
     state = theta.copy(), np.array(poses, np.float64)
     used = [np.ones(len(view.px), bool) for view in views]
     for _ in range(_ROUNDS):
@@ -245,18 +302,18 @@ class _Problem:
         theta, poses = state
         S = np.diag(self.prior)
         g = self.prior * (self.theta0 - theta)
-        solved = []
+        solved, count = [], len(theta)
         for U, C, V, gp, gl in parts:
             # A view of which no corner counts any more has no pose: its own stays.
             damped = U + damping * np.diag(np.diag(U)) + (1e-12 * np.trace(U) + 1e-9) * np.eye(6)
             both = np.linalg.solve(damped, np.column_stack([C, gp]))
             solved.append(both)
-            S = S + V - C.T @ both[:, :9]
-            g = g + gl - C.T @ both[:, 9]
+            S = S + V - C.T @ both[:, :count]
+            g = g + gl - C.T @ both[:, count]
         unit = 1 / np.sqrt(np.maximum(np.diag(S), 1e-30))
-        scaled = S * np.outer(unit, unit) + damping * np.eye(9)
+        scaled = S * np.outer(unit, unit) + damping * np.eye(count)
         d_theta = unit * np.linalg.lstsq(scaled, unit * g, rcond=1e-14)[0]
-        d_poses = np.array([both[:, 9] - both[:, :9] @ d_theta for both in solved])
+        d_poses = np.array([both[:, count] - both[:, :count] @ d_theta for both in solved])
         return theta + d_theta, poses + d_poses
 
     def fit(self, state: tuple[Array, Array], used: list[Bools]) -> Fit:
@@ -267,7 +324,8 @@ class _Problem:
         larger of the two stands.
         """
         theta, poses = state
-        A, scatter = np.zeros((9, 9)), np.zeros((9, 9))
+        A = np.zeros((len(theta), len(theta)))
+        scatter = np.zeros_like(A)
         residuals = self.residuals(state)
         squares, count = 0.0, 0
         for view, pose, kept, r in zip(self.views, poses, used, residuals, strict=True):
@@ -280,7 +338,7 @@ class _Problem:
             gradient = own.T @ flat
             scatter += np.outer(gradient, gradient)
             squares, count = squares + float(flat @ flat), count + len(flat)
-        free = max(count - 6 * len(self.views) - 9, 1)
+        free = max(count - 6 * len(self.views) - len(theta), 1)
         variance = squares / free
         unit = 1 / np.sqrt(np.maximum(np.diag(A), 1e-30))
         values, vectors = np.linalg.eigh(A * np.outer(unit, unit))

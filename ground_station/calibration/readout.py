@@ -18,7 +18,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -78,7 +77,7 @@ class _Window:
 def readout_of(views: Sequence[View], theta: Array, height_px: int) -> Readout | None:
     """The readout time by the views in motion; None where no frames in a row are in motion.
 
-    `views` are sorted by input and time, `theta` (9,) is the lens.
+    `views` are sorted by input and time, `theta` (D,) is the lens.
     """
     windows = [_window(part, theta, height_px) for part in _moving(views)]
     whole = [window for window in windows if window is not None]
@@ -191,15 +190,14 @@ def _linearise(w: _Window, theta: Array, readout_s: float) -> tuple[Array, Array
     turn, shift = L @ w.turn, L @ w.shift_m
     turned = Rotation.from_rotvec(turn).apply(w.points_m @ w.R0.T)
     in_camera = turned + shift
-    zero = np.zeros(3)
-    px, jacobian = cv2.projectPoints(in_camera, zero, zero, lens.matrix(theta), theta[4:])
-    A = jacobian[:, 3:6].reshape(-1, 2, 3)  # at no rotation, a shift moves every point alike
+    px, by_camera, _ = lens.project(theta, np.zeros(6), in_camera)
+    A = by_camera[:, 3:].reshape(-1, 2, 3)  # at no rotation, a shift moves every point alike
     by_turn = A @ -_cross(turned) @ _left_jacobian(turn)
     by_pose = np.concatenate([by_turn, A], axis=2)  # (N, 2, 6)
     by_nodes = (by_pose[:, :, None, :] * L[:, None, :, None]).reshape(len(L) * 2, -1)
     rate = np.concatenate([dL @ w.turn, dL @ w.shift_m], axis=1) * w.row[:, None]
     by_readout = np.einsum("nij,nj->ni", by_pose, rate).ravel()
-    return (w.px - px.reshape(-1, 2)).ravel(), by_nodes, by_readout
+    return (w.px - px).ravel(), by_nodes, by_readout
 
 
 @dataclass

@@ -9,7 +9,6 @@ from typing import Any
 
 from ground_station.calibration.board import Board
 from ground_station.calibration.calibrate import Result
-from ground_station.calibration.lens import NAMES
 from ground_station.files import write_text
 from ground_station.presentation.text import columns
 
@@ -21,11 +20,12 @@ def write_camera(path: str | Path, result: Result, board: Board) -> None:
     lines = [
         f"# From {len(result.views)} views of a ChArUco board of {board.name}:",
         f"# {used} corners, {result.fit.rms_px:.3f} px RMS. Behind each number its deviation.",
-        'model = "opencv5"          # k1 k2 p1 p2 k3, pixel centres at integers',
+        f'model = "{camera.model}"'.ljust(27)
+        + f"# {' '.join(result.fit.names[4:])}, pixel centres at integers",
         f"width_px = {camera.width_px}",
         f"height_px = {camera.height_px}",
     ]
-    for name, value in zip(NAMES, result.fit.theta, strict=True):
+    for name, value in zip(result.fit.names, result.fit.theta, strict=True):
         lines.append(
             f"{name} = {_number(name, float(value))}".ljust(27)
             + f"# ± {_deviation(name, result.fit.deviations[name])}"
@@ -100,7 +100,7 @@ def numbers(result: Result) -> list[tuple[str, str, str]]:
     """Name, value and deviation of each number of the camera, readout included when known."""
     rows = [
         (name, _number(name, float(value)), "± " + _deviation(name, result.fit.deviations[name]))
-        for name, value in zip(NAMES, result.fit.theta, strict=True)
+        for name, value in zip(result.fit.names, result.fit.theta, strict=True)
     ]
     readout = result.readout
     if readout is not None and result.readout_known:

@@ -97,7 +97,7 @@ def informative(
     tells = np.array([lens.information(theta, p, v) for p, v in zip(poses, points, strict=True)])
     outlines = np.array([apply_homography(view.seen.H, outline_m) for view in views])
     free = np.ones(len(views), bool)
-    total = np.diag(lens.weak_prior(size_px))
+    total = np.diag(lens.weak_prior(size_px, lens.model_of(theta)))
     chosen: list[int] = []
 
     def take(k: int) -> None:

@@ -30,6 +30,12 @@ class Features:
     def __len__(self) -> int:
         return len(self.keypoints_px)
 
+    def where(self, keep: npt.NDArray[np.bool_]) -> Features:
+        """Those alone; `keep` (N,)."""
+        if keep.all():
+            return self
+        return Features(self.keypoints_px[keep], self.scores[keep], self.descriptors[keep])
+
 
 class Extractor(Protocol):
     """Key points and descriptors of an image. `name` and `sha256` are what a map remembers.

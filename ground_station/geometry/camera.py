@@ -1,19 +1,25 @@
-"""The camera: OpenCV's five-parameter lens model on a pinhole, and its TOML file.
+"""The camera: a lens model on a pinhole, and its TOML file.
 
 Pixels: the centre of the top-left pixel is (0, 0), as in OpenCV. Camera axes: x right, y down,
-z forward.
+z forward. What only a lens model knows is in `lens_models`; others ask the camera.
+
+A fisheye's picture may show directions up to and beyond 90° from its axis, but poses and maps are
+computed on the plane z = 1: up to `lens_models.WIDEST` from the axis key points are used, and what
+lies beyond has no undistorted pixel (NaN). `rays` and `project` know all of the lens.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import CameraError
+from ground_station.geometry.lens_models import MODELS, KannalaBrandt, LensModel
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
@@ -22,7 +28,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera; `readout_s` is the rolling shutter's time from first row to last."""
+    """A calibrated camera; `readout_s` is the rolling shutter's time from first row to last.
+
+    `model` says which of the lens's numbers there are: k1, k2, p1, p2, k3 or, of a fisheye, k1 to
+    k4. The others are 0.
+    """
 
     width_px: int = config.key(640, "image width", unit="px", low=16, high=16384)
     height_px: int = config.key(480, "image height", unit="px", low=16, high=16384)
@@ -38,12 +48,40 @@ class Camera:
     readout_s: float = config.key(
         0.0, "rolling-shutter readout, 0: global", unit="s", low=0, high=1
     )
-    model: str = config.key("opencv5", "lens model", choices=["opencv5"])
+    model: str = config.key("opencv5", "lens model", choices=list(MODELS))
+    k4: float = config.key(0.0, "radial distortion of a fisheye", low=-100, high=100)
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise CameraError(f"camera: {name} must be a finite number, not {value}")
+        for name in foreign_keys(self.model):
+            if getattr(self, name) != 0:
+                raise CameraError(f"camera: {not_of(name, self.model)}")
+        if isinstance(self.lens, KannalaBrandt):
+            self._check_fold(self.lens)
+
+    def _check_fold(self, lens: KannalaBrandt) -> None:
+        """Refuses a polynomial that turns back inside of the picture, within the nearest border."""
+        ends = (self.width_px - 1, self.height_px - 1)
+        border = min(
+            min(centre, end - centre) / focal
+            for centre, end, focal in zip(
+                (self.cx_px, self.cy_px), ends, (self.fx_px, self.fy_px), strict=True
+            )
+        )
+        if lens.fold < math.pi and lens.radius(np.array(lens.fold)) < border:
+            raise CameraError(
+                f"camera: k1 to k4 turn the picture back {math.degrees(lens.fold):.0f}° from the "
+                "axis, inside of it, which no fisheye does: are they another model's "
+                "(model = 'opencv5'), or the focal length another picture size's?"
+            )
+
+    @cached_property
+    def lens(self) -> LensModel:
+        """The lens model with its numbers."""
+        chosen = MODELS[self.model]
+        return chosen(**{name: getattr(self, name) for name in chosen.NAMES})
 
     @property
     def matrix(self) -> Array:
@@ -54,50 +92,97 @@ class Camera:
 
     @property
     def distortion(self) -> Array:
-        """k1, k2, p1, p2, k3."""
-        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+        """The lens's numbers in OpenCV's order: k1, k2, p1, p2, k3, or a fisheye's k1 to k4."""
+        return np.array([getattr(self, name) for name in self.lens.NAMES])
+
+    @property
+    def distortion_model(self) -> str:
+        """Its name in `foxglove.CameraCalibration`."""
+        return self.lens.FOXGLOVE
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether its pictures are undistorted as they are."""
+        return self.lens.is_none
 
     def project(self, points_c: npt.ArrayLike) -> Array:
         """Points in camera coordinates (N, 3), metres, to distorted pixels (N, 2).
 
-        Brown–Conrady model as in OpenCV's calib3d documentation. Points at or behind the camera
-        (z <= 0) give NaN.
+        NaN for points that the lens does not see: at or behind the camera (z <= 0), and of a
+        fisheye those farther from the axis than where its polynomial turns back.
         """
-        points = np.asarray(points_c, dtype=np.float64).reshape(-1, 3)
-        z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
-        return self.distort(points[:, :2] / z[:, None])
+        return self._pixels(self.lens.bend_points(np.asarray(points_c, np.float64).reshape(-1, 3)))
 
     def distort(self, normalized: npt.ArrayLike) -> Array:
         """Undistorted coordinates on the plane z = 1 (N, 2) to distorted pixels (N, 2)."""
-        xy = np.asarray(normalized, dtype=np.float64).reshape(-1, 2)
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        xd = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        yd = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
-        return np.stack([self.fx_px * xd + self.cx_px, self.fy_px * yd + self.cy_px], axis=1)
+        return self._pixels(self.lens.bend(np.asarray(normalized, np.float64).reshape(-1, 2)))
+
+    def _pixels(self, bent: Array) -> Array:
+        x, y = bent[:, 0], bent[:, 1]
+        return np.stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px], axis=1)
 
     def undistort(self, pixels: npt.ArrayLike) -> Array:
-        """Distorted pixels (N, 2) to undistorted coordinates on the plane z = 1 (N, 2)."""
-        import cv2  # a tenth of a second for a process that only passes the numbers on
+        """Distorted pixels (N, 2) to undistorted coordinates on the plane z = 1 (N, 2).
 
-        uv = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2))
-        if len(uv) == 0:
-            return np.empty((0, 2))
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-        xy = cv2.undistortPointsIter(
-            uv, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria
-        )
-        return np.asarray(xy, np.float64).reshape(-1, 2)
+        NaN for pixels of a fisheye that are not used: see `uses`.
+        """
+        uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        return self.lens.unbend(uv, self.matrix) if len(uv) else np.empty((0, 2))
 
     def undistort_to_pinhole(self, pixels: npt.ArrayLike) -> Array:
         """Distorted pixels (N, 2) to the pixels a camera with the same K and no lens would see."""
         xy = self.undistort(pixels)
         return xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
 
+    def rays(self, pixels: npt.ArrayLike) -> Array:
+        """Distorted pixels (N, 2) to directions in camera coordinates (N, 3), not of length 1.
+
+        Those of a fisheye may point behind the plane z = 1; NaN where it sees nothing.
+        """
+        return self.lens.rays(np.asarray(pixels, np.float64).reshape(-1, 2), self.matrix)
+
+    def uses(self, pixels: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether distorted pixels (N, 2) are near enough to the axis to be used (N,)."""
+        return self.lens.uses(np.asarray(pixels, np.float64).reshape(-1, 2), self.matrix)
+
+    def drawn_in(self, pixels: npt.ArrayLike) -> Array:
+        """Distorted pixels (N, 2) that are not used drawn to the axis until they are (N, 2)."""
+        bent = self.lens.drawn_in((np.asarray(pixels, np.float64) - [self.cx_px, self.cy_px])
+                                  / [self.fx_px, self.fy_px])  # fmt: skip
+        return self._pixels(bent)
+
+    def stretch(self, pinhole_px: npt.ArrayLike) -> Array:
+        """By how much a pixel's noise is longer at undistorted pixels (N, 2): (N,)."""
+        pixels = np.asarray(pinhole_px, np.float64).reshape(-1, 2)
+        return self.lens.stretch((pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px])
+
+    def rows(self, pinhole_px: Array) -> Array:
+        """About which row of the picture (N,) undistorted pixels (N, 2) are in.
+
+        The five-parameter lens is not looked at, as it moves rows by a few.
+        """
+        if isinstance(self.lens, KannalaBrandt):
+            flat = (pinhole_px - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+            return np.asarray(self.distort(flat)[:, 1])
+        return np.asarray(pinhole_px[:, 1])
+
     def as_dict(self) -> dict[str, float | int | str]:
-        """The camera as the keys of its file."""
-        return asdict(self)
+        """The camera as the keys of its file: those of its model."""
+        foreign = foreign_keys(self.model)
+        return {name: value for name, value in asdict(self).items() if name not in foreign}
+
+
+def foreign_keys(model: str) -> list[str]:
+    """The lens numbers that are of another model."""
+    every = dict.fromkeys(name for kind in MODELS.values() for name in kind.NAMES)
+    return [name for name in every if name not in MODELS[model].NAMES]
+
+
+def not_of(name: str, model: str) -> str:
+    """What to say of a key that is of another lens model."""
+    other = next(other for other, kind in MODELS.items() if name in kind.NAMES)
+    known = ", ".join(MODELS[model].NAMES)
+    return f"{name} is of model = '{other}'; '{model}' has {known}: remove {name}, or change model"
 
 
 THESIS_CAMERA = Camera(k1=0.1673, k2=-0.2605, p1=-1.3e-5, p2=-0.00203, k3=0.0, readout_s=0.020)
@@ -116,7 +201,13 @@ def load_camera(path: str | Path) -> Camera:
         document = config.read(path)
         missing = [name for name in _REQUIRED if name not in document]
         if missing:
-            raise CameraError(f"{path}: the key '{missing[0]}' is missing")
+            raise CameraError(f"the key '{missing[0]}' is missing")
+        model = document.get("model", Camera.model)
+        for name in foreign_keys(model) if model in list(MODELS) else ():
+            if name in document:  # even as 0: its writer thought of another lens
+                raise CameraError(not_of(name, model))
         return config.from_mapping(document, Camera, where=str(path))
     except ConfigError as error:
         raise CameraError(str(error)) from None
+    except CameraError as error:
+        raise CameraError(f"{path}: {error}") from None

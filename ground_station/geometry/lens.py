@@ -17,14 +17,16 @@ class Lens:
     """A camera with what is needed to tell quickly whether a direction is in its image.
 
     A distortion polynomial folds back far outside of the image, so that directions no pixel sees
-    would land inside; `max_radius` bounds them on the plane z = 1.
+    would land inside; `max_radius` bounds them on the plane z = 1. Of a fisheye it is what is used.
     """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         w, h = camera.width_px - 0.5, camera.height_px - 0.5
         corners = np.array([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]])
-        self.max_radius = 1.02 * float(np.linalg.norm(camera.undistort(corners), axis=1).max())
+        farthest = 1.02 * float(np.linalg.norm(camera.undistort(corners), axis=1).max())
+        reach = camera.lens.reach
+        self.max_radius = farthest if farthest < reach else reach  # also where that is not a number
 
     def inside(self, normalized: Array) -> npt.NDArray[np.bool_]:
         """Whether directions (N, 2) on the plane z = 1 land in the image; (N,)."""

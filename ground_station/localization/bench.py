@@ -141,6 +141,7 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
         camera.readout_s * (camera.distort(flat)[:, 1] - middle) / (2 * middle),
         np.full(_OBSERVATIONS, settings.sigma_px),
         np.tile(settings.landmark_sigma_m**2 * np.eye(3), (_OBSERVATIONS, 1, 1)),
+        np.ones(_OBSERVATIONS),
     )
     sigma = np.repeat([0.05, 0.1, 0.5, 0.5], 3)
     predicted = Kinematics(0, guess, np.zeros(6), np.diag(sigma**2))

@@ -85,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.errors import InputError
     from ground_station.files import write_json
     from ground_station.geometry.camera import load_camera
+    from ground_station.geometry.resizing import for_pictures
     from ground_station.geometry.trajectory import read_tum
     from ground_station.localization.extraction import extractor_for
     from ground_station.localization.localizer import LocalizationError, Localizer
@@ -96,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
     )
     from ground_station.mapping import store
     from ground_station.mapping.refinement.observations import save_observations
+    from ground_station.recording.look import look
     from ground_station.recording.open import open_input, parse_range
 
     settings = load_settings(args)
@@ -114,6 +116,11 @@ def run(args: argparse.Namespace) -> int:
     if not map_.info.registered:
         _say(f"the map '{map_.info.name}' is not registered: poses are in its own frame and scale")
     camera = load_camera(args.camera) if args.camera else source.camera or map_.info.camera
+    if args.camera or source.camera is None:
+        first = look(source)
+        camera, said = for_pictures(camera, first.size_px, first.display_deg, str(args.input))
+        if said:
+            _say(said)
     localizer = Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []

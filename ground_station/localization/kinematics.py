@@ -38,7 +38,8 @@ class Sights:
 
     `points_m` (N, 3) in the world; `pinhole_px` (N, 2), undistorted pixels; `row_s` (N,), when each
     one's row was exposed after the frame's time (0 for a global shutter); `sigma_px` (N,), standard
-    deviation of a pixel coordinate; `covariance_m2` (N, 3, 3) of the points' positions.
+    deviation of a pixel coordinate; `covariance_m2` (N, 3, 3) of the points' positions; `stretch`
+    (N,), how many undistorted pixels one of the picture's is there, by which residuals are judged.
     """
 
     points_m: Array
@@ -46,6 +47,7 @@ class Sights:
     row_s: Array
     sigma_px: Array
     covariance_m2: Array
+    stretch: Array
 
     def __len__(self) -> int:
         return len(self.points_m)

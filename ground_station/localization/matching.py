@@ -52,13 +52,10 @@ class Described:
 
 
 def describe(features: Features, camera: Camera, taken: Conditions) -> Described:
-    """Features without those that are not finite, and where they are without the lens."""
+    """Features that are finite and in what is used of the lens, and where they are without it."""
     finite = np.isfinite(features.keypoints_px).all(axis=1)
     finite &= np.isfinite(features.descriptors).all(axis=1)
-    if not finite.all():
-        features = Features(
-            features.keypoints_px[finite], features.scores[finite], features.descriptors[finite]
-        )
+    features = features.where(finite & camera.uses(features.keypoints_px))
     normalized = camera.undistort(features.keypoints_px)
     focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
     return Described(features, normalized, normalized * focal + centre, taken)
@@ -127,11 +124,13 @@ class Matcher:
         projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
         where = projected.pinhole_px
         radius: float | Array = radius_px or self.radius_px
+        if self.camera.model == "fisheye":  # or an array of ones would cost the others time
+            radius = radius * self.camera.stretch(where)
         if self._rolling and len(where):
             points = landmarks.position_m[projected.landmark]
             where = self._at_rows(points, where, expected)
             if radius_px is None:
-                radius = self._radius_px(points, expected)
+                radius = self._radius_px(points, where, expected)
         watch.lap("projection")
         limits: F32 = np.asarray(settings.association.max_descriptor_distance, np.float32)
         if self.thresholds:
@@ -170,7 +169,7 @@ class Matcher:
         looked for. Landmarks shifted aside tell how many do so by chance.
         """
         among = self._index.near(wTc, self._lens, self.settings.projection)
-        witness = Witness(seen.features, seen.pinhole_px, self._lens, self._modes)
+        witness = Witness(seen.features, self._lens, self._modes)
         return witness.support(wTc, self.landmarks, among).significance
 
     def sights(
@@ -193,12 +192,15 @@ class Matcher:
             path = expected_blur_px(self.camera, points_c, expected.twist, taken.exposure_s)
             sigma = blurred_sigma_px(sigma, path, taken.sharpness, blur)
         floor = np.eye(3) * self.settings.pose.landmark_sigma_m**2
+        pinhole = self.camera.undistort_to_pinhole(pixel)
+        stretch = self.camera.stretch(pinhole)
         return Sights(
             points,
-            self.camera.undistort_to_pinhole(pixel),
+            pinhole,
             self.row_s(pixel),
-            sigma,
+            sigma * stretch,
             self.landmarks.covariance_m2[landmark].astype(np.float64) + floor,
+            stretch,
         )
 
     def row_s(self, pixel_px: Array) -> Array:
@@ -211,17 +213,22 @@ class Matcher:
         if self._readout_s == 0 or not np.any(expected.twist):
             return pinhole_px
         flow = pixel_jacobian(points_m, expected.wTc, self.camera) @ expected.twist
-        row_s = (pinhole_px[:, 1] / (self.camera.height_px - 1) - 0.5) * self._readout_s
+        row = self.camera.rows(pinhole_px)
+        row_s = (row / (self.camera.height_px - 1) - 0.5) * self._readout_s
         return np.asarray(pinhole_px + flow * np.clip(row_s, -1, 1)[:, None])
 
-    def _radius_px(self, points_m: Array, expected: Kinematics) -> Array:
-        """How far from its prediction each landmark (N, 3) is looked for, by the covariance."""
-        settings = self.settings
+    def _radius_px(self, points_m: Array, pinhole_px: Array, expected: Kinematics) -> Array:
+        """How far from its prediction (N, 2) each landmark (N, 3) is looked for, by the covariance.
+
+        The limits, as a pixel's noise, are of the picture, whose pixels the lens stretches.
+        """
+        settings, stretch = self.settings, self.camera.stretch(pinhole_px)
         J = pixel_jacobian(points_m, expected.wTc, self.camera)
         variance = np.einsum("nij,jk,nik->ni", J, expected.covariance[:6, :6], J).sum(axis=1)
-        radius = _REACH * np.sqrt(variance + 2 * settings.pose.sigma_px**2)
+        radius = _REACH * np.sqrt(variance + 2 * (settings.pose.sigma_px * stretch) ** 2)
         least = min(settings.association.refine_radius_px or np.inf, self.radius_px)
-        return np.clip(np.nan_to_num(radius, nan=np.inf), least, self.radius_px)
+        most = self.radius_px * stretch
+        return np.clip(np.nan_to_num(radius, nan=np.inf), least * stretch, most)
 
 
 def pixel_jacobian(points_m: Array, wTc: Array, camera: Camera) -> Array:

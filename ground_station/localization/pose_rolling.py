@@ -65,7 +65,8 @@ def solve_rolling(
             wTc, twist, linear = found.wTc, found.twist, found.linear
             if chosen is every:
                 spread = linear.spread_px2
-            residual_px, inlier = _judge(every, wTc, twist, spread, settings.inlier_px)
+            inlier_px = settings.inlier_px * sights.stretch
+            residual_px, inlier = _judge(every, wTc, twist, spread, inlier_px)
     covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
     if covariance is None:
         return no_solution(count, "singular", iterations)
@@ -76,7 +77,7 @@ def solve_rolling(
         Kinematics(predicted.time_ns, wTc, twist, covariance),
         linear.information,
         linear.gradient,
-        residual_px,
+        residual_px / sights.stretch,
         inlier,
         float(apart @ prior.information @ apart),
         iterations,
@@ -92,6 +93,7 @@ def _refused(predicted: Kinematics, sights: Sights) -> str:
         "row_s": (count,),
         "sigma_px": (count,),
         "covariance_m2": (count, 3, 3),
+        "stretch": (count,),
     }
     for name, shape in shapes.items():
         values = getattr(sights, name)
@@ -133,7 +135,7 @@ def _inverse(information: Array) -> Array | None:
 
 
 def _judge(
-    sights: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: float
+    sights: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: Array
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Distances (N,) from sights to projected landmarks, pixels, and which are inliers (N,)."""
     view = sights.view(wTc, twist)

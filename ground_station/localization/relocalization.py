@@ -156,7 +156,7 @@ class _Search:
         self.features = features
         focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
         self.pinhole_px = normalized * focal + centre
-        self.witness = Witness(features, self.pinhole_px, lens, modes)
+        self.witness = Witness(features, lens, modes)
 
     def propose(self, candidates: Indices) -> Array | str:
         """wTc from matches with some landmarks (M,), or why there is none."""
@@ -220,8 +220,9 @@ class _Search:
     def _residual_px(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
         points = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark])
         projected = points @ self.camera.matrix.T
-        offset = projected[:, :2] / projected[:, 2:] - self.pinhole_px[feature]
-        return np.asarray(np.linalg.norm(offset, axis=1), np.float64)
+        seen = self.pinhole_px[feature]
+        offset = projected[:, :2] / projected[:, 2:] - seen
+        return np.asarray(np.linalg.norm(offset, axis=1) / self.camera.stretch(seen), np.float64)
 
     def _refine(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
         """Least squares over the matches (Levenberg-Marquardt)."""

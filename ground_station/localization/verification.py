@@ -56,17 +56,14 @@ class Support:
 class Witness:
     """A frame's features as a place to look landmarks up in."""
 
-    def __init__(
-        self, features: Features, pinhole_px: Array, lens: Lens, modes: Modes | None = None
-    ) -> None:
-        """`pinhole_px` (F, 2): the features without the lens; `modes` of the map's landmarks."""
-        self.features, self.pinhole_px, self.lens = features, pinhole_px, lens
-        self._modes = modes
-        self._tree = cKDTree(pinhole_px)
+    def __init__(self, features: Features, lens: Lens, modes: Modes | None = None) -> None:
+        """`modes` of the map's landmarks."""
+        self.features, self.lens, self._modes = features, lens, modes
+        self._tree = cKDTree(features.keypoints_px)
 
     def support(self, wTc: Array, landmarks: Landmarks, index: Indices) -> Support:
         """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
-        cTw, camera = poses.inverse(wTc), self.lens.camera
+        cTw = poses.inverse(wTc)
         points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
         ahead = points[:, 2] > 0.05
         index, points = index[ahead], points[ahead]
@@ -78,7 +75,7 @@ class Witness:
             index, flat = index[seen], flat[seen]
         if not len(index):
             return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
-        pixel = flat * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+        pixel = self.lens.camera.distort(flat)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
         feature, distance = self._near(pixel, descriptors, mode)
         found = distance < _MAX_DISTANCE
@@ -104,7 +101,7 @@ class Witness:
         _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_PX)
         if mode is not None:
             near = np.concatenate([near, near[mode]])
-        there = near < len(self.pinhole_px)
+        there = near < len(self.features)
         own = self.features.descriptors[np.where(there, near, 0)]
         cosine = np.where(there, np.einsum("nkd,nd->nk", own, descriptors), -np.inf)
         best = cosine.argmax(axis=1)

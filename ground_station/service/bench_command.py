@@ -28,8 +28,9 @@ _COMMANDS = (
     (
         "map",
         "ground_station.evaluation.maps.command",
-        "size against accuracy: fewer landmarks, shorter descriptors",
-        "Measures what a map loses when 'blimp map compress' makes it smaller.",
+        "size against accuracy: fewer landmarks, shorter descriptors; many images",
+        "Measures what a map loses when 'blimp map compress' makes it smaller, or, with --campus, "
+        "what builds of many images cost.",
     ),
 )
 

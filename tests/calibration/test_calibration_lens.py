@@ -13,7 +13,6 @@ from ground_station.calibration.calibrate import Result, calibrate
 from ground_station.calibration.certainty import at_corners_px
 from ground_station.calibration.detection import BoardFinder, Sighting
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.lens import NAMES
 from ground_station.calibration.selection import CORNERS
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
@@ -58,7 +57,7 @@ def test_the_lens_is_right_and_so_are_its_deviations() -> None:
         assert camera.fy_px == pytest.approx(STILL.fy_px, rel=0.003)
         assert math.hypot(camera.cx_px - STILL.cx_px, camera.cy_px - STILL.cy_px) < 1.5
         assert result.fit.rms_px == pytest.approx(0.08 * math.sqrt(2), rel=0.1)
-        for name in NAMES:
+        for name in result.fit.names:
             sigma = result.fit.deviations[name]
             off.append((getattr(camera, name) - getattr(STILL, name)) / sigma)
         for name, corner in zip(CORNERS, ((0, 0), (639, 0), (0, 479), (639, 479)), strict=True):

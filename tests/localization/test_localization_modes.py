@@ -206,8 +206,7 @@ def test_a_pose_is_as_significant_by_modes(room):
     lens = Lens(room.camera)
 
     def support(features: Features, modes):
-        pinhole = room.camera.undistort_to_pinhole(features.keypoints_px)
-        witness = Witness(features, pinhole, lens, modes)
+        witness = Witness(features, lens, modes)
         index = np.arange(len(room.map.landmarks))
         return witness.support(truth[0], room.map.landmarks, index)
 

@@ -65,7 +65,8 @@ def _scene(
     predicted = Kinematics(
         5, TRUE @ poses.inverse(poses.exp(error[:6])), twist - error[6:], np.diag(sigma**2)
     )
-    return predicted, Sights(points, pixels, row_s, np.full(count, noise_px), root @ root), wrong
+    sigma, even = np.full(count, noise_px), np.ones(count)
+    return predicted, Sights(points, pixels, row_s, sigma, root @ root, even), wrong
 
 
 def _error(state: Kinematics, twist: np.ndarray = TWIST) -> np.ndarray:

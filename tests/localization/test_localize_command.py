@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ground_station import cli
-from ground_station.errors import InputError
+from ground_station.errors import CameraError, InputError
 from ground_station.features.extractors import create
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
@@ -106,6 +106,32 @@ def test_a_folder_becomes_a_trajectory_and_figures(flight, tmp_path, preset):
     assert set(figures["latency_ms"]) == {"p50", "p99"}
     assert {"features", "projection", "association", "pose", "total"} <= set(figures["stage_ms"])
     assert figures["preset"] == preset and figures["frame"] == "world"
+
+
+@pytest.mark.parametrize("size", [(1280, 960), (320, 240)])
+def test_pictures_of_another_size_are_localized_with_the_camera_scaled(
+    flight, tmp_path, capsys, size
+):
+    (tmp_path / "frames").mkdir()
+    for path in sorted((flight / "frames").iterdir()):
+        image = cv2.resize(cv2.imread(str(path)), size, interpolation=cv2.INTER_LINEAR)
+        cv2.imwrite(str(tmp_path / "frames" / path.name), image)
+    args = _args(flight, tmp_path, "--init", str(flight / "truth.txt"))
+    args.input = str(tmp_path / "frames")
+    assert command.run(args) == 0
+    estimate, truth = read_tum(tmp_path / "est.txt"), read_tum(flight / "truth.txt")
+    assert len(estimate) == len(truth)
+    assert np.abs(estimate.position_m - truth.position_m).max() < 0.02
+    assert f"its pictures are {size[0]}x{size[1]}" in capsys.readouterr().err
+
+
+def test_pictures_of_another_shape_are_refused_with_what_to_do(flight, tmp_path):
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "0.png"), np.zeros((640, 480), np.uint8))
+    args = _args(flight, tmp_path)
+    args.input = str(tmp_path / "frames")
+    with pytest.raises(CameraError, match=r"480x640, the .*blimp calibrate"):
+        command.run(args)
 
 
 def test_smoothed_poses_go_to_a_file_of_their_own(flight, tmp_path):

@@ -188,6 +188,7 @@ def test_the_frustum_is_the_cameras_own(shown: Watched) -> None:
         "height_px": 480,
         "K": own.matrix.tolist(),
         "distortion": own.distortion.tolist(),
+        "model": own.model,
     }
     load = "import('/static/js/view_rays.js').then((m) =>"
     rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told)
@@ -200,6 +201,12 @@ def test_the_frustum_is_the_cameras_own(shown: Watched) -> None:
     # Without a camera it is about that one's; with one that is none, a pinhole's.
     plain = np.array(shown.page.evaluate(f"() => {load} m.viewRays(null))"))
     assert np.allclose(plain, rays, atol=0.05)
+    wide = Camera(fx_px=244.0, fy_px=245.0, model="fisheye", k1=-0.021, k2=0.0043)
+    fisheye = told | {
+        "K": wide.matrix.tolist(), "distortion": wide.distortion.tolist(), "model": "fisheye",
+    }  # fmt: skip
+    rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", fisheye)
+    assert np.allclose(rays, wide.undistort(wide.drawn_in(border)), atol=1e-6)
     told["distortion"] = [50.0, -900.0, 3.0, 3.0, 1000.0]
     wild = np.array(shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told))
     assert np.isfinite(wild).all() and np.abs(wild).max() < 2

@@ -31,6 +31,7 @@ def test_the_sample_map(served):
     told = details["camera"]
     assert (told["width_px"], told["height_px"]) == (own.width_px, own.height_px)
     assert told["K"] == own.matrix.tolist() and told["distortion"] == own.distortion.tolist()
+    assert told["model"] == "opencv5"
 
 
 def test_a_configured_camera_takes_the_place_of_the_maps(tmp_path):

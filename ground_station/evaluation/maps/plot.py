@@ -55,3 +55,41 @@ def sizes_plot(rows: Sequence[dict[str, Any]], flights: dict[str, dict[str, Any]
         axes.legend(frameon=False, labelcolor=LIGHT.ink, fontsize=8, ncols=2, loc="lower right")
     grid[-1].set_xlabel("size of the map, kB; numbers: landmarks")
     return figure
+
+
+def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
+    """Time (s) and peak memory (GB) over the number of images, all logarithmic.
+
+    `rows` as `scale.measured` gives them; a line each for threads and for so many processes. A
+    dashed line shows time that grows as the images do, another the memory allowed.
+    """
+    figure = Figure(figsize=(8.0, 7.2), layout="constrained", facecolor=LIGHT.paper)
+    FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for k, processes in enumerate(dict.fromkeys(row["processes"] for row in rows)):
+        mine = [row for row in rows if row["processes"] == processes]
+        x = [row["images"] for row in mine]
+        name = f"{processes} processes" if processes else f"{mine[0]['threads']} threads"
+        sign, colour = _SIGNS[k % len(_SIGNS)], _COLOURS[k % len(_COLOURS)]
+        for axes, key in ((upper, "total_s"), (lower, "peak_gb")):
+            y = [row[key] for row in mine]
+            axes.plot(x, y, marker=sign, color=colour, lw=1.0, label=name)
+        upper.plot(
+            x, [row["cpu_s"] for row in mine], marker=sign, color=colour, lw=1.0, ls=":",
+            label=f"{name}, CPU time",
+        )  # fmt: skip
+    first = min(rows, key=lambda row: row["images"])
+    x = sorted({row["images"] for row in rows})
+    linear = [first["total_s"] * size / first["images"] for size in x]
+    upper.plot(x, linear, "--", color=LIGHT.limit, lw=1.2, label="linear")
+    lower.axhline(most_gb, color=LIGHT.limit, linestyle="--", lw=1.2, label="allowed")
+    for axes, name in ((upper, "time, s"), (lower, "peak memory, GB")):
+        dressed(axes, LIGHT)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_ylabel(name)
+        axes.legend(frameon=False, labelcolor=LIGHT.ink, fontsize=8)
+    lower.set_xticks(x, [str(size) for size in x])
+    lower.xaxis.set_minor_formatter(NullFormatter())
+    lower.set_xlabel("images of a simulated campus")
+    return figure

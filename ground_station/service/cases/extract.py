@@ -73,6 +73,7 @@ def _copy(writer: RecordingWriter, topic: str, log_ns: int, data: bytes) -> None
             height_px=camera.height,
             matrix=list(camera.K),
             distortion=list(camera.D),
+            distortion_model=camera.distortion_model,
             topic=topic,
         )
     else:

@@ -104,7 +104,7 @@ def calibration(payload_id: str, camera: Camera, time_ns: int) -> CameraCalibrat
         frame_id=conversion.optical_frame(payload_id),
         width=camera.width_px,
         height=camera.height_px,
-        distortion_model="plumb_bob",
+        distortion_model=camera.distortion_model,
         D=camera.distortion.tolist(),
         K=K.ravel().tolist(),
         R=np.eye(3).ravel().tolist(),

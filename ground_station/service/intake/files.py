@@ -154,6 +154,7 @@ class GroundRun(run.Run):
             height_px=camera.height_px,
             matrix=camera.matrix.ravel().tolist(),
             distortion=camera.distortion.tolist(),
+            distortion_model=camera.distortion_model,
             topic=stream.prefix + CALIBRATION_TOPIC,
         )
         self._current.added(500)

@@ -92,6 +92,7 @@ class Maps:
                     "height_px": camera.height_px,
                     "K": camera.matrix.tolist(),
                     "distortion": camera.distortion.tolist(),
+                    "model": camera.model,
                 },
             }
 

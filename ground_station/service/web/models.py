@@ -176,13 +176,15 @@ class BoundsModel(BaseModel):
 class CameraModel(BaseModel):
     """A camera: `K` (3, 3) in pixels, `distortion` OpenCV's k1, k2, p1, p2, k3.
 
-    The centre of the top-left pixel is (0, 0).
+    Of a `model` that is 'fisheye' they are k1 to k4; else it is 'opencv5'. The centre of the
+    top-left pixel is (0, 0).
     """
 
     width_px: int
     height_px: int
     K: list[list[float]]
     distortion: list[float]
+    model: str
 
 
 class MapDetailsModel(BaseModel):

@@ -5,6 +5,8 @@
 const HALF_VIEW = [0.638, 0.475];
 export const PER_SIDE = 6; // a lens bends the sides
 const ROUNDS = 20;
+const WIDEST = (65 * Math.PI) / 180; // of a fisheye: farther from its axis nothing is used
+const HALVINGS = 40;
 
 /**
  * The picture's border, clockwise from its upper left corner, as points x, y on the plane z = 1 of
@@ -31,8 +33,9 @@ export function viewRays(camera) {
  */
 export function undistorted(camera, u, v) {
   const [[fx, , cx], [, fy, cy]] = camera.K;
-  const [k1, k2, p1, p2, k3] = camera.distortion;
   const [x0, y0] = [(u - cx) / fx, (v - cy) / fy];
+  if (camera.model === "fisheye") return unbent(camera.distortion, x0, y0);
+  const [k1, k2, p1, p2, k3] = camera.distortion;
   let [x, y] = [x0, y0];
   for (let round = 0; round < ROUNDS; round += 1) {
     const r2 = x * x + y * y;
@@ -43,4 +46,20 @@ export function undistorted(camera, u, v) {
   }
   // A model that does not hold out there gives no frustum of its own.
   return Math.abs(x - x0) < 1 && Math.abs(y - y0) < 1 ? [x, y] : [x0, y0];
+}
+
+/**
+ * The ray of a fisheye's pixel, by bisection; what is farther out is drawn at the widest.
+ * @param {number[]} numbers @param {number} x @param {number} y
+ */
+function unbent([k1, k2, k3, k4], x, y) {
+  const r = Math.hypot(x, y);
+  let [low, high] = [0, WIDEST];
+  for (let round = 0; round < HALVINGS; round += 1) {
+    const angle = (low + high) / 2;
+    const t = angle * angle;
+    if (angle * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))) < r) low = angle;
+    else high = angle;
+  }
+  return r > 0 ? [(x / r) * Math.tan(low), (y / r) * Math.tan(low)] : [0, 0];
 }
