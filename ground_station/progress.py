@@ -4,10 +4,24 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 from tqdm import tqdm
 
 _LINE_EVERY_S = 10.0
+_SILENT: ContextVar[bool] = ContextVar("silent", default=False)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """In this thread, jobs within the block say nothing: they are steps of a job that does."""
+    before = _SILENT.set(True)
+    try:
+        yield
+    finally:
+        _SILENT.reset(before)
 
 
 class Progress:
@@ -16,7 +30,8 @@ class Progress:
     def __init__(self, label: str, total: int | None) -> None:
         self._label, self._total, self._done = label, total, 0
         self._start_s = self._said_s = time.monotonic()
-        terminal = sys.stderr.isatty()
+        self._silent = _SILENT.get()
+        terminal = sys.stderr.isatty() and not self._silent
         self._bar = tqdm(total=total, desc=label, leave=False) if terminal else None
 
     def step(self, total: int | None = None) -> None:
@@ -40,6 +55,8 @@ class Progress:
         return time.monotonic() - self._start_s
 
     def _say(self, text: str) -> None:
+        if self._silent:
+            return
         print(text, file=sys.stderr, flush=True)
 
     def __enter__(self) -> Progress:

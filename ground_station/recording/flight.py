@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens_models import MODELS
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.recording.exposures import Exposures
 from ground_station.recording.frames import ALL_FRAMES, CAMERA_TABLE, Frame, FrameRange
@@ -88,6 +89,16 @@ class FlightRecording:
         return Frame(number, frame_name(number), time_ns, image, exposure_s)
 
 
+_LENS_MODELS = {
+    "plumb_bob": "opencv5",
+    "": "opencv5",
+    "kannala_brandt": "fisheye",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+"""Ours by `foxglove.CameraCalibration`'s names; the fisheye's last two are ROS's and OpenCV's."""
+
+
 def camera_of(reader: RecordingReader) -> Camera | None:
     """The camera of a recording, None when it has none or one not calibrated (ROS: fx of 0).
 
@@ -97,12 +108,14 @@ def camera_of(reader: RecordingReader) -> Camera | None:
     if message is None or not message.K or message.K[0] == 0:
         return None
     d = list(message.D)
-    if message.distortion_model not in ("plumb_bob", "") or len(message.K) != 9 or len(d) > 5:
+    model = _LENS_MODELS.get(message.distortion_model)
+    names = MODELS[model].NAMES if model else ()
+    enough = len(d) == len(names) if model == "fisheye" else len(d) <= len(names)
+    if model is None or len(message.K) != 9 or not enough:
         raise InputError(
             f"{reader.path}: the lens model '{message.distortion_model}' with {len(d)} parameters; "
-            "only plumb_bob with up to 5 is read"
+            "only plumb_bob with up to 5 and kannala_brandt with 4 are read"
         )
-    d += [0.0] * (5 - len(d))
     text = reader.metadata_table(CAMERA_TABLE).get("readout_s", "0")
     try:
         readout_s = float(text)
@@ -113,8 +126,9 @@ def camera_of(reader: RecordingReader) -> Camera | None:
         "width_px": message.width,
         "height_px": message.height,
         **{"fx_px": K[0], "fy_px": K[4], "cx_px": K[2], "cy_px": K[5]},
-        **dict(zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True)),
+        **dict(zip(names, d, strict=False)),
         "readout_s": readout_s,
+        "model": model,
     }
     return config.from_mapping(values, Camera, where=f"{reader.path}: calibration")
 

@@ -39,6 +39,11 @@ class ImageFolder:
                 f"{path}: the range {frame_range} holds none of its {len(names)} images"
             )
 
+    @property
+    def paths(self) -> list[Path]:
+        """The files of the frames in the range."""
+        return [path for _, path in self._paths]
+
     def count(self) -> int | None:
         return len(self._paths)
 
@@ -49,7 +54,7 @@ class ImageFolder:
             if shape is not None and image.shape != shape:
                 raise InputError(
                     f"{path}: {image.shape[1]}x{image.shape[0]} px, but the images before it have "
-                    f"{shape[1]}x{shape[0]} px"
+                    f"{shape[1]}x{shape[0]} px: keep those of one size, as the camera wrote them"
                 )
             shape = image.shape
             yield Frame(k, path.name, round(k * 1e9 / self._rate_hz), image)

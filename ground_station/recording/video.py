@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,16 @@ from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey, parameter_sets_in
 
 _BLOCK_BYTES = 1 << 18
+_REORDERED = 16
+"""Pictures that may wait for later ones (ITU-T H.264, A.3.1: MaxDpbFrames is at most 16)."""
 
 
 class VideoFile:
-    """A video in a container (MP4, Matroska, …), with its own timestamps.
+    """A video in a container (MP4, Matroska, …), with its own timestamps, whatever its frame rate.
 
-    A picture without a timestamp is at k / `rate_hz` s, and a note says so.
+    Pictures come as players show them, edit lists obeyed, but not turned. A video without any
+    timestamps has those of `rate_hz`; single pictures without one, or with one that is not later
+    than the picture's before, come half a usual step after that. A note says so.
     """
 
     def __init__(
@@ -39,41 +45,43 @@ class VideoFile:
 
     def __iter__(self) -> Iterator[Frame]:
         self.notes.clear()
-        untimed = given = k = 0
+        given = 0
         with self._open() as container:
+            mended = _Mended(self._rate_hz, container.format.name)
             stream = container.streams.video[0]
-            for k, picture in enumerate(self._decode(container, stream)):
+            for k, (time_ns, picture) in enumerate(mended.times(self._decode(container, stream))):
                 if self._range.is_past(k):
                     break
-                if k not in self._range:
-                    continue
-                if picture.pts is None or picture.time_base is None:
-                    untimed += 1
-                    time_ns = round(k * 1e9 / self._rate_hz)
-                else:
-                    time_ns = round(picture.pts * picture.time_base * 1_000_000_000)
-                given += 1
-                yield Frame(k, frame_name(k), time_ns, grey(picture))
-        if untimed:
-            self.notes.append(
-                f"{self.path}: {untimed} frames without a time, taken at {self._rate_hz:g} Hz"
-            )
+                if k in self._range:
+                    given += 1
+                    yield Frame(k, frame_name(k), time_ns, grey(picture))
+        self.notes += [f"{self.path}: {note}" for note in mended.notes()]
         check_given(self.path, given, self._range)
 
+    def first_picture(self) -> tuple[int, int, int]:
+        """Width, height, and the degrees by which displays turn it clockwise: 0, 90, 180 or 270."""
+        with self._open() as container:
+            for picture in self._decode(container, container.streams.video[0]):
+                # FFmpeg's angle is against the clock.
+                return picture.width, picture.height, round(-picture.rotation / 90) % 4 * 90
+        raise InputError(f"{self.path}: it gives no video frames")
+
     def _decode(self, container: Any, stream: Any) -> Iterator[av.VideoFrame]:
-        damaged = k = 0
+        damaged = unseen = k = 0
         reason = ""
         try:
-            for picture in container.decode(stream):
-                if picture.is_corrupt:
-                    damaged += 1
-                    continue
-                k += 1
-                yield picture
+            for packet in container.demux(stream):
+                unseen += packet.is_discard  # an edit list leaves it out
+                for picture in packet.decode():
+                    if picture.is_corrupt:
+                        damaged += 1
+                        continue
+                    k += 1
+                    yield picture
         except av.error.FFmpegError as error:
             reason = error.strerror or str(error)
         promised = int(stream.frames)
-        if k + damaged < promised:
+        if k + damaged + unseen < promised:
             reason = f"its header promises {promised} frames"
         if reason:
             self.notes.append(f"{self.path}: cut ({reason}); {k} frames read")
@@ -90,6 +98,65 @@ class VideoFile:
             container.close()
             raise InputError(f"{self.path}: it has no video stream")
         return container
+
+
+class _Mended:
+    """Times of pictures in the order of display: those of the container, later by each picture.
+
+    AVI stores one time an entry in the order of decoding, so that times come permuted where
+    pictures wait for later ones: there the k-th picture has the k-th time.
+    """
+
+    def __init__(self, rate_hz: float, container: str) -> None:
+        self._waiting = _REORDERED if container == "avi" else 0
+        self._step_ns = self._nominal_ns = round(1e9 / rate_hz)
+        self._last_ns: int | None = None
+        self._timed = self._untimed = self._late = 0
+
+    def times(self, pictures: Iterator[av.VideoFrame]) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Each picture with its time, nanoseconds."""
+        waiting: deque[tuple[bool, av.VideoFrame]] = deque()
+        pending: list[int] = []
+        for picture in pictures:
+            has_time = False
+            if picture.pts is not None and picture.time_base is not None:
+                has_time = True
+                heappush(pending, round(picture.pts * picture.time_base * 1_000_000_000))
+            waiting.append((has_time, picture))
+            if len(waiting) > self._waiting:
+                has_time, picture = waiting.popleft()
+                yield self._at(heappop(pending) if has_time else None), picture
+        for has_time, picture in waiting:
+            yield self._at(heappop(pending) if has_time else None), picture
+
+    def _at(self, time_ns: int | None) -> int:
+        last = self._last_ns
+        if time_ns is None:
+            self._untimed += 1
+        else:
+            self._timed += 1
+            if last is None or time_ns > last:
+                if last is not None and self._timed > 1:
+                    self._step_ns = time_ns - last
+                self._last_ns = time_ns
+                return time_ns
+            self._late += 1
+        if last is None:
+            time_ns = 0
+        else:
+            time_ns = last + (self._step_ns // 2 if self._timed else self._nominal_ns)
+        self._last_ns = time_ns
+        return time_ns
+
+    def notes(self) -> Iterator[str]:
+        """What was mended."""
+        if self._untimed and not self._timed:
+            rate_hz = 1e9 / self._nominal_ns
+            yield f"{self._untimed} frames without a time, taken at {rate_hz:g} Hz"
+        elif self._untimed:
+            yield f"{self._untimed} frames without a time, put after those before them"
+        if self._late:
+            yield f"{self._late} frames not later than those before them, put after them"
 
 
 class AnnexBFile:

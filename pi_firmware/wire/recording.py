@@ -149,16 +149,20 @@ class RecordingWriter:
         height_px: int,
         matrix: Sequence[float],
         distortion: Sequence[float],
+        distortion_model: str = "plumb_bob",
         topic: str = CALIBRATION_TOPIC,
         frame_id: str = "camera",
     ) -> None:
-        """Adds the camera: `matrix` is K row by row (9), `distortion` k1, k2, p1, p2, k3."""
+        """Adds the camera: `matrix` is K row by row (9), `distortion` k1, k2, p1, p2, k3.
+
+        Of a fisheye, whose `distortion_model` is kannala_brandt, `distortion` is k1 to k4.
+        """
         k = [float(value) for value in matrix]
         message = CameraCalibration(
             frame_id=frame_id,
             width=width_px,
             height=height_px,
-            distortion_model="plumb_bob",
+            distortion_model=distortion_model,
             D=[float(value) for value in distortion],
             K=k,
             R=[1, 0, 0, 0, 1, 0, 0, 0, 1],

@@ -27,6 +27,7 @@ def make_flight(tmp_path: Path) -> Callable[..., Path]:
         name: str = "flight.mcap",
         matrix: Iterable[float] = (150, 0, 79.5, 0, 151, 59.5, 0, 0, 1),
         distortion: Iterable[float] = (0.1, -0.2, 0.001, 0.002, 0.03),
+        distortion_model: str = "plumb_bob",
         width_px: int = WIDTH,
         readout: str | None = "0.02",
         chunk_bytes: int = 4096,
@@ -39,6 +40,7 @@ def make_flight(tmp_path: Path) -> Callable[..., Path]:
                 height_px=HEIGHT,
                 matrix=list(matrix),
                 distortion=list(distortion),
+                distortion_model=distortion_model,
             )
             for number, unit in enumerate(units):
                 time_ns = START_NS + number * PERIOD_NS

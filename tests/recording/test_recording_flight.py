@@ -49,6 +49,18 @@ def test_the_camera_comes_with_its_readout_time(
     assert without is not None and without.readout_s == 0.0
 
 
+@pytest.mark.parametrize("name", ["kannala_brandt", "equidistant"])
+def test_a_fisheye_comes_as_one(
+    make_flight: MakeFlight, access_units: list[bytes], name: str
+) -> None:
+    numbers = (0.02, -0.003, 0.001, -0.0002)
+    path = make_flight(access_units, distortion=numbers, distortion_model=name)
+    camera = open_input(path).camera
+    assert camera is not None and camera.model == "fisheye"
+    np.testing.assert_array_equal(camera.distortion, numbers)
+    assert (camera.distortion_model, camera.readout_s) == ("kannala_brandt", 0.02)
+
+
 def test_an_uncalibrated_recording_has_no_camera(
     make_flight: MakeFlight, access_units: list[bytes]
 ) -> None:
@@ -62,6 +74,8 @@ def test_an_uncalibrated_recording_has_no_camera(
         ({"matrix": (-5.0, 0, 80, 0, 150, 60, 0, 0, 1)}, "fx_px"),
         ({"distortion": (0.1, 0, 0, 0, float("inf"))}, "k3"),
         ({"distortion": [0.0] * 8}, "8 parameters"),
+        ({"distortion_model": "kannala_brandt"}, "kannala_brandt' with 5 parameters"),
+        ({"distortion_model": "rational_polynomial"}, "rational_polynomial"),
         ({"readout": "twenty"}, "readout_s"),
         ({"readout": "nan"}, "readout_s"),
     ],

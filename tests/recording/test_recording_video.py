@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from numbered_video import FRAMES, HEIGHT, WIDTH, encode, number_in, picture
 
 from ground_station.errors import InputError
+from ground_station.recording import video
 from ground_station.recording.h264 import grey
 from ground_station.recording.open import open_input, parse_range
 from pi_firmware.wire import annexb
@@ -92,6 +94,68 @@ def test_a_range_of_a_video_keeps_index_and_time(tmp_path: Path) -> None:
     source = open_input(tmp_path / "v.mp4", frame_range=parse_range("100:"))
     with pytest.raises(InputError, match="no video frames in the range 100:"):
         list(source)
+
+
+def test_what_an_edit_list_leaves_out_is_neither_shown_nor_a_cut(tmp_path: Path) -> None:
+    """Times before 0 are written as an edit list that begins later, as players and phones do."""
+    path = tmp_path / "v.mp4"
+    write_video(path, [-66 + 33 * k for k in range(12)], {"x264-params": "bframes=3:b-adapt=0"})
+    source = open_input(path)
+    frames = list(source)
+    assert [number_in(f.image) for f in frames] == list(range(2, 12))
+    assert [f.time_ns for f in frames] == [33_000_000 * k for k in range(10)]
+    assert source.notes == []
+
+
+def test_an_avi_with_b_frames_has_times_in_the_order_of_its_pictures(tmp_path: Path) -> None:
+    """AVI keeps times in the order of decoding: read as they stand, they jump back and forth."""
+    path = tmp_path / "v.avi"
+    write_video(path, [33 * k for k in range(30)], {"x264-params": "bframes=3:b-adapt=0"})
+    frames = list(open_input(path))
+    assert [number_in(f.image) for f in frames] == list(range(30))
+    steps_ms = np.diff([f.time_ns for f in frames]) / 1e6
+    assert set(steps_ms[:-1]) == {33.0} and 0 < steps_ms[-1] <= 33
+
+
+def test_a_stream_whose_first_time_is_late_keeps_it(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.ts", [1000 + 40 * k for k in range(6)])
+    times = [f.time_ns for f in open_input(tmp_path / "v.ts")]
+    assert list(np.diff(times)) == [40_000_000] * 5 and times[0] >= 1_000_000_000
+
+
+@dataclass
+class Stamped:
+    """What the mending of times reads of a picture."""
+
+    pts: int | None
+    time_base: Fraction = Fraction(1, 1000)
+
+
+def mended(stamps_ms: list[int | None]) -> tuple[list[float], list[str]]:
+    """Times, milliseconds, and notes of pictures with these stamps, at 25 Hz where none has one."""
+    mending = video._Mended(25.0, "matroska")
+    times = [ns / 1e6 for ns, _ in mending.times(iter([Stamped(ms) for ms in stamps_ms]))]
+    return times, list(mending.notes())
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "times_ms", "note"),
+    [
+        ([0, 33, 66, 500, 520], [0, 33, 66, 500, 520], None),
+        ([0, 40, 40, 80, 120], [0, 40, 60, 80, 120], "1 frames not later than those before them"),
+        ([0, 40, 80, 30, 120], [0, 40, 80, 100, 120], "1 frames not later than those before them"),
+        ([0, 40, None, 80], [0, 40, 60, 80], "1 frames without a time, put after"),
+        ([None, None, None], [0, 40, 80], "3 frames without a time, taken at 25 Hz"),
+        ([7, 7, 7], [7, 27, 47], "2 frames not later than those before them"),
+    ],
+)
+def test_times_that_are_missing_or_doubled_are_put_between_and_said(
+    stamps_ms: list[int | None], times_ms: list[float], note: str | None
+) -> None:
+    """A frame that is not later than the one before would be refused by who localizes it."""
+    times, notes = mended(stamps_ms)
+    assert times == times_ms
+    assert [n[: len(note or "")] for n in notes] == ([note] if note else [])
 
 
 def test_a_cut_video_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
