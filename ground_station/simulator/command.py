@@ -9,25 +9,54 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ground_station.simulator.simulate import SimulationSettings
 
-EXAMPLE = "example: blimp simulate --plan loop --light cloudy --seed 7 --out out/loop.mcap"
+EXAMPLE = """\
+examples:
+  blimp simulate --plan loop --light cloudy --seed 7 --out out/loop.mcap
+  blimp simulate --scene hall --plan stills --lens-error 0.01 --out out/stills.mcap
+  blimp simulate --scene rooms --plan headset --seed 3 --out out/headset.mcap"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `blimp simulate`."""
     parser.epilog = EXAMPLE
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add(
         "--scene",
         default="atrium",
-        help="atrium, office, corridor, atrium-moved (other furniture),"
-        " atrium-moved-posted (and other posters) (default: atrium)",
+        help="atrium, office, corridor, hall (repeating panels), rooms (a flat), atrium-moved"
+        " (other furniture), atrium-moved-posted (and other posters) (default: atrium)",
     )
-    add("--plan", default="loop", help="mapping, loop (default), small-circle, fast, corridor")
+    add(
+        "--plan",
+        default="loop",
+        help="mapping, loop (default), small-circle, fast, corridor; of a person's camera: stills"
+        " (12 places, 8 headings, a wide lens), headset (a walk through --scene rooms)",
+    )
     add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")
     add("--out", type=Path, metavar="F.mcap", help="recording to write")
     add("--duration-s", type=float, metavar="S", help="length of the flight (default: the plan's)")
-    add("--rate-hz", type=float, default=30.0, metavar="R", help="frames a second (default: 30)")
+    add(
+        "--rate-hz",
+        type=float,
+        metavar="R",
+        help="frames a second (default: the plan's; of flights, 30)",
+    )
+    add(
+        "--camera",
+        type=Path,
+        metavar="CAMERA.toml",
+        help="the lens that takes the pictures (default: the plan's; of flights, the thesis's)",
+    )
+    add(
+        "--lens-error",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="the recording names focal lengths that are wrong by this share: 0.01 is 1 %% too long"
+        " (default: 0)",
+    )
     add(
         "--draught-m-s",
         type=float,
@@ -86,11 +115,13 @@ def run(args: argparse.Namespace) -> int:
 
 def settings_from(args: argparse.Namespace) -> SimulationSettings:
     """The settings that the arguments say."""
+    from ground_station.geometry.camera import load_camera
     from ground_station.simulator.simulate import SimulationSettings
 
     return SimulationSettings(
         out=args.out, scene=args.scene, plan=args.plan, light=args.light, seed=args.seed,
         duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
         bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points, build=args.build,
-        draught_m_s=args.draught_m_s,
+        draught_m_s=args.draught_m_s, lens_error=args.lens_error,
+        camera=None if args.camera is None else load_camera(args.camera),
     )  # fmt: skip

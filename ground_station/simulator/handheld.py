@@ -1,18 +1,20 @@
-"""A camera carried by hand at a run: steps, sway, and the hand's tremble.
+"""A camera carried by hand at a run, worn on the head at a walk, or held still for a picture.
 
 A runner's head and trunk bounce once a step and sway once in two (Pozzo, Berthoz and Lefort 1990
-find rotations of a few degrees); a hand's tremble lies between 3 and 12 Hz.
+find rotations of a few degrees); a hand's tremble lies between 3 and 12 Hz. Who walks through rooms
+looks about: the head turns against the way, slower than it steps.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ground_station.simulator.motion import Motion, Mount
-from ground_station.simulator.plans import Reference
+from ground_station.simulator.plans import Plan, Reference
 
 Array = npt.NDArray[np.float64]
 
@@ -32,17 +34,34 @@ class Runner:
     tremble_deg: float = 0.35
     tremble_m: float = 0.004
     tremble_Hz: tuple[float, float] = (3.0, 12.0)
+    look_deg: tuple[float, float] = (0.0, 0.0)
+    """Deviations of the head's yaw and pitch from straight along the way."""
+    look_Hz: tuple[float, float] = (0.05, 0.35)
+
+
+WEARER = Runner(
+    steps_Hz=1.7, bounce_m=0.018, sway_m=0.015, pitch_deg=0.9, yaw_deg=0.9, roll_deg=0.7,
+    tremble_deg=0.05, tremble_m=0.001, look_deg=(32.0, 10.0),
+)  # fmt: skip
+"""One who walks with a camera on the head: at 0.8 m/s it turns some 8 degrees in 0.2 s (mean)."""
+
+HEAD = Mount(forward_m=0.1, up_m=0.05, tilt_down_deg=8.0)
+"""A camera at the brow, that looks down a little as eyes do indoors."""
+
+_STILL_M, _STILL_DEG = (0.04, 0.04, 0.02), (2.0, 1.5, 1.0)
+"""Deviations from where a picture was meant to be taken: x, y, z; yaw, pitch, roll."""
 
 
 def _band_noise(
     count: int, columns: int, band_Hz: tuple[float, float], rng: np.random.Generator
 ) -> Array:
     """Gaussian noise (count, columns) of unit deviation between two frequencies, falling as 1/f."""
-    f = np.fft.rfftfreq(count, _STEP_S)
+    whole = max(count, math.ceil(1 / band_Hz[0] / _STEP_S))  # a period of the slowest, at least
+    f = np.fft.rfftfreq(whole, _STEP_S)
     gain = np.where((f >= band_Hz[0]) & (f <= band_Hz[1]), 1 / np.maximum(f, 1e-3), 0.0)
-    spectrum = np.fft.rfft(rng.standard_normal((count, columns)), axis=0) * gain[:, None]
-    noise = np.fft.irfft(spectrum, n=count, axis=0)
-    return noise / noise.std(axis=0)
+    spectrum = np.fft.rfft(rng.standard_normal((whole, columns)), axis=0) * gain[:, None]
+    noise = np.fft.irfft(spectrum, n=whole, axis=0)
+    return (noise / noise.std(axis=0))[:count]
 
 
 def carry(
@@ -74,5 +93,17 @@ def carry(
     cycle = np.stack([stride, np.sin(phase + 1.1), np.sin(phase / 2 + 0.5)], axis=1)
     angles = size[:, None] * swing * cycle + np.radians(r.tremble_deg) * tremble[:, 3:]
     angles[:, 0] += yaw
+    if any(r.look_deg):
+        angles[:, :2] += np.radians(r.look_deg) * _band_noise(count, 2, r.look_Hz, rng)
     held = mount or Mount(forward_m=0.3, up_m=0.0, tilt_down_deg=2.0)
     return Motion(times, moved, angles, held)
+
+
+def hold(plan: Plan, times_s: Array, rng: np.random.Generator) -> Motion:
+    """Holds the camera still at a plan's stands, in an order by chance, one at each time (N,)."""
+    stands = rng.permutation(plan.stands)[: len(times_s)]
+    position, yaw = plan.shape((stands + 0.5) / plan.stands)
+    angles = np.radians(_STILL_DEG) * rng.standard_normal((len(stands), 3))
+    angles[:, 0] += yaw
+    moved = position + np.array(_STILL_M) * rng.standard_normal((len(stands), 3))
+    return Motion(times_s, moved, angles, Mount(0.0, 0.0, 0.0), is_held=True)

@@ -26,6 +26,8 @@ Bytes = npt.NDArray[np.uint8]
 # Beyond the lens's field on each side (tangent), for what turns into view during a frame.
 _MARGIN = 0.05
 _MAX_SAMPLES = 12
+# Of a fisheye: the circle of its picture, as one plane is rendered. Tangent of 80°.
+_RIM = math.tan(math.radians(80.0))
 # Saturation of the sensor over the level of white: headroom for the tone curve.
 _OVERRANGE = 4.0
 _CONTRAST = 0.8
@@ -63,10 +65,30 @@ def covering_pinhole(camera: Camera, supersampling: float) -> Pinhole:
         np.stack([u, np.zeros_like(u)], 1), np.stack([u, np.full_like(u, v[-1])], 1),
         np.stack([np.zeros_like(v), v], 1), np.stack([np.full_like(v, u[-1]), v], 1),
     ])  # fmt: skip
-    reach = np.abs(camera.undistort(edge)).max(axis=0) + _MARGIN
+    sides = _flat(camera, edge)
+    if camera.model == "fisheye":  # whose rim may lie within the picture
+        sides = np.concatenate([sides, _flat(camera, _rim(camera))])
+    reach = np.nanmax(np.abs(sides), axis=0) + _MARGIN
     focal = supersampling * 0.5 * (camera.fx_px + camera.fy_px)
     width, height = (int(math.ceil(2 * r * focal / 8) * 8) for r in reach)
     return Pinhole(width, height, focal)
+
+
+def _flat(camera: Camera, pixels: npt.ArrayLike) -> Array:
+    """Pixels (N, 2) on the plane z = 1 (N, 2), NaN beyond the rim."""
+    rays = camera.rays(pixels)
+    flat = rays[:, :2] / np.where(rays[:, 2] > 0, rays[:, 2], np.nan)[:, None]
+    flat[~(np.hypot(flat[:, 0], flat[:, 1]) <= _RIM)] = np.nan
+    return flat
+
+
+def _rim(camera: Camera) -> Array:
+    """Pixels (M, 2) of the picture just within the rim, where it is in the picture at all."""
+    turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    pixels = camera.distort(0.9999 * _RIM * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    size = [camera.width_px - 1, camera.height_px - 1]
+    with np.errstate(invalid="ignore"):
+        return pixels[((pixels >= 0) & (pixels <= size)).all(axis=1)]
 
 
 class FrameMaker:
@@ -87,10 +109,15 @@ class FrameMaker:
         self._renderer, self._decoder = renderer, np.asarray(decoder, np.float32)
         h, w = camera.height_px, camera.width_px
         grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2)
-        rays = camera.undistort(grid).reshape(h, w, 2).astype(np.float32)
+        flat = _flat(camera, grid).reshape(h, w, 2)
+        seen = np.isfinite(flat[..., 0])
+        rays = np.nan_to_num(flat).astype(np.float32)
         self._x, self._y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
         r2 = self._x**2 + self._y**2
+        if camera.model == "fisheye":  # on the plane nearly all light would be of the rim
+            r2 = np.arctan(np.sqrt(r2)) ** 2
         self._vignette = 1 - np.float32(self.sensor.vignetting) * (r2 / r2.max())
+        self._vignette[~seen] = 0
         self._rows_s = row_offsets_s(camera)
         codes = np.arange(16384) / 16383.0
         # Gamma with a soft shoulder (Reinhard et al. 2002, eq. 4), so that highlights fade into

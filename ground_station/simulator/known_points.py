@@ -115,7 +115,7 @@ def choose_sights(
         high = (pixels < [camera.width_px - 1 - _EDGE_PX, camera.height_px - 1 - _EDGE_PX]).all(
             axis=1
         )
-        candidates = low & high & (flow < _FLOW_LIMIT_PX_S)
+        candidates = low & high & (flow < _FLOW_LIMIT_PX_S) & camera.uses(pixels)
         if not candidates.any():
             continue
         for i in np.flatnonzero(candidates & _visible(renderer, pinhole, wTc, points)).tolist():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry import poses
@@ -36,6 +36,9 @@ class Mount:
 class Motion:
     """Poses of the camera by cubic splines through body positions and yaw, pitch, roll.
 
+    With `is_held` it stands still at each of them, from halfway since the time before to halfway
+    until the one after.
+
     `times_s` (N,), `position_m` (N, 3) world, `angles_rad` (N, 3) yaw (unwrapped), pitch (nose down
     positive), roll: R = Rz(yaw) Ry(pitch) Rx(roll).
     """
@@ -46,9 +49,18 @@ class Motion:
         position_m: npt.NDArray[Any],
         angles_rad: npt.NDArray[Any],
         mount: Mount,
+        *,
+        is_held: bool = False,
     ) -> None:
         self.start_s, self.end_s = float(times_s[0]), float(times_s[-1])
-        self._spline = CubicSpline(times_s, np.hstack([position_m, angles_rad]))
+        states = np.hstack([position_m, angles_rad])
+        self._spline: PPoly
+        if is_held:
+            between = (times_s[1:] + times_s[:-1]) / 2
+            knots = np.concatenate([[times_s[0] - 1], between, [times_s[-1] + 1]])
+            self._spline = PPoly(states[None], knots)
+        else:
+            self._spline = CubicSpline(times_s, states)
         self._rates = self._spline.derivative()
         self._bTc = mount.bTc
 

@@ -1,17 +1,22 @@
 """Flight plans: closed paths through a hall with the heading along them, at a given speed.
 
-The paths are ellipses about the hall's middle that keep clear of pillars, furniture and lamps.
+Flights are ellipses about the hall's middle that keep clear of pillars, furniture and lamps. Two
+plans are of a person's camera: `headset` walks through the doorways of a scene that has walks, and
+`stills` stands on a grid and looks around at each place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.scene import Scene, SimulatorError
 
 Array = npt.NDArray[np.float64]
@@ -23,10 +28,31 @@ Shape = Callable[[Array], tuple[Array, Array]]
 _OFF_WALLS_M, _LOOKED_AT = 0.3, 400
 """How near a path may come to a scene's outermost walls, and at how many places it is looked at."""
 
+WIDE_CAMERA = Camera(
+    fx_px=343.2, fy_px=343.2, cx_px=322.4, cy_px=236.8, k1=-0.2171, k2=0.0523, k3=-0.0056
+)
+"""A wide lens, 100 degrees from side to side: what five parameters make of a stereographic one."""
+
+HEADSET_CAMERA = Camera(
+    fx_px=450.0, fy_px=450.0, cx_px=317.2, cy_px=243.5, k1=-0.12, k2=0.03, p1=0.0004, p2=-0.0003
+)
+"""A headset's camera, some 75 degrees wide, with a global shutter."""
+
+GRID_M, PLACES, HEADINGS = (3.8, 1.8), (4, 3), 8
+"""Spacing and number of the stills' places along x and y; headings at each, evenly around."""
+
+_EYE_M = 1.6
+_ROUNDING_M = 0.35  # deviation of what rounds the corners of a walk
+
 
 @dataclass(frozen=True)
 class Plan:
-    """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp."""
+    """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp.
+
+    With `stands` it is not flown: pictures are taken at as many even steps of the one turn; with
+    `is_worn` the camera is on a head. `rate_hz` and `camera` are what it is filmed with unless
+    something else is asked for.
+    """
 
     name: str
     shape: Shape
@@ -34,6 +60,10 @@ class Plan:
     speed_m_s: float
     by_hand: bool
     default_duration_s: float
+    is_worn: bool = False
+    stands: int = 0
+    rate_hz: float = 30.0
+    camera: Camera = THESIS_CAMERA
 
 
 class Reference:
@@ -82,12 +112,14 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
 
     Raises `SimulatorError` naming the plans there are, and for one that leaves the scene.
     """
-    plans = {
+    plans: dict[str, Callable[[tuple[float, float], Array], Plan]] = {
         "mapping": _mapping,
         "loop": _loop,
         "small-circle": _small_circle,
         "fast": _fast,
         "corridor": _corridor,
+        "stills": _stills,
+        "headset": partial(_headset, scene),
     }
     if name not in plans:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
@@ -178,3 +210,50 @@ def _corridor(centre: tuple[float, float], shift: Array) -> Plan:
         return np.stack([centre[0] + x, centre[1] - 0.6 + y, z], axis=1), yaw
 
     return Plan("corridor", shape, 1.0, 0.45, False, 105.0)
+
+
+def _stills(centre: tuple[float, float], shift: Array) -> Plan:
+    """A grid of places, at each of them pictures all around; no way leads from one to the next."""
+    count = PLACES[0] * PLACES[1] * HEADINGS
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        index = np.minimum((np.asarray(s) * count).astype(np.int64), count - 1)
+        place, heading = np.divmod(index, HEADINGS)
+        cell = np.stack(np.divmod(place, PLACES[1]), axis=1)
+        spot = (cell - (np.array(PLACES) - 1) / 2) * GRID_M + np.array(centre) + 0.2 * shift[:2]
+        z = np.full(len(spot), _EYE_M + 0.05 * shift[2])
+        yaw = 2 * np.pi * heading / HEADINGS + 0.2 * shift[3]
+        return np.column_stack([spot, z]), yaw
+
+    return Plan("stills", shape, 1.0, 0.0, True, 2.0 * count, stands=count, rate_hz=0.5,
+                camera=WIDE_CAMERA)  # fmt: skip
+
+
+def _headset(scene: Scene, centre: tuple[float, float], shift: Array) -> Plan:
+    """30 m on foot through rooms: once around a short walk, or part of a long one, by chance."""
+    if not scene.walks:
+        raise SimulatorError(
+            f"plan 'headset' walks through doorways; scene '{scene.name}' has none: --scene rooms"
+        )
+    corners = np.array(scene.walks[int(shift[0] > 0) % len(scene.walks)])
+    corners = corners if shift[1] > 0 else corners[::-1]  # the other way round
+    legs = np.diff(np.vstack([corners, corners[:1]]), axis=0)
+    reach = np.concatenate([[0], np.cumsum(np.linalg.norm(legs, axis=1))])
+    length_m, step_m = float(reach[-1]), 0.02
+    along = np.arange(0, length_m, step_m)
+    closed = np.vstack([corners, corners[:1]])
+    raw = np.stack([np.interp(along, reach, column) for column in closed.T], axis=1)
+    path = gaussian_filter1d(raw, _ROUNDING_M / step_m, axis=0, mode="wrap")
+    path = np.vstack([path, path[:1]])
+    spline = CubicSpline(np.linspace(0, 1, len(path)), path, bc_type="periodic")
+    tangent = spline(np.linspace(0, 1, len(path)), 1)
+    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    turning = CubicSpline(np.linspace(0, 1, len(path)), heading)
+
+    def shape(s: Array) -> tuple[Array, Array]:
+        place = spline(np.asarray(s))
+        z = np.full(len(place), _EYE_M + 0.06 * shift[2])
+        return np.column_stack([place, z]), turning(np.asarray(s))
+
+    return Plan("headset", shape, 1.0, 0.8, True, 39.0, is_worn=True, rate_hz=5.0,
+                camera=HEADSET_CAMERA)  # fmt: skip

@@ -50,6 +50,8 @@ class Scene:
     known_points: tuple[KnownPoint, ...]
     lamps: tuple[Lamp, ...]
     texture_seed: int
+    walks: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Closed ways on foot by their corners (x, y), metres, through the middles of doorways."""
     centre_m: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
 
     def __post_init__(self) -> None:

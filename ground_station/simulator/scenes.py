@@ -7,13 +7,17 @@ from functools import partial
 
 from ground_station.simulator.atrium import build_atrium
 from ground_station.simulator.corridor import build_corridor
+from ground_station.simulator.hall import build_hall
 from ground_station.simulator.office import build_office
+from ground_station.simulator.rooms import build_rooms
 from ground_station.simulator.scene import Scene, SimulatorError
 
 _SCENES: dict[str, Callable[[float], Scene]] = {
     "atrium": build_atrium,
     "office": build_office,
     "corridor": build_corridor,
+    "hall": build_hall,
+    "rooms": build_rooms,
     "atrium-moved": partial(build_atrium, moved=True),
     "atrium-moved-posted": partial(build_atrium, moved=True, posted=True),
 }

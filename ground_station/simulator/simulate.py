@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
-from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.simulator import dynamics, handheld, scenes
 from ground_station.simulator.encoding import H264Encoder
@@ -41,7 +41,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What to fly. `duration_s` None is the plan's own; `bitrate_kbps` replaces `crf`.
+    """What to fly. `bitrate_kbps` replaces `crf`; what is None is the plan's own.
+
+    `camera` takes the pictures; the recording carries one whose focal lengths are off by the share
+    `lens_error`, as a calibration of another day is.
 
     `build` is one of `hw/builds.toml`; None: the one that `simulated` there names. `draught_m_s` is
     the deviation of the air's speed along each axis; None: that of a quiet hall.
@@ -53,7 +56,7 @@ class SimulationSettings:
     light: str = "noon"
     seed: int = 0
     duration_s: float | None = None
-    rate_hz: float = 30.0
+    rate_hz: float | None = None
     crf: float = 20.0
     bitrate_kbps: int | None = None
     truth: Path | None = None
@@ -61,7 +64,8 @@ class SimulationSettings:
     texels_per_m: float = 150.0
     supersampling: float = 1.25
     renders: int = 2
-    camera: Camera = THESIS_CAMERA
+    camera: Camera | None = None
+    lens_error: float = 0.0
     build: str | None = None
     draught_m_s: float | None = None
 
@@ -72,10 +76,11 @@ class SimulationSettings:
             "crf": (0.0, 51.0),
             "supersampling": (0.25, 3.0),
             "renders": (1, 8),
+            "lens_error": (-0.2, 0.2),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise SimulatorError(f"{name} is {value}; allowed: {low:g} to {high:g}")
         if self.duration_s is not None and not 0 < self.duration_s <= 3600:
             raise SimulatorError(f"duration_s is {self.duration_s:g}; allowed: above 0 to 3600")
@@ -112,11 +117,17 @@ class SimulationResult:
 
 @dataclass(frozen=True)
 class Flight:
-    """A plan in motion and the times of its frames, seconds on the motion's clock."""
+    """A plan in motion and the times of its frames, seconds on the motion's clock.
+
+    `camera` takes the frames, `carried` is the one that the recording names.
+    """
 
     scene: Scene
     plan: Plan
     motion: Motion
+    rate_hz: float
+    camera: Camera
+    carried: Camera
     times_s: npt.NDArray[np.float64]
     noise: np.random.Generator
     clicks: np.random.Generator
@@ -129,20 +140,32 @@ def prepare_flight(settings: SimulationSettings) -> Flight:
     path, air, noise, clicks = streams
     plan = plan_named(settings.plan, scene, path)
     duration = settings.duration_s or plan.default_duration_s
-    count = max(1, round(duration * settings.rate_hz))
+    rate_hz = settings.rate_hz or plan.rate_hz
+    count = max(1, round(duration * rate_hz))
+    if plan.stands:  # none is taken twice; all of them, at whatever rate, unless some are asked for
+        count = min(count, plan.stands) if settings.duration_s else plan.stands
+    times_s = np.arange(count) / rate_hz
     phase = float(path.random())
     if plan.by_hand:
         if settings.build is not None:
             raise SimulatorError(f"build is {settings.build!r}; plan {settings.plan!r} flies none")
         if settings.draught_m_s is not None:
             raise SimulatorError(f"draught_m_s is for a blimp; plan {settings.plan!r} is by hand")
-        motion = handheld.carry(Reference(plan, phase, _RUN_UP_S), duration, air)
+        if plan.stands:
+            motion = handheld.hold(plan, times_s, air)
+        else:
+            reference = Reference(plan, phase, _RUN_UP_S)
+            worn = (handheld.WEARER, handheld.HEAD) if plan.is_worn else (None, None)
+            motion = handheld.carry(reference, duration, air, *worn)
     else:
         blimp = dynamics.Blimp.of_build(settings.build) if settings.build else dynamics.Blimp()
         if settings.draught_m_s is not None:
             blimp = replace(blimp, draught_m_s=settings.draught_m_s)
         motion = dynamics.fly(Reference(plan, phase), duration, air, blimp)
-    return Flight(scene, plan, motion, np.arange(count) / settings.rate_hz, noise, clicks)
+    camera = settings.camera or plan.camera
+    wrong = 1 + settings.lens_error
+    carried = replace(camera, fx_px=camera.fx_px * wrong, fy_px=camera.fy_px * wrong)
+    return Flight(scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks)
 
 
 def time_ns_of(times_s: npt.ArrayLike) -> npt.NDArray[np.int64]:
@@ -194,7 +217,7 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     started = time.monotonic()
     light_named(settings.light)  # refused before anything costly
     flight = prepare_flight(settings)
-    camera, sensor = settings.camera, Sensor()
+    camera, sensor = flight.camera, Sensor()
     _, lit = lit_scene(settings.scene, settings.texels_per_m, settings.light)
     pinhole = covering_pinhole(camera, settings.supersampling)
     buffer = (pinhole.width_px, pinhole.height_px)
@@ -219,8 +242,8 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     speed, turn = flight.motion.speed(times)
     return SimulationResult(
         out=str(settings.out), scene=settings.scene, plan=settings.plan, light=settings.light,
-        seed=settings.seed, frames=taken, duration_s=round(taken / settings.rate_hz, 6),
-        rate_hz=settings.rate_hz, bytes=settings.out.stat().st_size, setup_s=round(setup_s, 3),
+        seed=settings.seed, frames=taken, duration_s=round(taken / flight.rate_hz, 6),
+        rate_hz=flight.rate_hz, bytes=settings.out.stat().st_size, setup_s=round(setup_s, 3),
         frame_s=round(frame_s, 4), interrupted=interrupted, sights=len(sights),
         max_speed_m_s=round(float(speed.max(initial=0)), 3),
         max_turn_deg_s=round(math.degrees(float(turn.max(initial=0))), 2),
@@ -231,10 +254,10 @@ def _record(
     settings: SimulationSettings, flight: Flight, maker: FrameMaker, progress: Progress | None
 ) -> tuple[int, bool]:
     """Takes and writes all frames; returns their number and whether it was interrupted."""
-    camera, motion, times = settings.camera, flight.motion, flight.times_s
+    camera, motion, times = flight.camera, flight.motion, flight.times_s
     stamps = time_ns_of(times).tolist()
     encoder = H264Encoder(
-        camera.width_px, camera.height_px, settings.rate_hz,
+        camera.width_px, camera.height_px, flight.rate_hz,
         crf=settings.crf, bitrate_kbps=settings.bitrate_kbps,
     )  # fmt: skip
     taken = 0
@@ -242,10 +265,12 @@ def _record(
         _write_head(writer, settings, flight, stamps[0])
         exposure = AutoExposure(maker.sensor, maker.radiance(motion, float(times[0]), 0.0))
         for k, t in enumerate(times.tolist()):
+            if flight.plan.stands:  # held until the exposure has settled
+                exposure = AutoExposure(maker.sensor, maker.radiance(motion, t, 0.0))
             exposure_s, gain = exposure.settings
             radiance = maker.radiance(motion, t, exposure_s)
             picture = maker.expose(radiance, exposure_s, gain, flight.noise)
-            exposure.update(radiance, 1 / settings.rate_hz)
+            exposure.update(radiance, 1 / flight.rate_hz)
             pose = motion.wTc([t])[0]
             writer.write_pose(
                 stamps[k], pose[:3, 3].tolist(), poses.to_quaternion(pose).tolist(),
@@ -270,7 +295,7 @@ def _record(
 def _write_head(
     writer: RecordingWriter, settings: SimulationSettings, flight: Flight, first_ns: int
 ) -> None:
-    camera = settings.camera
+    camera = flight.carried
     writer.write_metadata("camera", {k: str(v) for k, v in camera.as_dict().items()})
     writer.write_metadata(
         "simulation",
@@ -279,8 +304,8 @@ def _write_head(
             "scene": settings.scene,
             "plan": settings.plan,
             "light": settings.light,
-            "rate_hz": f"{settings.rate_hz:g}",
-            "duration_s": f"{len(flight.times_s) / settings.rate_hz:g}",
+            "rate_hz": f"{flight.rate_hz:g}",
+            "duration_s": f"{len(flight.times_s) / flight.rate_hz:g}",
             "version": metadata.version("blimp-localization"),
             # The one that is flown without being asked for is not named, as ever.
             **({"build": settings.build} if settings.build else {}),
@@ -289,12 +314,17 @@ def _write_head(
                 if settings.draught_m_s is not None
                 else {}
             ),
+            **({"lens_error": f"{settings.lens_error:g}"} if settings.lens_error else {}),
         },
     )
+    if settings.lens_error:
+        taken_with = {k: str(v) for k, v in flight.camera.as_dict().items()}
+        writer.write_metadata("true_camera", taken_with)
     writer.write_calibration(
         first_ns,
         width_px=camera.width_px,
         height_px=camera.height_px,
         matrix=camera.matrix.ravel().tolist(),
         distortion=camera.distortion.tolist(),
+        distortion_model=camera.distortion_model,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,13 @@ def _dotted(
 
 @pytest.fixture(scope="session")
 def room() -> Iterator[Room]:
+    with open_room(THESIS_CAMERA) as opened:
+        yield opened
+
+
+@contextmanager
+def open_room(camera: Camera) -> Iterator[Room]:
+    """The room, drawn large enough for a camera."""
     builder = SceneBuilder(TEXELS_PER_M)
     builder.rectangle([5, 2.5, 0], [0, -5.5, 0], [0, 0, 4], "dots")  # ahead
     builder.rectangle([0, 2.5, 0], [5, 0, 0], [0, 0, 4], "dots")  # left
@@ -66,7 +74,7 @@ def room() -> Iterator[Room]:
     textures, centres, halves = zip(*(_dotted(s, rng) for s in builder.surfaces), strict=True)
     decoder = (np.arange(256) / 255.0).astype(np.float32)
     supersampling = 1.25
-    pinhole = covering_pinhole(THESIS_CAMERA, supersampling)
+    pinhole = covering_pinhole(camera, supersampling)
     size = (pinhole.width_px, pinhole.height_px)
     with SceneRenderer(builder.surfaces, textures, size) as renderer:
         yield Room(

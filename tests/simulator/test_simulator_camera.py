@@ -14,7 +14,7 @@ from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.imaging import AutoExposure, Sensor, row_offsets_s
 from ground_station.simulator.known_points import project_rolling
 from ground_station.simulator.motion import Motion, Mount
-from tests.simulator.conftest import Room
+from tests.simulator.conftest import Room, open_room
 
 Array = npt.NDArray[np.float64]
 
@@ -44,13 +44,18 @@ def measured_and_expected(
     for centre, (a, b) in zip(room.centres, room.half_edges, strict=True):
         outline = centre + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) @ np.stack([a, b]) * 1.6
         x, y, z = poses.transform(cTw, centre[None])[0]
-        if z < 0.3 or abs(x / z) > 0.75 or abs(y / z) > 0.6:
-            continue  # beyond the lens's field its polynomial folds back
+        # Beyond the lens's field its polynomial folds back, and a fisheye's picture is dark.
+        outside = abs(x) > 0.75 * z or abs(y) > 0.6 * z
+        if camera.model == "fisheye":
+            outside = np.hypot(x, y) > 3.7 * z
+        if z < 0.3 or outside:
+            continue
         box = project_rolling(camera, motion, 0.0, outline)
         if not np.isfinite(box).all():
             continue
         low, high = np.floor(box.min(axis=0)).astype(int), np.ceil(box.max(axis=0)).astype(int)
-        if (low < 3).any() or (high > [636, 476]).any() or (high - low).min() < 8:
+        far = [camera.width_px - 4, camera.height_px - 4]
+        if (low < 3).any() or (high > far).any() or (high - low).min() < 8:
             continue
         inside = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
         pixels = project_rolling(camera, motion, 0.0, centre + inside @ np.stack([a, b]))
@@ -77,6 +82,28 @@ def test_a_still_camera_sees_every_dot_where_its_model_projects_it(room: Room) -
     assert len(error) > 60
     assert error.max() < 0.3
     assert np.abs((measured - expected).mean(axis=0)).max() < 0.03
+
+
+def test_a_fisheye_sees_every_dot_where_its_model_projects_it_and_is_dark_beyond_80_degrees() -> (
+    None
+):
+    wide = Camera(
+        width_px=480, height_px=360, fx_px=170.0, fy_px=171.0, cx_px=241.0, cy_px=178.0,
+        model="fisheye", k1=-0.02, k2=0.004,
+    )  # fmt: skip
+    with open_room(wide) as room:
+        measured, expected = measured_and_expected(room, wide, STILL, 0.0, 1)
+        maker = room.maker(wide, 1)
+        picture = maker.expose(maker.radiance(STILL, 0.0, 0.0), 1e-3, 1.0, None)
+    error = np.linalg.norm(measured - expected, axis=1)
+    rays = wide.rays(expected)
+    angle_deg = np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+    assert len(error) > 60 and angle_deg.max() > 65
+    assert error.max() < 0.3
+    grid = np.stack(np.meshgrid(np.arange(480), np.arange(360)), axis=-1).reshape(-1, 2)
+    rays = wide.rays(grid)
+    dark = (rays[:, 2] < np.cos(np.radians(80.1))).reshape(360, 480)
+    assert dark.any() and (picture[dark] == 0).all() and (picture[~dark] > 0).mean() > 0.6
 
 
 @pytest.mark.parametrize(("renders", "exposure_s"), [(2, 0.0), (3, 0.008)])

@@ -184,17 +184,23 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
     [
         (
             {"plan": "zigzag"},
-            "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor",
+            "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor, "
+            "stills, headset",
         ),
         ({"light": "moon"}, "light 'moon' is unknown; there are: noon, cloudy, evening, sunset"),
         (
             {"scene": "cave"},
-            "scene 'cave' is unknown; there are: atrium, office, corridor, atrium-moved, "
-            "atrium-moved-posted",
+            "scene 'cave' is unknown; there are: atrium, office, corridor, hall, rooms, "
+            "atrium-moved, atrium-moved-posted",
         ),
         ({"rate_hz": 0.0}, "rate_hz is 0.0; allowed: 0.1 to 120"),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
         ({"duration_s": -1.0}, "duration_s is -1; allowed: above 0 to 3600"),
+        ({"lens_error": 0.5}, "lens_error is 0.5; allowed: -0.2 to 0.2"),
+        (
+            {"plan": "headset"},
+            "plan 'headset' walks through doorways; scene 'atrium' has none: --scene rooms",
+        ),
         ({"crf": 90.0}, "crf is 90.0; allowed: 0 to 51"),
         ({"seed": -1}, "seed is -1; allowed: 0 to 9.22337e+18"),
     ],
