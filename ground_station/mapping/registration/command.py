@@ -182,4 +182,5 @@ def _print(report: dict[str, Any]) -> None:
         for k, (name, residual) in enumerate(
             zip(report["point_names"], report["point_residual_m"], strict=True)
         ):
-            print(f"{name:<24} {residual:>10.4f}" + (f" {held[k]:>10.4f}" if held else ""))
+            most = "  disagrees most" if name == report.get("disagrees_most") else ""
+            print(f"{name:<24} {residual:>10.4f}" + (f" {held[k]:>10.4f}{most}" if held else ""))

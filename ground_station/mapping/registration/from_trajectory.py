@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from ground_station.errors import GeometryError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.mapping.registration import agreement
 from ground_station.mapping.registration.pose_similarity import (
+    Offset,
     Positions,
     joint_similarity,
     orientation_offset,
@@ -29,12 +32,11 @@ from ground_station.mapping.registration.uncertainty import Uncertainty, jacobia
 from ground_station.mapping.store import Keyframes, Map
 
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
 _MAX_DIFF_NS = 10_000_000
 """A trajectory's pose counts for a keyframe within 10 ms, as in the evaluation."""
-
-_MOST_OF_SPREAD = 0.5
-"""A quarter of the variance. Of a room's path a sound model left 4e-5, one inside out 0.4."""
 
 _MIN_EXTENT, _MAX_EXTENT = 1e-9, 1e9
 """Of a path, in a model's units or metres: beyond, squares leave the numbers' range."""
@@ -47,29 +49,22 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
     rotation off the camera's (a vehicle's own axes) are left out, with a note. Positions on one
     line leave the roll about it to the orientations. Raises `MapError` for fewer than three poses,
     numbers that are not finite, positions in one place, positions on one line where the
-    orientations cannot be used, and a map whose shape is not the trajectory's.
+    orientations cannot be used, and a trajectory that `agreement` finds to be of another flight,
+    damaged, or too short for the map.
     """
-    model, truth = _matched(map_.keyframes, trajectory)
+    chosen, model, truth = _matched(map_.keyframes, trajectory)
     n, total = len(model), len(map_.keyframes)
     notes = [f"{n} of {total} keyframes have a pose in the trajectory"]
-    positions = Positions(model[:, :3, 3], truth[:, :3, 3])
-    turned = truth[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)
-    mean, turned_alike = robust_rotation(turned, seed)
-    try:
-        check_spread(positions.target, "positions")
-        noise = np.zeros(n)
-        fit, alike = robust_similarity(positions.source, positions.target, noise, seed, "positions")
-        on_line = False
-    except (MapError, GeometryError):
-        fit, alike = similarity_on_a_line(positions, mean, seed)
-        on_line = True
+    time_ns = map_.keyframes.time_ns[chosen]
+    if odd := agreement.too_fast(time_ns, truth[:, :3, 3]):
+        raise MapError(f"registration: {odd}")
+    started = _start(model, truth, seed)
+    _check_agrees(started, model, truth, time_ns, trajectory, seed)
+    used, fit, offset = started.used, started.fit, started.offset
+    alike, turned, turned_alike = started.alike, started.turned, started.turned_alike
+    scatter_m, on_line = started.scatter_m, started.on_line
+    if on_line:
         notes.append("the positions lie on one line: the orientations give the roll about it")
-    used = positions.of(alike)
-    scatter_m = max(position_scatter(used, fit), used.floor_m())
-    _check_shape(scatter_m, used.target)
-    offset = orientation_offset(
-        fit, used.information(fit, scatter_m), model[:, :3, :3], truth[:, :3, :3], seed
-    )
     report: dict[str, Any] = {"method": "trajectory", "points": len(used.source), "points_given": n}
     if offset.another_frame:
         if on_line:
@@ -94,6 +89,8 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
             "sigma_m": joint.sigma_m,
             "sigma_deg": float(np.degrees(joint.sigma_rad)),
         }
+    if odd := agreement.extrapolates(known, fit.apply(map_.keyframes.wTc[:, :3, 3])):
+        raise MapError(f"registration: {odd}")
     if not alike.all():
         notes.append(f"{int((~alike).sum())} positions left out: far off where the others agree")
     if not (turned_alike.all() or offset.another_frame):
@@ -112,22 +109,98 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
     return Registration(fit, report, known, notes)
 
 
-def _check_shape(scatter_m: float, target: F64) -> None:
-    """Raises `MapError` where the positions hardly say where one keyframe is beside another.
+@dataclass(frozen=True)
+class _Start:
+    """The similarity by positions, which of them agree, and what the orientations say to it."""
 
-    Structure from motion can end inside out, with all images registered and small residuals.
+    used: Positions
+    fit: Alignment
+    alike: Bools
+    scatter_m: float
+    on_line: bool
+    turned: F64
+    turned_alike: Bools
+    offset: Offset
+
+
+def _start(model: F64, truth: F64, seed: int) -> _Start:
+    """Of matched poses (N, 4, 4); raises `MapError` where they leave the similarity open."""
+    positions = Positions(model[:, :3, 3], truth[:, :3, 3])
+    turned = truth[:, :3, :3] @ np.swapaxes(model[:, :3, :3], 1, 2)
+    mean, turned_alike = robust_rotation(turned, seed)
+    try:
+        check_spread(positions.target, "positions")
+        noise = np.zeros(len(model))
+        fit, alike = robust_similarity(positions.source, positions.target, noise, seed, "positions")
+        on_line = False
+    except (MapError, GeometryError):
+        fit, alike = similarity_on_a_line(positions, mean, seed)
+        on_line = True
+    used = positions.of(alike)
+    scatter_m = max(position_scatter(used, fit), used.floor_m())
+    offset = _offset(used, fit, scatter_m, model, truth, seed)
+    return _Start(used, fit, alike, scatter_m, on_line, turned, turned_alike, offset)
+
+
+def _offset(
+    used: Positions, fit: Alignment, scatter_m: float, model: F64, truth: F64, seed: int
+) -> Offset:
+    information = used.information(fit, scatter_m)
+    return orientation_offset(fit, information, model[:, :3, :3], truth[:, :3, :3], seed)
+
+
+def _check_agrees(
+    found: _Start, model: F64, truth: F64, time_ns: I64, trajectory: Trajectory, seed: int
+) -> None:
+    """Raises `MapError` for a trajectory that is not this flight's, with the mistake it looks like.
+
+    Structure from motion can also end inside out, with all images registered and small residuals.
     """
-    spread_m = float(np.sqrt(np.mean((target - target.mean(axis=0)) ** 2)))
-    if scatter_m > _MOST_OF_SPREAD * spread_m:
-        raise MapError(
-            "registration: the map has not the shape of the trajectory: its keyframes scatter "
-            f"{scatter_m:.3g} m an axis about a path that spreads {spread_m:.3g} m (allowed: half "
-            "of it); the map's structure is wrong, or the trajectory is of another flight"
+    fitted = _fitted(found, model, truth)
+    reason = agreement.disagreement(fitted)
+    hint = agreement.mirrored(fitted)
+    if not hint:
+        hint = agreement.late(found.used.source, time_ns[found.alike], trajectory)
+    if reason and not hint:
+        for words, mended in agreement.mistakes(truth):
+            if np.array_equal(mended[:, :3, 3], truth[:, :3, 3]) and not found.on_line:
+                other = replace(
+                    found,
+                    offset=_offset(found.used, found.fit, found.scatter_m, model, mended, seed),
+                )
+            else:
+                try:
+                    other = _start(model, mended, seed)
+                except MapError:
+                    continue
+            if not agreement.disagreement(_fitted(other, model, mended)):
+                hint = words
+                break
+    if reason or hint:
+        reason = reason or (
+            f"the trajectory scatters {found.scatter_m:.3g} m an axis about the keyframes, more "
+            "than twice what it need"
         )
+        hint = hint or (
+            "the trajectory is of another flight or damaged, or the map is bent: give the "
+            "trajectory of the video that the map was built from, or register by --pairs or --page"
+        )
+        raise MapError(f"registration: {reason}; {hint}")
 
 
-def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
-    """Poses (N, 4, 4) of keyframes and the trajectory's at their times."""
+def _fitted(found: _Start, model: F64, truth: F64) -> agreement.Fitted:
+    return agreement.Fitted(
+        found.used,
+        len(model),
+        found.scatter_m,
+        found.offset,
+        model[:, :3, :3],
+        truth[:, :3, :3],
+    )
+
+
+def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[Bools, F64, F64]:
+    """Which keyframes (K,) have a pose in the trajectory, theirs (N, 4, 4) and the trajectory's."""
     if not len(trajectory):
         raise MapError("registration: the trajectory has no poses")
     order = np.argsort(trajectory.time_ns, kind="stable")
@@ -144,7 +217,8 @@ def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
     if close.sum() < MIN_POINTS:
         raise MapError(
             f"registration: {int(close.sum())} of {len(kf)} keyframes have a pose within "
-            f"{_MAX_DIFF_NS / 1e9} s in the trajectory; at least {MIN_POINTS} are needed"
+            f"{_MAX_DIFF_NS / 1e9} s in the trajectory; at least {MIN_POINTS} are needed: its "
+            f"times are {_between(trajectory.time_ns)}, the map's {_between(kf.time_ns)}"
         )
     position = trajectory.position_m[nearest[close]]
     quaternion = trajectory.quaternion_xyzw[nearest[close]]
@@ -170,7 +244,11 @@ def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[F64, F64]:
             raise MapError(
                 f"registration: the {len(centre)} positions of the {which} lie in one place"
             )
-    return model, poses.from_quaternion(position, quaternion)
+    return close, model, poses.from_quaternion(position, quaternion)
+
+
+def _between(time_ns: I64) -> str:
+    return f"{time_ns.min() / 1e9:.3f} to {time_ns.max() / 1e9:.3f} s"
 
 
 def _uncertainty(

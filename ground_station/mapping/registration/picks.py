@@ -41,13 +41,15 @@ _SAME_MAP = 0.01
 class Pick:
     """A cluster of landmarks and its place on the plan.
 
-    `landmarks`, ids; `place` (3,), their centroid, map units; `plan_px` (2,), pixels of the plan.
+    `landmarks`, ids; `place` (3,), where it was clicked, and `offset` (3,), how far that is from
+    their centroid, map units; `plan_px` (2,), pixels of the plan.
     """
 
     name: str
     landmarks: I64
     place: F64
     plan_px: F64
+    offset: F64 = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class _Pick:
     landmarks: list[int]
     place: list[float]
     plan_px: list[float]
+    offset: list[float] = config.key([0.0, 0.0, 0.0], "of the place from the landmarks' middle")
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,7 @@ def write_picks(path: str | Path, picks: Picks) -> None:
                 "landmarks": pick.landmarks.tolist(),
                 "place": pick.place.tolist(),
                 "plan_px": pick.plan_px.tolist(),
+                "offset": pick.offset.tolist(),
             }
             for pick in picks.picks
         ],
@@ -201,7 +205,9 @@ def unmoved(picks: Picks, landmarks: Landmarks) -> bool:
     """Whether the map is as it was when the picks were made, however few of them there are."""
     for pick in picks.picks:
         found = landmarks.position_m[np.isin(landmarks.id, pick.landmarks)]
-        if len(found) != len(pick.landmarks) or not np.allclose(found.mean(axis=0), pick.place):
+        if len(found) != len(pick.landmarks) or not np.allclose(
+            found.mean(axis=0) + pick.offset, pick.place
+        ):
             return False
     return True
 
@@ -225,11 +231,12 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
                 "made in another one"
             )
         found = landmarks.position_m[rows]
-        now.append(replace(pick, place=found.mean(axis=0)))
+        now.append(replace(pick, place=found.mean(axis=0), offset=np.zeros(3)))
         scatter.append(
             np.cov(found.T, bias=True) / len(rows) if len(rows) > 1 else np.zeros((3, 3))
         )
-    before, after = (np.array([p.place for p in group]) for group in (picks.picks, now))
+    before = np.array([pick.place - pick.offset for pick in picks.picks])
+    after = np.array([pick.place for pick in now])
     try:
         went = align(before, after, True)
     except GeometryError:
@@ -242,6 +249,11 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
             f"registration: pick '{worst}' is {100 * off.max() / extent:.1f} % of the picks' extent"
             f" off where it was made; allowed: {100 * _SAME_MAP:g} %: it was another map"
         )
+    moved = [went.scale * went.rotation @ pick.offset for pick in picks.picks]
+    now = [
+        replace(pick, place=pick.place + offset, offset=offset)
+        for pick, offset in zip(now, moved, strict=True)
+    ]
     up = picks.upright
     direction = went.rotation @ up.direction
     upright = replace(
@@ -270,6 +282,7 @@ def _pick(item: Any, where: str) -> Pick:
         np.array(read.landmarks, np.int64),
         np.array(_vector(read.place, 3, f"{where}: place")),
         np.array(_vector(read.plan_px, 2, f"{where}: plan_px")),
+        np.array(_vector(read.offset, 3, f"{where}: offset")),
     )
 
 

@@ -205,11 +205,15 @@ def joint_similarity(positions: Positions, rotations: F64, start: Alignment) -> 
 
 @dataclass(frozen=True)
 class Offset:
-    """A constant rotation between a trajectory's axes and the camera's, and what hangs on it."""
+    """A constant rotation between a trajectory's axes and the camera's, and what hangs on it.
+
+    `share` of the orientations agree on it, with `scatter_deg` (root of the mean squared angle).
+    """
 
     angle_deg: float
     scatter_deg: float
     another_frame: bool
+    share: float
 
 
 def orientation_offset(
@@ -249,7 +253,8 @@ def orientation_offset(
     known = last - cross.T @ np.linalg.solve(first, cross)
     significant = bool(offset @ known @ offset > _SIGNIFICANT)
     scatter_deg = float(np.degrees(np.sqrt(3) * sigma))
-    return Offset(angle_deg, scatter_deg, significant and angle_deg > _SAME_CAMERA_DEG)
+    another = significant and angle_deg > _SAME_CAMERA_DEG
+    return Offset(angle_deg, scatter_deg, another, float(inliers.mean()))
 
 
 def position_scatter(positions: Positions, fit: Alignment) -> float:

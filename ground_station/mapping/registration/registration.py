@@ -65,4 +65,5 @@ def listed(names: Sequence[str], residual: F64, held_out: F64) -> dict[str, Any]
         report |= {"held_out_rms_m": rms(known), "held_out_max_m": float(known.max())}
     if len(known) == len(held_out):  # without one of a few the others may leave it open
         report["point_held_out_m"] = [round(float(e), 6) for e in held_out]
+        report["disagrees_most"] = names[int(np.argmax(held_out))]
     return report

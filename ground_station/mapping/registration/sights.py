@@ -124,6 +124,13 @@ def triangulate_sights(
     rays = camera.undistort(sights.pixel_px)
     for p, name in enumerate(sights.points):
         mine = np.flatnonzero(sights.point == p)
+        within = mine[np.isfinite(rays[mine]).all(axis=1)]
+        if len(within) < len(mine):
+            notes.append(
+                f"point '{name}': {len(mine) - len(within)} of its {len(mine)} sights are too near "
+                "to the rim of a fisheye's picture to be used: click it nearer to the middle"
+            )
+        mine = within
         known = [(s, lookup[key]) for s in mine if (key := known_image(sights.image[s], lookup))]
         if len({k for _, k in known}) < 2:
             notes.append(

@@ -308,8 +308,8 @@ def test_a_map_that_is_inside_out_is_refused_and_a_poor_trajectory_is_taken():
     wTc[:, :3, 3] = rng.normal(size=(len(wTc), 3))
     map_, middle = model_of(wTc, random_similarity(3)), wTc[:, :3, 3].mean(axis=0)
     spread_m = np.sqrt(np.mean((wTc[:, :3, 3] - middle) ** 2))
-    poor = by_trajectory(map_, trajectory_of(wTc, sigma_m=0.3 * spread_m), 0)
-    assert poor.report["sigma_m"] == pytest.approx(0.3 * spread_m, rel=0.3)
+    poor = by_trajectory(map_, trajectory_of(wTc, sigma_m=0.07 * spread_m), 0)
+    assert poor.report["sigma_m"] == pytest.approx(0.07 * spread_m, rel=0.3)
     mirrored = wTc.copy()
     mirrored[:, :3, 3] = 2 * middle - wTc[:, :3, 3]
     turned = trajectory_of(mirrored, offset=turned_by(175.0))

@@ -257,9 +257,9 @@ def test_only_who_knows_the_address_from_this_machine_gets_anything(untouched: S
 @pytest.mark.parametrize(
     ("what", "body", "words"),
     [
-        ("cluster", {"x": 1e99, "y": 0, "radius": 1, "low": 0, "high": 1}, "x: not what"),
-        ("cluster", {"x": 0, "y": 0, "radius": -1, "low": 0, "high": 1}, "radius of a pick is -1"),
-        ("cluster", {"x": 1e8, "y": 0, "radius": 1, "low": -9, "high": 9}, "no landmarks"),
+        ("click", {"x": 1e99, "y": 0, "radius": 1, "low": 0, "high": 1}, "x: not what"),
+        ("click", {"x": 0, "y": 0, "radius": -1, "low": 0, "high": 1}, "radius of a pick is -1"),
+        ("click", {"x": 1e8, "y": 0, "radius": 1, "low": -9, "high": 9}, "no landmarks"),
         ("place", {"u": 1, "v": 1}, "click the place in the map first"),
         ("place", {"u": 1}, "v: not what is expected"),
         ("delete", {"name": "\u202e9"}, "there is no pick '?9'"),
@@ -285,7 +285,7 @@ def test_picks_outlive_the_program_and_the_browser(stand: Stand) -> None:
     desk = stand.desk
     desk.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
     for k, place in enumerate(places_to_pick(stand)[:4], 1):
-        desk.cluster(place, 0.1, desk._up.low, desk._up.high)
+        desk.click(place, 0.1, desk._up.low, desk._up.high, False)
         assert desk._pending is not None and desk._pending.pick is not None
         desk.place(stand.pixel_of(desk._pending.pick.place))
         again = Desk(stand.folder, store.load(stand.folder), desk.plan, None, 0)
@@ -313,13 +313,13 @@ def test_picks_are_refused_until_they_determine_something(stand: Stand) -> None:
     places = places_to_pick(stand)
     low, high = desk._up.low, desk._up.high
     for k, place in enumerate(places[:2]):
-        desk.cluster(place, 0.05, low, high)
+        desk.click(place, 0.05, low, high, False)
         desk.place(np.array([50.0 + 100 * k, 50.0 + 80 * k]))
     assert stand.ask("save", {})[1]["detail"] == "2 picks; at least 3 are needed"
-    desk.cluster(places[0], 0.05, low, high)
+    desk.click(places[0], 0.05, low, high, False)
     with pytest.raises(MapError, match="'1' and '3' are the same place in the map"):
         desk.place(np.array([300.0, 10.0]))
-    desk.cluster(places[2], 0.05, low, high)
+    desk.click(places[2], 0.05, low, high, False)
     with pytest.raises(MapError, match="'2' and '3' are the same place on the plan"):
         desk.place(np.array([150.0, 130.0]))
     with pytest.raises(MapError, match="the click is beside the plan"):

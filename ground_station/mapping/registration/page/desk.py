@@ -16,17 +16,20 @@ from ground_station.errors import MapError
 from ground_station.mapping.registration import picks as files
 from ground_station.mapping.registration import upright as vertical
 from ground_station.mapping.registration.distances import Distances
-from ground_station.mapping.registration.page.clusters import cluster_at
+from ground_station.mapping.registration.page.clusters import Offer, anchors_at, offer_at
+from ground_station.mapping.registration.page.proposal import shown, wall_picks
 from ground_station.mapping.registration.picks import Pick, Picks, check_picks
 from ground_station.mapping.registration.plan import Plan, keep_plan
 from ground_station.mapping.registration.register import find_similarity, register_map
 from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.uncertainty import describe
+from ground_station.mapping.registration.walls import WallFit, fit_walls
 from ground_station.mapping.store import Map
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.text import printable
 
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
 
 _SHOWN = 60_000
 _MOST_TILT_DEG = 45.0
@@ -38,6 +41,8 @@ class Pending:
 
     name: str
     pick: Pick | None = None
+    offer: Offer | None = None
+    heights: tuple[float, float] = (0.0, 0.0)
 
 
 class Desk:
@@ -57,6 +62,7 @@ class Desk:
         self._tilt_deg = (0.0, 0.0)
         self._picks: list[Pick] = []
         self._pending: Pending | None = None
+        self._proposal: tuple[WallFit, I64] | None = None
         self._revision = 0
         self.notes = self._resume()
 
@@ -75,18 +81,38 @@ class Desk:
             positions = positions[np.arange(_SHOWN) * len(positions) // _SHOWN]
         return positions.astype("<f4").tobytes()
 
-    def cluster(self, click: F64, radius: float, low: float, high: float) -> None:
-        """The place in the map of the pick that is being made: a click (2,) in the top view."""
+    def click(self, at: F64, radius: float, low: float, high: float, offers: bool) -> None:
+        """The place in the map of the pick that is being made: a click (2,) in the top view.
+
+        It stays where it was clicked; a corner or pillar within `radius` is offered beside it.
+        """
         with self._lock:
             self._open()
             if not radius > 0:
                 raise MapError(f"the radius of a pick is {radius}; allowed: above 0")
-            turned = self._turned(self.map.landmarks.position_m)
-            rows = cluster_at(turned, click, radius, low, high)
             name = self._pending.name if self._pending else self._free_name()
-            place = self.map.landmarks.position_m[rows].mean(axis=0)
-            pick = Pick(name, self.map.landmarks.id[rows], place, np.zeros(2))
-            self._pending = Pending(name, pick)
+            pick = self._pick_at(name, at, low, high)
+            turned = self._turned(self.map.landmarks.position_m)
+            offer = offer_at(turned, at, radius, low, high) if offers else None
+            self._pending = Pending(name, pick, offer, (low, high))
+
+    def snap(self) -> None:
+        """Takes the offer: the pick that is being made moves to it."""
+        with self._lock:
+            self._open()
+            pending = self._pending
+            if pending is None or pending.offer is None:
+                raise MapError("there is no corner or pillar on offer")
+            pick = self._pick_at(pending.name, pending.offer.place, *pending.heights)
+            self._pending = Pending(pending.name, pick)
+
+    def _pick_at(self, name: str, at: F64, low: float, high: float) -> Pick:
+        turned = self._turned(self.map.landmarks.position_m)
+        rows = anchors_at(turned, at, low, high)
+        middle = turned[rows].mean(axis=0)
+        offset = (np.array([*at, middle[2]]) - middle) @ self._view
+        place = self.map.landmarks.position_m[rows].mean(axis=0) + offset
+        return Pick(name, self.map.landmarks.id[rows], place, np.zeros(2), offset)
 
     def place(self, pixel: F64) -> None:
         """The place on the plan, pixels (2,), of the pick that is being made; which then is."""
@@ -101,13 +127,42 @@ class Desk:
                 raise MapError(f"there are {files.MOST_PICKS} picks; no more are taken")
             pick = replace(self._pending.pick, plan_px=pixel)
             for other in self._picks:
-                same = np.array_equal(other.landmarks, pick.landmarks)
+                same = np.allclose(other.place, pick.place)
                 if same or np.linalg.norm(other.plan_px - pixel) < 1:
                     where = "in the map" if same else "on the plan"
                     raise MapError(f"'{other.name}' and '{pick.name}' are the same place {where}")
             self._picks = sorted([*self._picks, pick], key=_order)
-            self._pending = None
+            self._pending = self._proposal = None
             self._draft()
+
+    def propose(self, low: float, high: float) -> None:
+        """Fits landmarks between two heights to the plan's walls, from the picks as they are."""
+        with self._lock:
+            self._open()
+            turned = self._turned(self.map.landmarks.position_m)
+            rows = np.flatnonzero((turned[:, 2] >= low) & (turned[:, 2] <= high))
+            cameras = self._turned(self.map.keyframes.wTc[:, :3, 3])[:, :2]
+            place = np.array([pick.place for pick in self._picks]).reshape(-1, 3)
+            pixel = np.array([pick.plan_px for pick in self._picks]).reshape(-1, 2)
+            fit = fit_walls(turned[rows, :2], cameras, self._turned(place)[:, :2], pixel, self.plan)
+            self._proposal = fit, rows
+
+    def decide(self, accept: bool) -> None:
+        """Accepts the fit to the walls, which then stands in place of the picks, or drops it."""
+        with self._lock:
+            self._open()
+            if self._proposal is None:
+                raise MapError("there is no fit to the walls to decide on")
+            fit, rows = self._proposal
+            if accept:
+                if fit.ambiguous:
+                    raise MapError(f"the fit to the walls is not taken: {fit.ambiguous}")
+                landmarks = self.map.landmarks
+                flat = self._turned(landmarks.position_m[rows])[:, :2]
+                self._picks = wall_picks(fit, rows, flat, landmarks.position_m, landmarks.id)
+                self._pending = None
+                self._draft()
+            self._proposal = None
 
     def redo(self, name: str) -> None:
         """Takes a pick away to make it again under its name."""
@@ -125,7 +180,7 @@ class Desk:
             left = [pick for pick in self._picks if pick.name != name]
             if len(left) == len(self._picks):
                 raise MapError(f"there is no pick '{printable(name, 40)}'")
-            self._picks = left
+            self._picks, self._proposal = left, None
             self._draft()
 
     def scale(self, one: F64, other: F64, length_m: float) -> None:
@@ -133,13 +188,14 @@ class Desk:
         with self._lock:
             self._open()
             self.plan = self.plan.with_distance(one, other, length_m)
+            self._proposal = None
 
     def turn(self) -> None:
         """The top view a quarter turn further, so that it lies as the plan does."""
         with self._lock:
             self._open()
             self._quarters = (self._quarters + 1) % 4
-            self._view = self._top_view()
+            self._view, self._proposal = self._top_view(), None
             self._revision += 1
 
     def upright(
@@ -164,7 +220,7 @@ class Desk:
                 sigma_deg = float(np.degrees(found.upright.sigma_rad))
                 found = vertical.with_up(self.map, up, sigma_deg, found.source, level)
             self._up = replace(found, upright=replace(found.upright, height_m=height_m))
-            self._view = self._top_view()
+            self._view, self._proposal = self._top_view(), None
             self._tilt_deg = tilt_deg
             self._revision += 1
 
@@ -221,6 +277,7 @@ class Desk:
                 "cameras": self._turned(self.map.keyframes.wTc[:, :3, 3])[:, :2].tolist(),
                 "revision": self._revision,
                 "pending": self._shown_pending(),
+                "walls": None if self._proposal is None else shown(self._proposal[0]),
                 "picks": [self._shown(pick) for pick in self._picks],
                 "notes": list(self.notes),
                 "fit": None,
@@ -244,11 +301,12 @@ class Desk:
         placed = found.fit.apply(np.array([pick.place for pick in picks.picks]))[:, :2]
         target = picks.scale.to_world(np.array([pick.plan_px for pick in picks.picks]))
         off = np.linalg.norm(placed - target, axis=1)
-        for shown, pick, far in zip(document["picks"], picks.picks, off, strict=True):
+        for row, pick, far in zip(document["picks"], picks.picks, off, strict=True):
             k = used.get(pick.name)
-            shown["used"] = k is not None
-            shown["residual_m"] = float(far)
-            shown["held_out_m"] = held[k] if k is not None and held else None
+            row["used"] = k is not None
+            row["residual_m"] = float(far)
+            row["held_out_m"] = held[k] if k is not None and held else None
+            row["disagrees_most"] = pick.name == report.get("disagrees_most")
         keys = (
             "points", "points_given", "residual_rms_m", "residual_max_m", "held_out_rms_m",
             "scale", "scale_sigma_percent", "point_sigma_m", "degrees_of_freedom",
@@ -330,17 +388,21 @@ class Desk:
             "used": True,
             "residual_m": None,
             "held_out_m": None,
+            "disagrees_most": False,
         }
 
     def _shown_pending(self) -> dict[str, Any] | None:
         if self._pending is None:
             return None
         pick = self._pending.pick
-        shown = {"name": printable(self._pending.name, 40), "map": None, "landmarks": 0}
+        said: dict[str, Any] = {"name": printable(self._pending.name, 40), "map": None}
+        said["offer"] = None
+        if self._pending.offer is not None:
+            offer = self._pending.offer
+            said["offer"] = {"what": offer.what, "map": offer.place.tolist()}
         if pick is not None:
-            shown["map"] = self._turned(pick.place[None])[0].tolist()
-            shown["landmarks"] = len(pick.landmarks)
-        return shown
+            said["map"] = self._turned(pick.place[None])[0].tolist()
+        return said
 
 
 def _order(pick: Pick) -> tuple[int, str]:

@@ -33,8 +33,11 @@ function drawMark(c, u, v, name, of, halo = "paper") {
   c.font = "bold 14px system-ui, sans-serif";
   c.lineWidth = 4;
   c.strokeStyle = colour(halo);
-  c.strokeText(name, u + 9, v - 8);
-  c.fillText(name, u + 9, v - 8);
+  // Beside the mark, on the side where there is room.
+  const left = u + 12 + c.measureText(name).width > c.canvas.clientWidth;
+  c.textAlign = left ? "right" : "left";
+  c.strokeText(name, u + (left ? -9 : 9), v - 8);
+  c.fillText(name, u + (left ? -9 : 9), v - 8);
 }
 
 const markOf = (pick) => (pick.used ? "accent" : "bad");
@@ -59,7 +62,13 @@ function drawMap(c, view) {
   const { pending } = state;
   if (pending?.map) {
     const [u, v] = view.toScreen(pending.map[0], pending.map[1]);
-    drawMark(c, u, v, `${pending.name}: ${pending.landmarks} landmarks`, "good");
+    drawMark(c, u, v, pending.name, "good");
+    if (pending.offer) {
+      const [x, y] = view.toScreen(...pending.offer.map);
+      c.setLineDash([3, 3]);
+      drawMark(c, x, y, `${pending.offer.what}?`, "camera");
+      c.setLineDash([]);
+    }
   }
   if (view.hover) {
     c.strokeStyle = colour("accent");
@@ -70,9 +79,21 @@ function drawMap(c, view) {
   }
 }
 
-function toPlan(x, y) {
-  const [a, b, d, e, u, v] = state.fit.to_plan;
+function toPlan(x, y, by = state.fit.to_plan) {
+  const [a, b, d, e, u, v] = by;
   return [a * x + d * y + u, b * x + e * y + v];
+}
+
+function overlay(c, view, by, of, alpha) {
+  const [low, high] = heightRange();
+  c.fillStyle = colour(of);
+  c.globalAlpha = alpha;
+  for (let k = 0; k < points.length; k += 3) {
+    if (points[k + 2] < low || points[k + 2] > high) continue;
+    const [u, v] = view.toScreen(...toPlan(points[k], points[k + 1], by));
+    c.fillRect(u - 0.8, v - 0.8, 1.6, 1.6);
+  }
+  c.globalAlpha = 1;
 }
 
 function drawPlan(c, view) {
@@ -81,17 +102,10 @@ function drawPlan(c, view) {
     c.imageSmoothingEnabled = view.scale < 2;
     c.drawImage(plan, u, v, plan.naturalWidth * view.scale, plan.naturalHeight * view.scale);
   }
-  if (state.fit && byId("overlay").checked) {
-    const [low, high] = heightRange();
-    c.fillStyle = colour("plan-overlay");
-    c.globalAlpha = 0.5;
-    for (let k = 0; k < points.length; k += 3) {
-      if (points[k + 2] < low || points[k + 2] > high) continue;
-      const [u, v] = view.toScreen(...toPlan(points[k], points[k + 1]));
-      c.fillRect(u - 0.8, v - 0.8, 1.6, 1.6);
-    }
-    c.globalAlpha = 1;
-  }
+  if (state.walls) {
+    overlay(c, view, state.walls.before, "plan-bad", 0.25);
+    overlay(c, view, state.walls.after, "plan-overlay", 0.6);
+  } else if (state.fit && byId("overlay").checked) overlay(c, view, state.fit.to_plan, "plan-overlay", 0.5);
   for (const pick of state.picks) {
     const [u, v] = view.toScreen(...pick.plan_px);
     if (state.fit) {
@@ -140,7 +154,7 @@ function bounds() {
 
 function clickMap(x, y) {
   const [low, high] = heightRange();
-  ask("cluster", { x, y, radius: SNAP_PX / mapView.scale, low, high });
+  ask("click", { x, y, radius: SNAP_PX / mapView.scale, low, high, offers: byId("offers").checked });
 }
 
 function clickPlan(u, v) {
@@ -195,6 +209,8 @@ function row(pick) {
   tr.dataset.pick = pick.name;
   const cells = [pick.name, pick.residual_m === null ? "" : metres(pick.residual_m),
     pick.used ? (pick.held_out_m === null ? "" : metres(pick.held_out_m)) : "left out"];
+  if (pick.disagrees_most) tr.title = "disagrees most: where the others put it is furthest off";
+  if (pick.disagrees_most) cells[2] += " ◂ most";
   cells.forEach((text, k) => {
     const cell = document.createElement(k ? "td" : "th");
     cell.className = k ? "number" : "";
@@ -235,11 +251,32 @@ function hint() {
   if (state.plan.resolution_m === null) return "The plan has no scale yet: press “set its scale”";
   const { pending } = state;
   if (!pending) return "Click a place in the map that the plan shows, too: a corner, a pillar";
+  if (pending.offer) return `Click place ${pending.name} on the plan, or press S to move it to the ${pending.offer.what}`;
   return pending.map ? `Now click place ${pending.name} on the plan` : `Click place ${pending.name} in the map`;
 }
 
 function say() {
   byId("hint").textContent = hint();
+}
+
+function sayOffer() {
+  const offer = state.pending?.offer;
+  byId("snap").hidden = !offer || state.saved;
+  if (offer) byId("snap").textContent = `move to the ${offer.what} (S)`;
+}
+
+function wallsWords() {
+  const { walls, picks } = state;
+  if (!walls) return picks.length < 2 ? "Needs two rough picks, far apart." : "Begins at the picks; you decide on what it finds.";
+  const found = `${Math.round(100 * walls.on_walls)} % of the landmarks on walls, ${metres(walls.residual_m)} off them (RMS); before, orange, ${metres(walls.start_residual_m)}.`;
+  return walls.ambiguous ? `${found} Not to be taken: ${walls.ambiguous}.` : found;
+}
+
+function sayWalls() {
+  byId("walls-words").textContent = wallsWords();
+  byId("walls-fit").disabled = state.picks.length < 2 || state.plan.resolution_m === null || state.saved;
+  byId("walls-accept").hidden = !state.walls || Boolean(state.walls.ambiguous);
+  byId("walls-refuse").hidden = !state.walls;
 }
 
 function list(id, texts) {
@@ -273,6 +310,8 @@ function show(refused) {
   byId("save").disabled = !state.fit || state.saved;
   for (const control of document.querySelectorAll("aside input, aside select, aside td button, #plan-scale, #map-turn")) control.disabled = state.saved;
   drawHeights();
+  sayOffer();
+  sayWalls();
   say();
   repaint();
 }
@@ -294,6 +333,16 @@ byId("heights").addEventListener("click", (event) => {
 });
 for (const id of ["low", "high"]) byId(id).addEventListener("input", () => { drawHeights(); repaint(); });
 byId("overlay").addEventListener("change", repaint);
+byId("walls-fit").addEventListener("click", () => {
+  const [low, high] = heightRange();
+  ask("walls", { low, high });
+});
+byId("walls-accept").addEventListener("click", () => ask("decide", { accept: true }));
+byId("walls-refuse").addEventListener("click", () => ask("decide", { accept: false }));
+byId("snap").addEventListener("click", () => ask("snap"));
+document.addEventListener("keydown", (event) => {
+  if (event.key.toLowerCase() === "s" && !event.target.matches("input, select") && !byId("snap").hidden) ask("snap");
+});
 byId("map-turn").addEventListener("click", async () => {
   mapView.touched = false;
   await ask("turn");

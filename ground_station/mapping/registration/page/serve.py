@@ -45,7 +45,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Cluster(_Strict):
+class Click(_Strict):
     """A click in the top view, map units."""
 
     x: _Number
@@ -53,6 +53,7 @@ class Cluster(_Strict):
     radius: _Number
     low: _Number
     high: _Number
+    offers: bool = True
 
 
 class Place(_Strict):
@@ -74,6 +75,19 @@ class Named(_Strict):
     """A pick."""
 
     name: _Name
+
+
+class Heights(_Strict):
+    """Heights in the top view, map units."""
+
+    low: _Number
+    high: _Number
+
+
+class Decision(_Strict):
+    """What a person says to the fit to the walls."""
+
+    accept: bool
 
 
 class Upright(_Strict):
@@ -142,9 +156,15 @@ def build(desk: Desk, token: str, done: Callable[[], None]) -> FastAPI:
     def plan() -> Response:
         return Response(desk.picture(), media_type="image/png")
 
-    @app.post(f"{root}/cluster")
-    def cluster(asked: Cluster) -> Any:
-        desk.cluster(np.array([asked.x, asked.y]), asked.radius, asked.low, asked.high)
+    @app.post(f"{root}/click")
+    def click(asked: Click) -> Any:
+        at = np.array([asked.x, asked.y])
+        desk.click(at, asked.radius, asked.low, asked.high, asked.offers)
+        return desk.state()
+
+    @app.post(f"{root}/snap")
+    def snap() -> Any:
+        desk.snap()
         return desk.state()
 
     @app.post(f"{root}/place")
@@ -177,6 +197,16 @@ def build(desk: Desk, token: str, done: Callable[[], None]) -> FastAPI:
     def upright(asked: Upright) -> Any:
         tilt = asked.tilt_x_deg, asked.tilt_y_deg
         desk.upright(asked.source, tilt, asked.level, asked.height_m)
+        return desk.state()
+
+    @app.post(f"{root}/walls")
+    def walls(asked: Heights) -> Any:
+        desk.propose(asked.low, asked.high)
+        return desk.state()
+
+    @app.post(f"{root}/decide")
+    def decide(asked: Decision) -> Any:
+        desk.decide(asked.accept)
         return desk.state()
 
     @app.post(f"{root}/save")
