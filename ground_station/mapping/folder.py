@@ -13,6 +13,8 @@ from pathlib import Path
 from ground_station.errors import MapError
 
 _OURS = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", "sparse")
+PICTURE = "map.png"
+"""What a build draws of its map; it is not kept where another map takes the place."""
 
 
 def check_target(folder: Path) -> None:
@@ -67,7 +69,7 @@ def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
         yield part
         if folder.exists():
             for entry in folder.iterdir():
-                if entry.name not in _OURS and not (part / entry.name).exists():
+                if entry.name not in (*_OURS, PICTURE) and not (part / entry.name).exists():
                     _keep(entry, part / entry.name)
             if keep is None:
                 shutil.rmtree(old, ignore_errors=True)

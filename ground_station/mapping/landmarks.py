@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 
 from ground_station.mapping.sfm.colmap import Model
 from ground_station.mapping.store import Landmarks
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
 
 
 def residuals_px(model: Model) -> F64:
@@ -79,15 +80,25 @@ def make_landmarks(model: Model, descriptors: F32) -> Landmarks:
 
     A landmark's descriptor is the mean of its observations' descriptors, renormalised.
     """
+    return landmarks_of_blocks(model, [(np.arange(len(model.point)), descriptors)])
+
+
+def landmarks_of_blocks(model: Model, blocks: Sequence[tuple[I64, F32]]) -> Landmarks:
+    """As `make_landmarks`, of descriptors that need not be in memory together.
+
+    Each block is some observations, by index (B,), with their descriptors (B, D); every observation
+    is in one of them. They are gone through twice, one after the other.
+    """
     count = len(model.position)
     n = np.bincount(model.point, minlength=count)
     weight = 1.0 / np.maximum(n, 1)
-    sights = np.arange(len(model.point))
-    tracks = csr_array((np.ones(len(sights), np.float32), (model.point, sights)),
-                       shape=(count, len(sights)))  # fmt: skip
-    mean = tracks @ descriptors
+    mean = np.zeros((count, blocks[0][1].shape[1] if len(blocks) else 0), np.float32)
+    for sights, descriptors in blocks:
+        np.add.at(mean, model.point[sights], descriptors)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    square = np.sum((descriptors - mean[model.point]) ** 2, axis=1)
+    square = np.zeros(len(model.point), np.float32)
+    for sights, descriptors in blocks:
+        square[sights] = np.sum((descriptors - mean[model.point[sights]]) ** 2, axis=1)
     spread = np.sqrt(np.bincount(model.point, square, count) * weight)
     rays = model.wTc[model.image, :3, 3] - model.position[model.point]
     distance = np.linalg.norm(rays, axis=1)

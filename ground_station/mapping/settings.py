@@ -10,6 +10,7 @@ from typing import Any
 from ground_station.features.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
 
 SHIPPED = Path(__file__).with_name("mapping.toml")
 
@@ -98,7 +99,11 @@ class MatchSettings:
         0.95, "the same of other features, whose distances differ less", low=0.1, high=1.0
     )
     error_px: float = config.key(
-        1.5, "distance from the epipolar line", unit="px", low=0.1, high=20.0
+        1.5,
+        "distance from the epipolar line; more where the images' own noise is larger",
+        unit="px",
+        low=0.1,
+        high=20.0,
     )
     planar_ratio: float = config.key(
         0.9, "share explained by a homography that makes a pair degenerate", low=0.1, high=1.0
@@ -129,7 +134,10 @@ class SfmSettings:
         "of structure from motion; auto: global, and incremental where that leaves images out",
         choices=("incremental", "global", "auto"),
     )
-    refine_camera: bool = config.key(False, "refine the focal lengths, too")
+    part_images: int = config.key(
+        600, "of more, overlapping parts of about so many are made beside each other and joined",
+        unit="images", low=50, high=20000,
+    )  # fmt: skip
     min_tri_angle_deg: float = config.key(
         1.5, "a landmark's largest angle between two sights", unit="deg", low=0.0, high=45.0
     )
@@ -245,7 +253,7 @@ class MappingSettings:
         "of a longer input the keyframes, at most so many; a step in the range goes before",
         unit="images",
         low=2,
-        high=5000,
+        high=20000,
     )
     seed: int = config.key(0, "of every random choice", low=0, high=2**31 - 1)
     threads: int = config.key(0, "worker threads, 0: one a core", unit="threads", low=0, high=256)
@@ -265,7 +273,14 @@ class MappingSettings:
 
 def load_settings(path: str | Path | None = None) -> MappingSettings:
     """Reads a settings file, the shipped one by default; raises `ConfigError` with one line."""
-    return config.load(path or SHIPPED, MappingSettings)
+    document = config.read(path or SHIPPED)
+    sfm = document.get("sfm")
+    if isinstance(sfm, dict) and "refine_camera" in sfm:
+        raise ConfigError(
+            f"{path}: the key 'sfm.refine_camera' is gone, take it out: a lens that misfits is "
+            "refined without being asked, a build without --camera finds its own"
+        )
+    return config.from_mapping(document, MappingSettings, where=str(path or SHIPPED))
 
 
 def with_changes(

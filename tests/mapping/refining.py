@@ -164,7 +164,7 @@ def _world(tmp_path_factory) -> World:
         pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
     )
     reconstruction = colmap.from_arrays(model, camera)
-    colmap.adjust(reconstruction, loss_px=1.0, refine_camera=False, threads=1)
+    colmap.adjust(reconstruction, loss_px=1.0, threads=1)
     found, position = colmap.positions(reconstruction, model)
     fit = align(position, points, True)  # registered by what it saw
     model = dataclasses.replace(model, wTc=fit.apply_poses(found), position=fit.apply(position))

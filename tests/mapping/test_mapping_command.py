@@ -12,6 +12,7 @@ import pytest
 
 from ground_station.errors import CameraError, GroundStationError, InputError, MapError
 from ground_station.mapping import command
+from pi_firmware.wire.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
 
@@ -79,9 +80,11 @@ def camera_file(tmp_path):
         (["nowhere"], InputError, "nowhere"),
         (["empty"], InputError, "empty"),
         (["one", "--camera", "camera.toml"], InputError, "the input has 1"),
-        (["two"], CameraError, "does not carry a camera"),
+        (["two"], MapError, "no two of the 2 images overlap"),
         (["two", "--camera", "absent.toml"], CameraError, "absent.toml"),
-        (["small", "--camera", "camera.toml"], MapError, "is 320x240 pixels, the camera 640x480"),
+        (["wide", "--camera", "camera.toml"], CameraError, "320x200, the .*another shape"),
+        (["tall", "--camera", "camera.toml"], CameraError, "240x320, the .*turned by a quarter"),
+        (["two", "--camera", "camera.toml", "--max-images", "1"], ConfigError, "max_images"),
         (["two", "--camera", "camera.toml"], MapError, "no two of the 2 images overlap"),
         (["two", "--camera", "camera.toml", "--range", "5"], InputError, "'5'"),
         (["two", "--camera", "camera.toml", "--features", "surf"], GroundStationError, "'surf'"),
@@ -93,7 +96,8 @@ def test_bad_input_gets_one_line(tmp_path, monkeypatch, camera_file, arguments, 
     _images(tmp_path / "one", 1)
     _images(tmp_path / "two", 2)
     _images(tmp_path / "b" / "two", 2)
-    _images(tmp_path / "small", 2, (240, 320))
+    _images(tmp_path / "wide", 2, (200, 320))
+    _images(tmp_path / "tall", 2, (320, 240))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=words) as caught:
         _run("build", *arguments, "--out", "map")
@@ -108,6 +112,10 @@ def test_keyframes_of_long_inputs_are_taken_and_it_is_said(
     settings = tmp_path / "mapping.toml"
     settings.write_text("max_images = 4\nmax_features = 50\n")
     monkeypatch.chdir(tmp_path)
+    with pytest.raises(MapError, match="no two of the 6 images"):  # the flag goes before the file
+        _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map",
+             "--max-images", 6)  # fmt: skip
+    capsys.readouterr()
     # Noise: none shows what another does, so all nine are due, and they are thinned.
     with pytest.raises(MapError, match="no two of the 4 images"):
         _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map")
@@ -116,3 +124,39 @@ def test_keyframes_of_long_inputs_are_taken_and_it_is_said(
     with pytest.raises(MapError, match="no two of the 9 images"):  # a step is meant as it stands
         _run("build", "many", "--camera", camera_file, "--settings", settings,
              "--out", "map", "--range", "::1")  # fmt: skip
+
+
+def test_a_build_without_a_camera_says_which_lens_it_starts_with(tmp_path, monkeypatch, capsys):
+    _images(tmp_path / "two", 2)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MapError, match="no two of the 2 images overlap"):
+        _run("build", "two", "--out", "map")
+    assert "a focal length of 473 px is guessed" in capsys.readouterr().out
+
+
+def test_a_build_ends_with_a_verdict_a_picture_and_the_next_command(
+    built, tmp_path, monkeypatch, capsys
+):
+    """A build that has made this map: what is printed of it, drawn and written."""
+    import shutil
+
+    from ground_station.mapping.construction import build
+    from ground_station.mapping.refinement import refine
+
+    _images(tmp_path / "two", 2)
+    shutil.copytree(built.folder, tmp_path / "map")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(build, "build_map", lambda *_, **__: None)
+    monkeypatch.setattr(refine, "straighten", lambda *_: built.map)
+    assert _run("build", "two", "--out", "map", "--json", "b.json") == 0
+    lines = capsys.readouterr().out.splitlines()[1:]  # after the guessed lens
+    assert lines[0] == "WHOLE: all 16 images stand in this map, in one piece"
+    assert lines[-2:] == [
+        "picture: map/map.png",
+        "next: blimp map register map --page    (its scale and its place in the building)",
+    ]
+    assert len(lines) <= 6
+    assert (tmp_path / "map" / "map.png").read_bytes()[:4] == b"\x89PNG"
+    document = json.loads((tmp_path / "b.json").read_text())
+    assert document["verdict"] == "whole" and document["said"] == lines[:-2]
+    assert document["landmarks"] == len(built.map.landmarks)  # all the keys as before

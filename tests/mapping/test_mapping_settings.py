@@ -21,7 +21,11 @@ def test_the_shipped_file_holds_every_key_with_its_default():
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("[match]\nratio = 1.5\n", "match.ratio.*1.5.*0.1 to 1"), ("colour = 1\n", "'colour'")],
+    [
+        ("[match]\nratio = 1.5\n", "match.ratio.*1.5.*0.1 to 1"),
+        ("colour = 1\n", "'colour'"),
+        ("[sfm]\nrefine_camera = true\n", "'sfm.refine_camera' is gone.*finds its own"),
+    ],
 )
 def test_wrong_settings_are_refused_by_name(tmp_path, text, words):
     path = tmp_path / "mapping.toml"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,17 @@ import numpy as np
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping import landmarks, store
+from ground_station.mapping.construction import noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.content import structure_key
-from ground_station.mapping.construction.images import extract
-from ground_station.mapping.construction.structure import Structure, adjust_and_filter, reconstruct
+from ground_station.mapping.construction.images import Images, extract
+from ground_station.mapping.construction.lens import SelfCalibration, with_lens
+from ground_station.mapping.construction.lens_prior import LensPrior
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.parts.reconstruction import reconstruct
+from ground_station.mapping.construction.structure import Structure, adjust_and_filter
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
@@ -36,6 +42,7 @@ def build_map(
     settings: MappingSettings,
     out: str | Path,
     *,
+    prior: LensPrior | None = None,
     total: int | None = None,
     built: dict[str, Any] | None = None,
     cache: Cache | None = None,
@@ -44,12 +51,15 @@ def build_map(
 ) -> store.Map:
     """Builds a map from frames in the folder `out`; a killed build leaves the old map there.
 
-    `total` is the number of frames if known, `built` what map.toml shall say of the inputs. With a
-    `cache`, what an earlier build has made is not made again, one that was killed included.
+    `prior` says how well the camera is known; None: it is calibrated. A lens that nobody calibrated
+    is found by the images, and so is one that misfits, where the images decide; the map holds it
+    then. `total` is the number of frames if known, `built` what map.toml shall say of the inputs.
+    With a `cache`, what an earlier build has made is not made again, one that was killed included.
     `held` keeps the work of structure from motion until the caller has done with the map, too.
     `workers` extract and match, by default threads of this process. Raises `InputError` when there
     are fewer than two frames, `MapError` when sizes differ from the camera's, images do not
-    overlap, or structure from motion fails.
+    overlap, structure from motion fails, or nobody calibrated the lens and the images leave it
+    open.
     """
     out = Path(out)
     threads = settings.threads or os.cpu_count() or 1
@@ -58,22 +68,41 @@ def build_map(
     # What lasts is let go of only when the map is in its place.
     with ExitStack() as own, replacing(out) as folder:
         with _timed(stage_s, "features"):
-            images = extract(frames, camera, settings, threads, total, cache=cache, workers=workers)
-        with _timed(stage_s, "match"):
-            pairs = match(images, camera, settings, threads, cache=cache, workers=workers)
-        work = None
+            images = extract(
+                frames, camera, settings, threads, total,
+                cache=cache, workers=workers, folder=folder / "work",
+            )  # fmt: skip
+        # A camera that somebody gives without a word on its lens is a calibrated one.
+        lens = SelfCalibration(
+            prior or LensPrior(camera, "file", 0.0),
+            images,
+            settings.match.of(settings.features).ratio,
+        )
+        going = True
+        while going:
+            if lens.camera != camera:
+                camera, images = lens.camera, with_lens(images, lens.camera)
+            limits = lens.settings(settings)
+            with _timed(stage_s, "match"):
+                seen = noise.measured(images, camera, limits.match.of(limits.features).ratio)
+                limits = _with_noise(limits, seen)
+                pairs = match(images, camera, limits, threads, cache=cache, workers=workers)
+            work = None
+            if cache:
+                key = structure_key(images, pairs, camera, limits)
+                keeper = own if held is None else held
+                work = keeper.enter_context(lasting(cache.folder / "work", key))
+            if work is None:
+                work = folder / "work" / str(lens.rounds)
+                work.mkdir(parents=True)
+            with _timed(stage_s, "sfm"), _colmap_in(work):
+                structure = reconstruct(images, pairs, camera, limits, threads, work, workers)
+            with _timed(stage_s, "refine"):
+                model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
+            with _timed(stage_s, "lens"):
+                going = lens.go_on(model, images)
         if cache:
             print(f"{cache.figures} (cache {cache.folder})", flush=True)
-            key = structure_key(images, pairs, camera, settings)
-            keeper = own if held is None else held
-            work = keeper.enter_context(lasting(cache.folder / "work", key))
-        if work is None:
-            work = folder / "work"
-            work.mkdir()
-        with _timed(stage_s, "sfm"), _colmap_in(work):
-            structure = reconstruct(images, pairs, camera, settings, threads, work)
-        with _timed(stage_s, "refine"):
-            model = adjust_and_filter(structure.reconstruction, settings.sfm, threads)
         notes = _notes(len(images.names), len(model.names), structure)
         for note in notes:
             print(note, flush=True)
@@ -84,7 +113,14 @@ def build_map(
             "registered": len(model.names),
             "model_sizes": [len(model.names), *structure.sizes[1:]],
             "dropped": structure.dropped,
+            "left_out": _left_out(images, pairs, structure, model.names),
+            "parts": _parts(images, structure, model.names),
+            "doubts": structure.doubts,
             "notes": notes,
+            **(
+                {"noise_px": seen.sigma_px, "match_error_px": limits.match.error_px} if seen else {}
+            ),
+            "lens": lens.as_built(),
             "sigma_px": landmarks.sigma_px(model),
             "reprojection_px": float(np.linalg.norm(landmarks.residuals_px(model), axis=1).mean()),
             "observations": len(model.point),
@@ -108,7 +144,7 @@ def build_map(
 def _timed(stage_s: dict[str, float], name: str) -> Iterator[None]:
     start_s = time.monotonic()
     yield
-    stage_s[name] = time.monotonic() - start_s
+    stage_s[name] = stage_s.get(name, 0.0) + time.monotonic() - start_s
 
 
 @contextmanager
@@ -124,11 +160,50 @@ def _colmap_in(work: Path) -> Iterator[None]:
         ) from error
 
 
+def _with_noise(settings: MappingSettings, found: noise.Noise | None) -> MappingSettings:
+    """With a limit in pixels that the images' own noise asks for, where it is larger."""
+    if found is None or found.limit_px <= settings.match.error_px:
+        return settings
+    return replace(settings, match=replace(settings.match, error_px=found.limit_px))
+
+
+def _parts(images: Images, structure: Structure, names: list[str]) -> list[list[str]]:
+    """The names of each model's images, this map's first; empty where it is the only one."""
+    others = [
+        [images.names[image_id - 1] for image_id in sorted(part.reg_image_ids())]
+        for part in structure.parts
+    ]
+    return [list(names), *others] if others else []
+
+
+def _left_out(
+    images: Images, pairs: Mapping[Pair, TwoView], structure: Structure, names: list[str]
+) -> dict[str, str]:
+    """Why each image that stands in no model has no place."""
+    elsewhere = {image_id - 1 for part in structure.parts for image_id in part.reg_image_ids()}
+    linked = {k for pair in pairs for k in pair}
+    here, dropped = set(names), set(structure.dropped)
+    reasons = {}
+    for k, name in enumerate(images.names):
+        if name in here or k in elsewhere:
+            continue
+        if name in dropped:
+            reasons[name] = "where it fits, other images say that it does not belong"
+        elif k in linked:
+            reasons[name] = "too little of what it shows has a place"
+        else:
+            reasons[name] = "it shares nothing with another image"
+    return reasons
+
+
 def _notes(images: int, registered: int, structure: Structure) -> list[str]:
     sizes, dropped = structure.sizes, structure.dropped
     others = f", models of sizes {[registered, *sizes[1:]]}" if sizes[1:] else ", one model"
     notes = [f"{registered} of {images} images registered{others}"]
     if dropped:
         shown = ", ".join(dropped[:5]) + (", …" if len(dropped) > 5 else "")
-        notes.append(f"{len(dropped)} images dropped, far off their neighbours: {shown}")
+        notes.append(
+            f"{len(dropped)} images left out: where they fit, others say that they do not belong: "
+            f"{shown}"
+        )
     return notes + structure.notes

@@ -21,6 +21,7 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cv2
+import numpy as np
 
 from ground_station import __version__
 from ground_station.errors import MapError
@@ -46,6 +47,9 @@ _ALONE_S = 60.0
 _TRIES = 4
 _PAIRS = 16
 """In one call: what goes with a call is then little beside the work in it."""
+_LARGE_BYTES = 65_536
+"""An array larger than this, such as a picture, goes to a worker by itself: Dask's scheduler keeps
+the arguments of every call."""
 _CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
 
 Versions = dict[str, str]
@@ -81,7 +85,7 @@ def checked(
 class _Shared:
     """A value that is sent to the cluster when the first call needs it, and then stays there."""
 
-    value: Any
+    get: Callable[[], Any]
     future: Any = None
 
 
@@ -100,7 +104,10 @@ class Cluster:
 
     batch = _PAIRS
 
-    def __init__(self, client: Any, name: str, settings: MappingSettings) -> None:
+    def __init__(
+        self, client: Any, name: str, settings: MappingSettings, here: bool = False
+    ) -> None:
+        self.here = here
         self._client, self._place, self._settings = client, name, settings
         self._ours = versions(settings)
         threads = client.nthreads()
@@ -110,7 +117,7 @@ class Cluster:
     @contextmanager
     def shared(self, values: Sequence[Any]) -> Iterator[Sequence[Any]]:
         """Values that go to the cluster once, each when the first call needs it."""
-        handles = [_Shared(value) for value in values]
+        handles = [_Shared(functools.partial(values.__getitem__, k)) for k in range(len(values))]
         try:
             yield handles
         finally:
@@ -122,7 +129,7 @@ class Cluster:
         cluster is gone or kills its workers."""
 
         def send(item: Sequence[Any]) -> _Call:
-            call = _Call(function, item)
+            call = _Call(function, [_apart(arg) for arg in item])
             self._reached(self._send, call)
             return call
 
@@ -163,7 +170,7 @@ class Cluster:
     def _sent(self, value: _Shared) -> Any:
         # What was shared goes with the worker that had it: Dask makes anew only what it has made.
         if value.future is None or value.future.status != "finished":
-            (value.future,) = self._client.scatter([value.value], hash=False)
+            (value.future,) = self._client.scatter([value.get()], hash=False)
         return value.future
 
     def _receive(self, call: _Call) -> Any:
@@ -193,6 +200,13 @@ class Cluster:
         self._send(call)
 
 
+def _apart(arg: Any) -> Any:
+    """A large array as a value of one call's own, which the cluster forgets with the call."""
+    if isinstance(arg, np.ndarray) and arg.nbytes > _LARGE_BYTES:
+        return _Shared(lambda: arg)
+    return arg
+
+
 def _futures(call: _Call) -> list[Any]:
     shared = [arg.future for arg in call.args if isinstance(arg, _Shared)]
     return [future for future in shared if future is not None]
@@ -216,7 +230,7 @@ def connected(where: str | int, settings: MappingSettings) -> Iterator[Cluster]:
         except TimeoutError:
             raise MapError(f"{place}: the scheduler has no workers") from None
         _check_workers(client, place, settings)
-        yield Cluster(client, place, settings)
+        yield Cluster(client, place, settings, here=not isinstance(where, str))
 
 
 def _client(where: str | int, held: ExitStack) -> Any:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from ground_station.errors import GroundStationError
 from ground_station.files import write_json
-from ground_station.mapping.table import print_table
 
 if TYPE_CHECKING:
     from ground_station.mapping.construction.cache import Cache
@@ -22,6 +21,7 @@ HELP = "Builds a map from recordings, videos or folders."
 EXAMPLE = """\
 examples:
   blimp map build flight.mcap --out maps/atrium
+  blimp map build walk.mp4 --out maps/hall
   blimp map build frames/ --camera camera.toml --range 0:500:5 --out maps/kitchen
   blimp map build flight.mcap --dask 8 --pairs exhaustive --out maps/hall
 
@@ -34,11 +34,18 @@ tls:// and certificates in Dask's configuration where others share it."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map build`."""
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
-    parser.add_argument("--camera", metavar="TOML", help="camera file; a recording carries its own")
+    parser.add_argument(
+        "--camera", metavar="TOML",
+        help="camera file (default: a recording's own, else by the metadata, else a guess)",
+    )  # fmt: skip
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map")
     parser.add_argument("--features", help="extractor or model by name (default: the settings')")
     parser.add_argument("--range", metavar="A:B[:S]", help="frames A to B, with S every S-th")
     parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
+    parser.add_argument(
+        "--max-images", type=int, metavar="N",
+        help="of a longer input so many keyframes at most (default: the settings')",
+    )  # fmt: skip
     parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
     parser.add_argument("--seed", type=int, help="of every random choice (default: the settings')")
     parser.add_argument(
@@ -57,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dask",
         metavar="ADDRESS|N",
-        help="extract and match on a Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, "
+        help="extract, match and make parts on a Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, "
         "or in N processes here (default: threads)",
     )
     parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
@@ -67,14 +74,22 @@ def run(args: argparse.Namespace) -> int:
     """Builds; raises `BlimpError` for what a person can mend."""
     from ground_station.mapping.construction.build import build_map
     from ground_station.mapping.construction.inputs import open_inputs
+    from ground_station.mapping.construction.verdict import next_step, verdict
     from ground_station.mapping.construction.workers import open_workers
-    from ground_station.mapping.folder import check_target
+    from ground_station.mapping.folder import PICTURE, check_target
+    from ground_station.mapping.inspection.picture import from_above
     from ground_station.mapping.inspection.summary import describe
     from ground_station.mapping.refinement.refine import straighten
     from ground_station.mapping.settings import load_settings, with_changes
+    from ground_station.presentation.dress import LIGHT, write_png
 
     check_target(Path(args.out))
-    changes = {"features": args.features, "seed": args.seed, "match.pairs": args.pairs}
+    changes = {
+        "features": args.features,
+        "max_images": args.max_images,
+        "seed": args.seed,
+        "match.pairs": args.pairs,
+    }
     settings = with_changes(load_settings(args.settings), changes, "blimp map build")
     threads = settings.threads or os.cpu_count() or 1
     # A cluster that is not there is said before anything is read.
@@ -90,14 +105,22 @@ def run(args: argparse.Namespace) -> int:
             print(line, flush=True)
         build_map(
             inputs, inputs.camera, settings, args.out,
-            total=inputs.total, built=inputs.built, cache=cache, workers=workers, held=held,
+            prior=inputs.prior, total=inputs.total, built=inputs.built, cache=cache,
+            workers=workers, held=held,
         )  # fmt: skip
         map_ = straighten(args.out, settings)
     for note in inputs.notes:
         print(f"note: {note}", file=sys.stderr)
-    print_table(describe(map_))
+    found = verdict(map_)
+    picture = Path(args.out) / PICTURE
+    write_png(from_above(map_, found.missing, found.lines[0], LIGHT), picture)
+    for line in found.lines:
+        print(line)
+    print(f"picture: {picture}")
+    print(next_step(found, map_, args.out))
     if args.json:
-        write_json(args.json, describe(map_))
+        seen = {"verdict": found.word, "said": found.lines, "picture": str(picture)}
+        write_json(args.json, seen | describe(map_))
     return 0
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import version
@@ -59,6 +60,8 @@ def features_key(image: npt.NDArray[np.uint8], how: bytes) -> bytes:
 def comparison(camera: Camera, rules: Rules) -> bytes:
     """What, besides their features, decides a pair's geometry; one line for `pair_key`."""
     lens = {name: value for name, value in camera.as_dict().items() if name != "readout_s"}
+    if math.isfinite(camera.lens.reach):  # beyond it key points are left out, which numbers them
+        lens["reach"] = camera.lens.reach
     return _line({"camera": lens, "rules": asdict(rules), "opencv": cv2.__version__})
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
 from ground_station.mapping.construction.cache import Cache
+from ground_station.mapping.construction.feature_file import FeatureFile
 from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
@@ -31,12 +33,13 @@ _LOCAL = threading.local()
 class Images:
     """What is kept of n frames: names, times (n,), features, their undistorted pixels (N, 2).
 
-    `keys` are the hashes by which a cache knows the features, none without a cache.
+    `features` may lie in a file, and are mapped when they are looked at. `keys` are the hashes by
+    which a cache knows the features, none without a cache.
     """
 
     names: list[str]
     time_ns: I64
-    features: list[Features]
+    features: Sequence[Features]
     pinhole_px: list[F64]
     keys: list[bytes] = field(default_factory=list)
 
@@ -50,18 +53,32 @@ def extract(
     *,
     cache: Cache | None = None,
     workers: Workers | None = None,
+    folder: Path | None = None,
 ) -> Images:
     """Features of all frames, extracted in parallel while the input is read.
 
-    What `cache` holds is not extracted again. Raises `InputError` for fewer than two frames,
-    `MapError` for a size other than the camera's.
+    What `cache` holds is not extracted again. With a `folder` the features lie in a file there,
+    for as long as the images are used, else in memory. Raises `InputError` for fewer than two
+    frames, `MapError` for a size other than the camera's.
     """
     names: list[str] = []
     times: list[int] = []
-    found: list[Features | None] = []
+    kept = FeatureFile(folder) if folder else None
+    in_memory: dict[int, Features] = {}
+    pixels: dict[int, F64] = {}
     keys: list[bytes] = []
     under_way: deque[int] = deque()
     how = content.extraction(extractor_of(settings), settings) if cache else b""
+
+    def keep(k: int, features: Features) -> None:
+        # What a cache has of a picture knows nothing of the lens: a better one may use more of it.
+        features = features.where(camera.uses(features.keypoints_px))
+        pixels[k] = camera.undistort_to_pinhole(features.keypoints_px)
+        if kept is None:
+            in_memory[k] = features
+        else:
+            kept.put(k, features)
+        progress.step()
 
     def missing() -> Iterator[tuple[MappingSettings, npt.NDArray[np.uint8]]]:
         for frame in frames:
@@ -72,31 +89,30 @@ def extract(
             if cache:
                 keys.append(content.features_key(frame.image, how))
                 features = cache.features(keys[-1])
-            found.append(features)
+            k = len(names) - 1
             if features is None:
-                under_way.append(len(found) - 1)
+                under_way.append(k)
                 yield settings, frame.image
             else:
-                progress.step()
+                keep(k, features)
 
     with Progress("features, images", total) as progress:
         for features in (workers or Threads(threads)).map(extract_features, missing()):
             k = under_way.popleft()
-            found[k] = features
             if cache:
                 cache.keep_features(keys[k], features)
-            progress.step()
+            keep(k, features)
     if len(names) < 2:
         raise InputError(f"a map needs at least 2 frames; the input has {len(names)}")
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"two frames are named '{twice}'")
-    described = [features for features in found if features is not None]
+    described = [in_memory[k] for k in range(len(names))] if kept is None else kept.close()
     return Images(
         names=names,
         time_ns=np.array(times, dtype=np.int64),
         features=described,
-        pinhole_px=[camera.undistort_to_pinhole(features.keypoints_px) for features in described],
+        pinhole_px=[pixels[k] for k in range(len(names))],
         keys=keys,
     )
 

@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import CameraError, InputError
-from ground_station.geometry.camera import Camera, load_camera
+from ground_station.errors import InputError
+from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import keyframes
+from ground_station.mapping.construction.first_lens import known_lens
 from ground_station.mapping.construction.keyframes import Choice
+from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.motion import Figures
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
@@ -51,11 +53,11 @@ class ChosenFrames(FrameRange):
 class Inputs:
     """The frames of all inputs in order, under names that are theirs alone; iterable again.
 
-    `total` is their number, where it is known; `built` is what map.toml shall say of them; `said`
-    are lines about the choice, known at once.
+    `prior` is what is known of their lens; `total` is their number, where it is known; `built` is
+    what map.toml shall say of them; `said` are lines about lens and choice, known at once.
     """
 
-    camera: Camera
+    prior: LensPrior
     total: int | None
     built: dict[str, Any]
     said: list[str]
@@ -63,6 +65,11 @@ class Inputs:
     _sources: list[FrameSource]
     _chosen: list[int] | None = None
     _looked_at: list[FrameSource] | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that took the frames, as far as it is known."""
+        return self.prior.camera
 
     def __iter__(self) -> Iterator[Frame]:
         """Raises `InputError` when a chosen frame is not there the second time."""
@@ -96,9 +103,9 @@ def open_inputs(
 ) -> Inputs:
     """Opens the inputs of a map and chooses their frames.
 
-    `camera` is a camera file, needed where the inputs do not carry the same camera; `rate_hz` gives
-    times to what has none; `frames` is a range, `A:B` or `A:B:S`. Raises `InputError`,
-    `CameraError`, `MapError` or the recording's error, one line each.
+    `camera` is a camera file instead of the inputs' own; with neither, the lens is taken from their
+    metadata or guessed. `rate_hz` gives times to what has none; `frames` is a range, `A:B` or
+    `A:B:S`. Raises `InputError`, `CameraError`, `MapError` or the recording's error, one line each.
     """
     paths = list(paths)
     _check_names(paths)
@@ -106,24 +113,32 @@ def open_inputs(
         _check_rereadable(path)
     wanted = parse_range(frames) if frames else None
     sources = [open_input(path, rate_hz, wanted) for path in paths]
-    taken_by = load_camera(camera) if camera else _carried(paths, sources)
+    lens = known_lens(camera, paths, sources)
+    prior, said = lens.prior, lens.said
     built: dict[str, Any] = {
         "inputs": [Path(path).name for path in paths],
         "range": frames or "::",
         "rate_hz": rate_hz,
+        "lens_prior": {
+            "source": prior.source,
+            "focal_px": round(prior.camera.fx_px, 2),
+            "sigma_focal": round(prior.sigma_focal, 4),
+        },
     }
+    if lens.display_deg:
+        built["display_deg"] = lens.display_deg
     counts = [source.count() for source in sources]
     known = None if None in counts else sum(count or 0 for count in counts)
     exact = frames is not None and frames.count(":") == 2
     limit = min(settings.keyframes.choose_above, settings.max_images)
     if exact or (known is not None and known <= limit):
-        return Inputs(taken_by, known, built, [], paths, sources)
+        return Inputs(prior, known, built, said, paths, sources)
     if len(paths) > settings.max_images:
         raise InputError(f"{len(paths)} inputs; max_images is {settings.max_images}")
-    figures = _measured(sources, taken_by, settings, known)
+    figures = _measured(sources, prior.camera, settings, known)
     total = sum(map(len, figures))
     if total <= limit:  # a container that does not say how many frames it holds
-        return Inputs(taken_by, total, built, [], paths, sources)
+        return Inputs(prior, total, built, said, paths, sources)
     chosen = keyframes.choose(figures, settings.max_images, settings.keyframes)
     again: list[FrameSource] = [
         open_input(path, rate_hz, ChosenFrames(indices=frozenset(index.tolist())))
@@ -136,8 +151,8 @@ def open_inputs(
         "blurred": chosen.blurred,
     }
     given = [len(index) for index in chosen.index]
-    said = _said(total, chosen, settings)
-    return Inputs(taken_by, len(chosen), built, said, paths, again, given, sources)
+    said += _said(total, chosen, settings)
+    return Inputs(prior, len(chosen), built, said, paths, again, given, sources)
 
 
 def _measured(
@@ -183,15 +198,3 @@ def _check_rereadable(path: str) -> None:
             f"{path}: a pipe or device cannot be read twice, which choosing frames needs; "
             "write it to a file first"
         )
-
-
-def _carried(paths: Sequence[str], sources: Sequence[FrameSource]) -> Camera:
-    """The camera that all inputs carry."""
-    first = sources[0].camera
-    for path, source in zip(paths, sources, strict=True):
-        if source.camera is None or first is None:
-            raise CameraError(f"{path}: does not carry a camera; give one with --camera")
-        if source.camera != first:
-            raise CameraError(f"{path}: was taken by another camera than {paths[0]}")
-    assert first is not None  # the loop has seen it
-    return first

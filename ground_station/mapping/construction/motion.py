@@ -211,8 +211,7 @@ class Motion:
         """Unit vectors (N, 3) of pixels of a small picture (N, 2)."""
         height, width = image.shape
         scale = np.array([self._camera.width_px / width, self._camera.height_px / height])
-        xy = self._camera.undistort((small_px + 0.5) * scale - 0.5)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        rays = self._camera.rays((small_px + 0.5) * scale - 0.5)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 

@@ -16,7 +16,14 @@ from ground_station.mapping.construction.consistency import plausible_frames
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair, sequences
-from ground_station.mapping.construction.placing import chains, lookalikes, loops, merging
+from ground_station.mapping.construction.placing import (
+    bridges,
+    chains,
+    contradictions,
+    lookalikes,
+    loops,
+    merging,
+)
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings, SfmSettings
 from ground_station.mapping.sfm import colmap, global_mapping
@@ -34,6 +41,11 @@ room) as with 1e-6, in half the time."""
 _NEARLY_ALL = 0.95
 """Share of the images that the global method must place for `auto` to be content with it."""
 
+_DOUBTFUL = 0.5
+"""Of a model whose largest group without contradictions is a smaller share, nothing is believed."""
+_TRIES = 3
+"""How often images that were contradicted are placed anew."""
+
 Pairs = Mapping[Pair, TwoView]
 
 
@@ -42,12 +54,15 @@ class Structure:
     """The largest model, `sizes` of all models in images, and the images dropped.
 
     `notes`: lines for a person, on models that stay apart and images that changed their place.
+    `parts`: the other models, the larger first. `doubts`: sentences on what could not be decided.
     """
 
     reconstruction: colmap.Reconstruction
     sizes: list[int]
     dropped: list[str]
     notes: list[str] = field(default_factory=list)
+    parts: list[colmap.Reconstruction] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
 
 def reconstruct(
@@ -78,7 +93,6 @@ class _Reconstruction:
         self._wanted = Wanted(
             settings.seed,
             threads,
-            settings.sfm.refine_camera,
             settings.sfm.min_tri_angle_deg,
             len(images.names),
         )
@@ -111,7 +125,8 @@ class _Reconstruction:
             wrong = self._misplaced(models[0], links, pairs)
             colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
         self._drop_implausible(models[0], ordered)
-        gone = sorted(placed - set(models[0].reg_image_ids()))
+        models, doubts = self._consistent(models, pairs)
+        gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
         if moved:
             notes.append(
                 f"{moved} images stood where the images beside them do not see the same; "
@@ -122,7 +137,96 @@ class _Reconstruction:
             [model.num_reg_images() for model in models],
             [self._images.names[image_id - 1] for image_id in gone],
             notes,
+            models[1:],
+            doubts,
         )
+
+    def _consistent(
+        self, models: list[colmap.Reconstruction], pairs: Pairs
+    ) -> tuple[list[colmap.Reconstruction], list[str]]:
+        """Models without images that the rotations of pairs contradict; what stays in doubt.
+
+        Where that leaves little of the first, the global method, which starts nowhere, is asked,
+        too. Groups that contradict each other become models of their own, which are joined again
+        where a similarity does it without a contradiction.
+        """
+        confirmed = contradictions.rotations(
+            pairs, self._images.pinhole_px, self._camera.matrix, self._wanted.threads
+        )
+
+        def split(model: colmap.Reconstruction) -> list[colmap.Reconstruction]:
+            placed = self._placed(model)
+            groups = contradictions.consistent_groups(
+                placed, confirmed, pairs, self._images.pinhole_px
+            )
+            sets = [part for group in groups for part in bridges.separated(placed.among(group))]
+            if len(sets) == 1:
+                return [model]
+            large = [part for part in sets if len(part) >= self._wanted.smallest]
+            pieces = []
+            for part in large:
+                # Without the others it is another model, of which pieces may come loose.
+                piece = self._kept(model, part)
+                colmap.adjust(
+                    piece, loss_px=self._sfm.loss_px, threads=self._wanted.threads,
+                    tolerance=_TOLERANCES[0],
+                )  # fmt: skip
+                drop_misfits(piece, self._sfm)
+                pieces += split(piece)
+            return sorted(pieces, key=lambda piece: -piece.num_reg_images())
+
+        def sizes(found: list[colmap.Reconstruction]) -> list[int]:
+            return [each.num_reg_images() for each in found]
+
+        pieces = split(models[0])
+        if not pieces or pieces[0].num_reg_images() < _DOUBTFUL * models[0].num_reg_images():
+            models, _ = self._solve("global", pairs, method="global")
+            others = split(models[0])
+            pieces = max(
+                pieces, others, key=lambda found: [each.num_reg_images() for each in found]
+            )
+        tries, bridged = 0, pairs
+        while len(pieces) > 1 and tries < _TRIES:
+            # What links two pieces is what bends them; as models of their own they may be joined.
+            piece_of = {
+                image_id - 1: number
+                for number, piece in enumerate(pieces)
+                for image_id in piece.reg_image_ids()
+            }
+            bridged = loops.among(
+                bridged,
+                {(i, j) for i, j in bridged if piece_of.get(i, -1) == piece_of.get(j, -1)},
+            )
+            models, _ = self._solve(f"again-{tries}", bridged, joining=pairs, start=pieces[0])
+            pieces, tries = split(models[0]), tries + 1
+        if not pieces:
+            raise MapError(
+                "structure from motion contradicts what pairs of images say of each other: the "
+                "images show too little, or the camera file is of another camera"
+            )
+        found = sorted(
+            [*pieces, *(piece for model in models[1:] for piece in split(model))],
+            key=lambda piece: -piece.num_reg_images(),
+        )
+        kept: list[colmap.Reconstruction] = []
+        placed: set[int] = set()
+        for piece in found:
+            new = {*piece.reg_image_ids()} - placed
+            if not kept or len(new) >= self._wanted.smallest:
+                kept.append(piece)
+                placed |= new
+        doubts = [
+            f"{len(pieces)} pieces fit each other only against what pairs of their images say: "
+            "they are kept apart"
+        ]
+        return kept, doubts if len(pieces) > 1 else []
+
+    @staticmethod
+    def _kept(model: colmap.Reconstruction, group: set[int]) -> colmap.Reconstruction:
+        """A copy of a model with these images, by index, only."""
+        copy = colmap.copied(model)
+        colmap.drop_images(copy, sorted({*copy.reg_image_ids()} - {k + 1 for k in group}))
+        return copy
 
     def _trusted(self, links: set[Pair], pairs: Pairs) -> Pairs:
         """The pairs that agree with a model made of links alone."""
@@ -137,8 +241,11 @@ class _Reconstruction:
         *,
         joining: Pairs | None = None,
         start: colmap.Reconstruction | None = None,
+        method: str | None = None,
     ) -> tuple[list[colmap.Reconstruction], list[str]]:
         """The models that pairs give, the largest first, and what is to say of the others.
+
+        By the settings' method where none is given.
 
         Models are merged by the pairs `joining`, the same ones if none are given; the first one
         goes on from `start`.
@@ -153,10 +260,11 @@ class _Reconstruction:
         with Progress("structure from motion, images", count) as progress:
             mapping = Incremental(database, folder, self._wanted, progress.step)
             models: list[colmap.Reconstruction] = []
-            if self._sfm.method != "incremental" and start is None:
+            method = method or self._sfm.method
+            if method != "incremental" and start is None:
                 models = global_mapping.reconstruct(database, folder / "global", self._wanted)
                 most = max((model.num_reg_images() for model in models), default=0)
-                if self._sfm.method == "auto" and most < _NEARLY_ALL * count:
+                if method == "auto" and most < _NEARLY_ALL * count:
                     models = []
             models = models or mapping.run(start)
         if not models:
@@ -242,10 +350,7 @@ def adjust_and_filter(
     or `min_tri_angle_deg` go; twice, because the first round's outliers bend the second's poses.
     """
     for tolerance in _TOLERANCES:
-        colmap.adjust(
-            reconstruction, loss_px=sfm.loss_px, refine_camera=sfm.refine_camera, threads=threads,
-            tolerance=tolerance,
-        )  # fmt: skip
+        colmap.adjust(reconstruction, loss_px=sfm.loss_px, threads=threads, tolerance=tolerance)
         model = drop_misfits(reconstruction, sfm)
     if not len(model.point_id):
         raise MapError(

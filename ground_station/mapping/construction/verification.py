@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
 from ground_station.mapping.construction import pairs as choice
 from ground_station.mapping.construction.cache import Cache, Known
+from ground_station.mapping.construction.feature_file import KeptFeatures, KeptSide, Lazily, Side
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView, mutual_matches, verify
 from ground_station.mapping.construction.workers import Threads, Workers
@@ -24,8 +26,6 @@ from ground_station.progress import Progress
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Pair = tuple[int, int]
-Side = tuple[F32, F64]
-"""What a comparison needs of an image: descriptors (N, D) and undistorted pixels (N, 2)."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,19 @@ def match(
     What `cache` holds is not compared again. Where not every pair is compared, a second round
     tries those that images seen by both bring near each other.
     """
-    descriptors = [features.descriptors for features in images.features]
+    descriptors = Lazily(len(images.names), lambda k: images.features[k].descriptors)
     sequence = choice.sequences(images.names, images.time_ns)
     wanted = settings.match.of(settings.features)
     chosen = choice.choose_pairs(descriptors, wanted, settings.seed, sequence)
     workers = workers or Threads(threads)
-    sides = list(zip(descriptors, images.pinhole_px, strict=True))
-    with workers.shared(sides) as shared:
+    kept = images.features
+    if isinstance(kept, KeptFeatures) and workers.here:
+        sharing: AbstractContextManager[Sequence[Any]] = nullcontext(kept.sides(images.pinhole_px))
+    else:
+        sharing = workers.shared(
+            Lazily(len(descriptors), lambda k: (descriptors[k], images.pinhole_px[k]))
+        )
+    with sharing as shared:
         run = _Comparison(images, shared, camera, settings, sequence, cache, workers)
         verified = run.compare(chosen, "matching, pairs")
         if wanted.covisible and not choice.is_exhaustive(len(descriptors), wanted):
@@ -124,10 +130,11 @@ def verify_pair(first: Side, second: Side, rules: Rules, camera_matrix: F64) -> 
 
 
 def verify_pairs(
-    pairs: Sequence[tuple[int, int, Rules]], camera_matrix: F64, *sides: Side
+    pairs: Sequence[tuple[int, int, Rules]], camera_matrix: F64, *sides: Side | KeptSide
 ) -> list[TwoView | None]:
     """`verify_pair` of each (i, j, rules), i and j indices into `sides`."""
-    return [verify_pair(sides[i], sides[j], rules, camera_matrix) for i, j, rules in pairs]
+    opened = [side.load() if isinstance(side, KeptSide) else side for side in sides]
+    return [verify_pair(opened[i], opened[j], rules, camera_matrix) for i, j, rules in pairs]
 
 
 class _Comparison:

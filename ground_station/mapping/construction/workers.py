@@ -24,14 +24,18 @@ class Workers(Protocol):
     """Calls functions beside each other.
 
     `name` is what map.toml says of them; `batch` is how many small things make one call worth
-    sending.
+    sending; `here`: they read the files of this machine.
     """
 
     name: str
     batch: int
+    here: bool
 
     def shared(self, values: Sequence[Any]) -> AbstractContextManager[Sequence[Any]]:
-        """Gives, for values that many calls need, what stands for each among their arguments."""
+        """Gives, for values that many calls need, what stands for each among their arguments.
+
+        A value is looked up when a call needs it.
+        """
         ...
 
     def map(self, function: Callable[..., Out], items: Iterable[Sequence[Any]]) -> Iterator[Out]:
@@ -46,6 +50,7 @@ class Threads:
     """Threads of this process."""
 
     batch = 1
+    here = True
 
     def __init__(self, count: int) -> None:
         self.name = f"{count} threads"

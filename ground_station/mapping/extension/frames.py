@@ -201,5 +201,4 @@ def _in_map(features: Features, camera: Camera, of_map: Camera) -> tuple[Feature
         again = of_map.undistort(of_map.distort(ray))
         keep = np.linalg.norm((again - ray) * focal, axis=1) < _SAME_RAY_PX
     keep &= np.isfinite(ray).all(axis=1) & np.isfinite(features.descriptors).all(axis=1)
-    kept = Features(features.keypoints_px[keep], features.scores[keep], features.descriptors[keep])
-    return kept, ray[keep] * focal + [of_map.cx_px, of_map.cy_px]
+    return features.where(keep), ray[keep] * focal + [of_map.cx_px, of_map.cy_px]

@@ -80,13 +80,14 @@ def taken_by(model: Camera, carried: Camera) -> tuple[Camera, str]:
     lengths and centre without a lens: the recording's pictures are not undistorted, so that its
     camera counts.
     """
-    if not np.any(model.distortion) and np.allclose(model.matrix, carried.matrix, atol=1e-6):
-        lens = "" if np.array_equal(model.distortion, carried.distortion) else _UNDISTORTED
+    if model.is_pinhole and np.allclose(model.matrix, carried.matrix, atol=1e-6):
+        lens = "" if carried.is_pinhole else _UNDISTORTED
         return carried, lens
     if (model.width_px, model.height_px) != (carried.width_px, carried.height_px):
         return model, ""  # said of the first picture, in one line
     v, u = np.mgrid[0 : model.height_px : 16, 0 : model.width_px : 16]
     grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+    grid = grid[model.uses(grid)]
     off_px = float(np.linalg.norm(carried.distort(model.undistort(grid)) - grid, axis=1).max())
     if off_px <= _DIFFER_PX:
         return model, ""

@@ -141,6 +141,7 @@ def _figures(
             "height_px": camera.height_px,
             "K": camera.matrix.tolist(),
             "distortion": camera.distortion.tolist(),
+            "model": camera.model,
         },
         "plan": _placed(plan, scale) if plan is not None else None,
         "grid": {

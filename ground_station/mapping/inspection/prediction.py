@@ -15,6 +15,8 @@ F64 = npt.NDArray[np.float64]
 
 _LEAST_CHANCE = 0.02
 """Landmarks less likely than this are not projected."""
+_UP = {0: (1, -1), 90: (0, -1), 180: (1, 1), 270: (0, 1)}
+"""The camera's axis and its sign that is up in pictures which displays turn clockwise so far."""
 _WEAK = 1e-6
 """Information that keeps a pose without landmarks invertible: 1,000 of its units."""
 
@@ -114,7 +116,8 @@ class Predictor:
         dv[:, 1], dv[:, 2] = camera.fy_px / z, -camera.fy_px * X[:, 1] / z**2
         # By the landmark in world axes, and then in its own deviations.
         a, b = (np.einsum("ni,nij->nj", np.einsum("ni,nji->nj", d, wRc), root) for d in (du, dv))
-        square = self.needs.sigma_px**2
+        flat = np.stack([X[:, 0] / z, X[:, 1] / z], axis=1)
+        square = (self.needs.sigma_px * camera.lens.stretch(flat)) ** 2
         l11 = np.sqrt(np.einsum("ni,ni->n", a, a) + square)
         l21 = np.einsum("ni,ni->n", a, b) / l11
         l22 = np.sqrt(np.maximum(np.einsum("ni,ni->n", b, b) + square - l21**2, square))
@@ -127,11 +130,13 @@ class Predictor:
 def levelled(map_: Map) -> Map:
     """The map with z up: as it is once registered; else turned so that its cameras stand upright.
 
-    Only positions, poses, view directions and covariances are turned.
+    Upright is as displays show the pictures, which they may turn from how they are stored. Only
+    positions, poses, view directions and covariances are turned.
     """
     if map_.info.registered or not len(map_.keyframes):
         return map_
-    up = -map_.keyframes.wTc[:, :3, 1].mean(axis=0)
+    axis, sign = _UP.get(map_.info.built.get("display_deg", 0), _UP[0])
+    up = sign * map_.keyframes.wTc[:, :3, axis].mean(axis=0)
     length = float(np.linalg.norm(up))
     if length < 1e-6:
         return map_

@@ -17,6 +17,8 @@ from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 
+_JUDGED = ("doubts", "parts", "left_out", "noise_px", "lens_prior", "lens")
+"""What a build has written of its own doubts, as it is."""
 _QUANTILES = (("p5", 5), ("p50", 50), ("p95", 95))
 _COVERED_CELL = 50
 """A map's longer side has so many cells where its covered area is counted."""
@@ -36,6 +38,7 @@ def describe(map_: Map) -> dict[str, Any]:
         "images": len(kf),
         "images_given": built.get("images", len(kf)),
         "model_sizes": built.get("model_sizes", [len(kf)]),
+        **{name: built[name] for name in _JUDGED if name in built},
         "landmarks": len(lm),
         "modes": len(map_.modes) if map_.modes is not None else None,
         "mean_track": round(float(lm.observations.mean()), 2) if len(lm) else 0.0,

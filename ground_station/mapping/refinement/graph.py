@@ -154,7 +154,6 @@ def solve(
         done = colmap.adjust(
             reconstruction,
             loss_px=loss_px,
-            refine_camera=False,
             threads=threads,
             max_iterations=_ROUND_STEPS,
         )

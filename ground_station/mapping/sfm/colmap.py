@@ -146,7 +146,6 @@ def adjust(
     model: Reconstruction,
     *,
     loss_px: float,
-    refine_camera: bool,
     threads: int = 0,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
@@ -158,7 +157,6 @@ def adjust(
     """
     options = adjustment_options(loss_px, threads, max_iterations)
     options.ceres.solver_options.function_tolerance = tolerance
-    options.refine_focal_length = refine_camera
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -167,8 +165,15 @@ def adjust(
     return bool(summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE)
 
 
-def from_arrays(model: Model, camera: Camera, weight: F64 | None = None) -> Reconstruction:
-    """A reconstruction of a model's arrays, image k with id `image_id[k]`; `feature` is made anew.
+def from_arrays(
+    model: Model,
+    camera: Camera,
+    weight: F64 | None = None,
+    keypoints_px: Sequence[F64] | None = None,
+) -> Reconstruction:
+    """A reconstruction of a model's arrays, image k with id `image_id[k]`.
+
+    `feature` is made anew, unless all key points of each image (N, 2), undistorted, are given.
 
     COLMAP's adjustment has one loss for all sights. So `weight` (K,) of the images becomes a camera
     for each weight whose pixels are so much smaller: the same rays, with residuals scaled. Without
@@ -191,11 +196,15 @@ def from_arrays(model: Model, camera: Camera, weight: F64 | None = None) -> Reco
         )
     order = np.argsort(model.image, kind="stable")
     offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order)) - offset[model.image[order]]
+    place = model.feature
+    if keypoints_px is None:
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order)) - offset[model.image[order]]
     cTw = np.linalg.inv(model.wTc) if len(model.wTc) else model.wTc
     for k, name in enumerate(model.names):
-        pixels = (model.pixel_px[order[offset[k] : offset[k + 1]]] + HALF_PIXEL) * weights[k]
+        mine = order[offset[k] : offset[k + 1]]
+        seen = model.pixel_px[mine] if keypoints_px is None else keypoints_px[k]
+        pixels = (seen + HALF_PIXEL) * weights[k]
         result.add_image_with_trivial_frame(
             pycolmap.Image(
                 name=name,
@@ -207,9 +216,10 @@ def from_arrays(model: Model, camera: Camera, weight: F64 | None = None) -> Reco
         )
     by_point = np.argsort(model.point, kind="stable")
     tracks = np.searchsorted(model.point[by_point], np.arange(len(model.position) + 1)).tolist()
-    sights = np.stack([model.image_id[model.image], place], axis=1)[by_point].tolist()
+    sights = np.stack([model.image_id[model.image], place], axis=1)[by_point]
     for m, point_id in enumerate(model.point_id.tolist()):
-        track = [pycolmap.TrackElement(*sight) for sight in sights[tracks[m] : tracks[m + 1]]]
+        mine = sights[tracks[m] : tracks[m + 1]].tolist()  # all of them as lists would be large
+        track = [pycolmap.TrackElement(*sight) for sight in mine]
         point = pycolmap.Point3D(xyz=model.position[m], track=pycolmap.Track(track))
         result.add_point3D_with_id(point_id, point)
     return result
@@ -270,6 +280,11 @@ def similarity(source: F64, target: F64, error: float, seed: int) -> Alignment |
     return Alignment(motion.rotation.matrix(), np.array(motion.translation), float(motion.scale))
 
 
+def copied(model: Reconstruction) -> Reconstruction:
+    """A model of its own that is the same."""
+    return pycolmap.Reconstruction(model)
+
+
 def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
     """Takes images out of a model, with their sights."""
     for image_id in np.asarray(image_ids).tolist():
@@ -300,11 +315,12 @@ def compact(model: Reconstruction) -> Reconstruction:
     """
     result = pycolmap.Reconstruction()
     result.add_camera_with_trivial_rig(model.cameras[_CAMERA_ID])
-    place: dict[tuple[int, int], int] = {}
+    place: dict[int, I64] = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]
         kept = [int(i) for i in image.get_observation_point2D_idxs()]
-        place.update({(image_id, old): new for new, old in enumerate(kept)})
+        place[image_id] = np.full(len(image.points2D), -1, np.int64)
+        place[image_id][kept] = np.arange(len(kept))
         pixels = np.array([image.points2D[i].xy for i in kept]).reshape(-1, 2)
         result.add_image_with_trivial_frame(
             pycolmap.Image(
@@ -316,7 +332,7 @@ def compact(model: Reconstruction) -> Reconstruction:
         point = model.points3D[point_id]
         track = pycolmap.Track(
             [
-                pycolmap.TrackElement(e.image_id, place[e.image_id, e.point2D_idx])
+                pycolmap.TrackElement(e.image_id, place[e.image_id][e.point2D_idx])
                 for e in point.track.elements
             ]
         )

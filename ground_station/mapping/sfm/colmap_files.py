@@ -24,6 +24,7 @@ PARAMETERS = {
     "SIMPLE_RADIAL": 4,
     "RADIAL": 5,
     "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
 }
 """How many numbers a camera has, by its model: those that our lens model can hold."""

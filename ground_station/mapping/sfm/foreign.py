@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens_models import MODELS
 from ground_station.mapping.sfm import colmap_files, colmap_text
 from ground_station.mapping.sfm.colmap import HALF_PIXEL
 from ground_station.mapping.sfm.colmap_files import NO_POINT, CameraEntry, ImageEntry
@@ -30,9 +31,10 @@ _ORDER = {
     "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
-"""COLMAP's parameters; the lens is OpenCV's polynomial in all of them."""
+"""COLMAP's parameters; the lens is OpenCV's polynomial or its fisheye."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class ForeignModel:
 def read(folder: str | Path) -> ForeignModel:
     """Reads a COLMAP model, binary or text; raises `MapError` with one line naming what is wrong.
 
-    Refused are lenses that OpenCV's five parameters do not hold, and images of several cameras.
+    Refused are lenses that neither OpenCV's five parameters nor its fisheye hold, and images of
+    several cameras.
     """
     folder = Path(folder)
     if (folder / "cameras.bin").exists():
@@ -105,14 +108,18 @@ def _only_camera(folder: Path, cameras: dict[int, CameraEntry], images: list[Ima
 def camera_of(entry: CameraEntry) -> Camera:
     """COLMAP's camera as ours; raises `CameraError` or `ConfigError` for what ours cannot be."""
     given = dict(zip(_ORDER[entry.model].split(), entry.params, strict=True))
-    rational = {name: given.pop(name) for name in ("k4", "k5", "k6") if name in given}
+    fisheye = entry.model == "OPENCV_FISHEYE"
+    others = () if fisheye else ("k4", "k5", "k6")
+    rational = {name: given.pop(name) for name in others if name in given}
     if any(rational.values()):
         numbers = ", ".join(f"{name} {value:.3g}" for name, value in rational.items())
         raise CameraError(f"{entry.model} with {numbers}; only 0 can be taken over")
     if "f" in given:
         given["fx"] = given["fy"] = given.pop("f")
-    lens = {name: given[name] for name in ("k1", "k2", "p1", "p2", "k3") if name in given}
+    model = "fisheye" if fisheye else "opencv5"
+    lens = {name: given[name] for name in MODELS[model].NAMES if name in given}
     values = {
+        "model": model,
         "width_px": entry.width,
         "height_px": entry.height,
         "fx_px": given["fx"],

@@ -30,9 +30,9 @@ def reconstruct(database: Path, work: Path, wanted: Wanted) -> list[colmap.Recon
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = wanted.seed
     options.num_threads = wanted.threads or -1
-    options.min_model_size = min(10, max(2, wanted.images // 2))
+    options.min_model_size = wanted.smallest
     mapper = options.mapper
-    mapper.bundle_adjustment.refine_focal_length = wanted.refine_camera
+    mapper.bundle_adjustment.refine_focal_length = False
     mapper.bundle_adjustment.refine_principal_point = False
     mapper.bundle_adjustment.refine_extra_params = False
     mapper.min_tri_angle_deg = wanted.min_tri_angle_deg

@@ -44,9 +44,13 @@ class Wanted:
 
     seed: int
     threads: int
-    refine_camera: bool
     min_tri_angle_deg: float
     images: int
+
+    @property
+    def smallest(self) -> int:
+        """Images of a model that is worth keeping."""
+        return min(10, max(2, self.images // 2))
 
 
 def pipeline_options(wanted: Wanted) -> pycolmap.IncrementalPipelineOptions:
@@ -55,9 +59,9 @@ def pipeline_options(wanted: Wanted) -> pycolmap.IncrementalPipelineOptions:
     options.random_seed = wanted.seed
     options.num_threads = wanted.threads or -1
     options.extract_colors = False
-    options.min_model_size = min(10, max(2, wanted.images // 2))
+    options.min_model_size = wanted.smallest
     options.max_num_models = 5
-    options.ba_refine_focal_length = wanted.refine_camera
+    options.ba_refine_focal_length = False
     options.ba_refine_principal_point = False
     options.ba_refine_extra_params = False
     # Constant intrinsics let the global adjustment run more rarely without drift, and nothing needs
@@ -86,6 +90,10 @@ class Incremental:
         colmap.quiet()
         self._options = pipeline_options(wanted)
         self._mapping = self._options.get_mapper()
+        # An image that a weak bridge holds, as behind a turn, comes last, among the most points.
+        self._last_demands = self._options.get_mapper()
+        self._last_demands.abs_pose_min_num_inliers = self._options.min_num_matches
+        self._last_demands.max_reg_trials *= 2
         self._triangulation = self._options.get_triangulation()
         self._seed = wanted.seed
         choice = pycolmap.DatabaseCacheOptions()
@@ -289,20 +297,21 @@ class Incremental:
     def _register_next(
         self, mapper: pycolmap.IncrementalMapper, model: colmap.Reconstruction
     ) -> int | None:
-        """The image that found its place, the best first; by matches with images where points fail.
+        """The image that found its place, the best first; None when none does.
 
-        None when none does.
+        By points; by matches with images where points fail; by as few points as a pair needs
+        matches where both fail.
         """
-        for structure_less in (False, True):
-            register = (
-                mapper.register_next_structure_less_image
-                if structure_less
-                else mapper.register_next_image
-            )
+        by_points, by_images = mapper.register_next_image, mapper.register_next_structure_less_image
+        for register, demands in (
+            (by_points, self._mapping),
+            (by_images, self._mapping),
+            (by_points, self._last_demands),
+        ):
             small = model.num_reg_images() < self._options.min_model_size
-            candidates = mapper.find_next_images(self._mapping, structure_less)
+            candidates = mapper.find_next_images(demands, register is by_images)
             for trial, image_id in enumerate(candidates):
-                if register(self._mapping, image_id):
+                if register(demands, image_id):
                     return int(image_id)
                 if small and trial >= _STUBBORN:
                     break

@@ -143,7 +143,7 @@ def pairs_of(path: Path, settings: MappingSettings, frames: str | None, camera: 
 def methods(images: Images, pairs: Any, camera: Camera, truth: Trajectory, seed: int) -> list[Row]:
     """Incremental and global structure from motion of the same pairs, adjusted and filtered."""
     rows = []
-    wanted = Wanted(seed, THREADS, False, 1.5, len(images.names))
+    wanted = Wanted(seed, THREADS, 1.5, len(images.names))
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         database = work / "database.db"
@@ -233,7 +233,7 @@ def corridor(flights: Path, with_methods: bool, seed: int) -> list[Row]:
         work = Path(folder)
         database = work / "database.db"
         colmap.write_database(database, camera, images.names, images.pinhole_px, pairs)
-        wanted = Wanted(settings.seed, THREADS, False, 1.5, len(images.names))
+        wanted = Wanted(settings.seed, THREADS, 1.5, len(images.names))
         timing: Row = {}
         with timed(timing, "sfm"):
             models = pycolmap.incremental_mapping(database, work, work, pipeline_options(wanted))

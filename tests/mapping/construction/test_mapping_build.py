@@ -119,25 +119,6 @@ def test_the_same_input_gives_the_same_map(built, use_scene, tmp_path):
     assert abs(len(again.landmarks) - len(built.map.landmarks)) <= 3
 
 
-def test_refined_focal_lengths_find_the_true_ones_and_the_lens_follows(built, use_scene, tmp_path):
-    import dataclasses
-
-    scene = built.scene
-    use_scene(scene)
-    wrong = dataclasses.replace(scene.camera, fx_px=515.0, fy_px=519.0)
-    settings = dataclasses.replace(
-        built.settings, sfm=dataclasses.replace(built.settings.sfm, refine_camera=True)
-    )
-    map_ = build.build_map(scene.frames(), wrong, settings, tmp_path / "refined")
-    found = map_.info.camera
-    assert abs(found.fx_px - scene.camera.fx_px) < 0.5 * abs(wrong.fx_px - scene.camera.fx_px)
-    pixels = np.stack(np.meshgrid([40.0, 320, 600], [40.0, 240, 440]), axis=-1).reshape(-1, 2)
-    model = pycolmap.Reconstruction(tmp_path / "refined" / "sparse")
-    fx, fy, cx, cy = model.cameras[1].params - [0, 0, 0.5, 0.5]
-    rays = (wrong.undistort_to_pinhole(pixels) - [cx, cy]) / [fx, fy]
-    assert np.abs(found.distort(rays) - pixels).max() < 0.1
-
-
 def _noise_frames(count: int, size: tuple[int, int] = (480, 640)):
     rng = np.random.default_rng(0)
     for k in range(count):

@@ -146,14 +146,15 @@ def test_several_inputs_are_told_apart_by_their_names(
         open_inputs([str(folder), str(twin)], SETTINGS, camera=camera_file)
 
 
-def test_cameras_that_are_missing_or_differ_are_refused(
+def test_cameras_that_differ_or_only_some_inputs_carry_are_refused(
     tmp_path: Path, folder: Path, units: list[bytes]
 ) -> None:
-    with pytest.raises(CameraError, match="walk: does not carry a camera; give one with --camera"):
-        open_inputs([str(folder)], SETTINGS)
     one, other = record(tmp_path / "one.mcap", units), record(tmp_path / "two.mcap", units, 260.0)
     with pytest.raises(CameraError, match=r"two.mcap: was taken by another camera than .*one.mcap"):
         open_inputs([str(one), str(other)], SETTINGS)
+    for pair in ((folder, one), (one, folder)):
+        with pytest.raises(CameraError, match=r"walk: does not carry a camera, .*--camera$"):
+            open_inputs([str(path) for path in pair], SETTINGS)
 
 
 @pytest.mark.parametrize("choose_above", [10, 100])

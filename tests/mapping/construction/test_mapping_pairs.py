@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 
+from ground_station.mapping.construction import pairs as pairs_module
 from ground_station.mapping.construction.pairs import (
     choose_pairs,
     covisible_pairs,
+    reduced_vlad,
     sequences,
     steps,
     vlad,
@@ -112,3 +116,44 @@ def test_the_second_round_is_bounded():
     pairs = covisible_pairs(n, list(linked), linked, settings)
     assert 0 < len(pairs) <= 3 * n
     assert pairs == sorted(set(pairs))
+
+
+def test_of_many_images_an_index_finds_those_that_look_alike(monkeypatch):
+    monkeypatch.setattr(pairs_module, "_COMPARED_WHOLE", 50)
+    places = _images(120)
+    again = [_unit(p + 0.05 * RNG.normal(size=p.shape)) for p in places]
+    settings = MatchSettings(exhaustive_max=2, neighbours=2, similar=3)
+    way = np.repeat([0, 1], 120)
+    pairs = choose_pairs(places + again, settings, 0, way)
+    assert {(k, k + 120) for k in range(120)} <= set(pairs)
+    assert {(k, k + 1) for k in range(239) if k != 119} <= set(pairs)
+    assert pairs == sorted(set(pairs)) and all(i < j for i, j in pairs)
+    assert len(pairs) <= 240 * (3 + 2)
+    assert pairs == choose_pairs(places + again, settings, 0, way)
+
+
+def test_reduced_vectors_are_of_unit_length_and_keep_what_is_alike():
+    places = _images(40)
+    again = [_unit(p + 0.05 * RNG.normal(size=p.shape)) for p in places]
+    vectors = reduced_vlad(places + again, 0)
+    assert vectors.shape[0] == 80 and vectors.shape[1] <= 80
+    assert np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+    similarity = vectors @ vectors.T
+    np.fill_diagonal(similarity, -1)
+    assert similarity.argmax(axis=1).tolist() == [*range(40, 80), *range(40)]
+
+
+def test_memory_grows_with_the_images_and_not_with_their_square():
+    n = 6000
+    images = [np.empty((0, 16), np.float32)] * n
+    linked = {(i, i + step): 50 for step in (1, 2) for i in range(n - step)}
+    settings = MatchSettings(min_inliers_far=30, covisible=4, similar=0)
+    tracemalloc.start()
+    try:
+        chosen = choose_pairs(images, settings, 0)
+        more = covisible_pairs(n, list(linked), linked, settings)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    # A matrix of all pairs has 36 MB where each is a byte.
+    assert len(chosen) > n and len(more) > n and peak < 36e6

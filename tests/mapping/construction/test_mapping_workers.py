@@ -10,6 +10,7 @@ import threading
 from concurrent.futures import CancelledError
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ground_station.errors import InputError, MapError
@@ -188,6 +189,48 @@ def test_a_mistake_of_ours_in_a_worker_is_not_hidden():
         list(dask.Cluster(_Failing(ZeroDivisionError()), "x", SETTINGS).map(abs, [(1,)]))
 
 
+def test_a_large_array_goes_beside_the_call_and_small_ones_within():
+    """Dask's scheduler keeps what a call carries: pictures would fill it."""
+
+    class Recording(_Client):
+        def __init__(self):
+            self.scattered, self.called = [], []
+
+        status = "running"
+
+        def nthreads(self):
+            return {"tcp://one": 1}
+
+        def scatter(self, values, hash):
+            self.scattered += values
+            return [_Done(f"scattered {len(self.scattered)}")]
+
+        def submit(self, *args, pure):
+            self.called.append(args[4:])
+            return _Done(0)
+
+    client = Recording()
+    picture, few = np.zeros((480, 640), np.uint8), np.zeros((3, 3))
+    workers = dask.Cluster(client, "tls://hall:8786", SETTINGS)
+    assert not workers.here
+    assert list(workers.map(abs, [(1, picture), (2, few)])) == [0, 0]
+    assert len(client.scattered) == 1 and client.scattered[0] is picture
+    (one, sent), (two, within) = client.called
+    assert (one, two) == (1, 2) and sent.value == "scattered 1" and within is few
+
+
+class _Done:
+    """A future that is ready."""
+
+    status = "finished"
+
+    def __init__(self, value):
+        self.value = value
+
+    def result(self, timeout):
+        return self.value
+
+
 def _lost_while_under_way(workers, died):
     """Sums with a shared value that dies, with every worker that has it, when a third are sent."""
     with workers.shared([1000]) as (value,):
@@ -204,7 +247,7 @@ def _lost_while_under_way(workers, died):
         return list(workers.map(operator.add, items()))
 
 
-def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames):
+def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames, tmp_path):
     frames, camera = sample_frames
     alone = extract(frames, camera, SETTINGS, 2, None)
     pairs = match(alone, camera, SETTINGS, 2)
@@ -212,10 +255,12 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames):
     expected = content.structure_key(alone, pairs, camera, SETTINGS)
     with open_workers("2", 2, SETTINGS) as workers:
         assert workers.name == "Dask on this machine, 2 workers"
-        images = extract(frames, camera, SETTINGS, 2, None, workers=workers)
-        found = match(images, camera, SETTINGS, 2, workers=workers)
-        # Structure from motion would start from the same, to the bit.
-        assert content.structure_key(images, found, camera, SETTINGS) == expected
+        assert workers.here
+        for folder in (None, tmp_path):
+            images = extract(frames, camera, SETTINGS, 2, None, workers=workers, folder=folder)
+            found = match(images, camera, SETTINGS, 2, workers=workers)
+            # Structure from motion would start from the same, to the bit.
+            assert content.structure_key(images, found, camera, SETTINGS) == expected
         masks = workers._client.run(signal.pthread_sigmask, signal.SIG_BLOCK, [])
         assert [signal.SIGINT in mask for mask in masks.values()] == [True, True]  # Ctrl-C is ours
         died = []

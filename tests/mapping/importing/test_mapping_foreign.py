@@ -66,6 +66,7 @@ def test_every_lens_that_ours_holds_projects_as_colmaps(name):
         "SIMPLE_RADIAL": [500.0, 321.0, 243.0, 0.1],
         "RADIAL": [500.0, 321.0, 243.0, 0.1, -0.2],
         "OPENCV": [500.0, 510.0, 321.0, 243.0, 0.1, -0.2, 0.003, -0.002],
+        "OPENCV_FISHEYE": [500.0, 510.0, 321.0, 243.0, -0.02, 0.004, 0.003, -0.001],
         "FULL_OPENCV": [500.0, 510.0, 321.0, 243.0, 0.1, -0.2, 0.003, -0.002, 0.05, 0.0, 0.0, 0.0],
     }[name]
     theirs = pycolmap.Camera(camera_id=1, model=name, width=640, height=480, params=values)
@@ -79,7 +80,7 @@ def test_every_lens_that_ours_holds_projects_as_colmaps(name):
 @pytest.mark.parametrize(
     ("name", "params", "words"),
     [
-        ("OPENCV_FISHEYE", [500, 500, 320, 240, 0, 0, 0, 0], "camera 1 has the model OPENCV_FISHE"),
+        ("RADIAL_FISHEYE", [500, 320, 240, 0, 0], "camera 1 has the model RADIAL_FISHE"),
         ("FOV", [500, 500, 320, 240, 0.9], "the model FOV; what can be taken over is SIMPLE_PINH"),
         ("FULL_OPENCV", [500, 500, 320, 240, *[0] * 5, 0.1, 0, 0], "FULL_OPENCV with k4 0.1, k5"),
         ("PINHOLE", [0.1, 500, 320, 240], "fx_px.*0.1"),

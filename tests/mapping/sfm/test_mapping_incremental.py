@@ -34,7 +34,7 @@ def on_image():
     seen.append(1)
     if len(seen) == last:
         os.kill(os.getpid(), signal.SIGKILL)
-Incremental(work / "database.db", work, Wanted(0, 1, False, 1.5, int(sys.argv[4])), on_image).run()
+Incremental(work / "database.db", work, Wanted(0, 1, 1.5, int(sys.argv[4])), on_image).run()
 """
 
 
@@ -50,7 +50,7 @@ def database(tmp_path_factory) -> Path:
 
 def _run(database: Path, work: Path, counted: list[int] | None = None) -> colmap.Model:
     steps: list[int] = [] if counted is None else counted
-    wanted = Wanted(0, 1, False, 1.5, FRAMES)
+    wanted = Wanted(0, 1, 1.5, FRAMES)
     (model,) = Incremental(database, work, wanted, lambda: steps.append(1)).run()
     return colmap.to_arrays(model)
 
@@ -174,7 +174,7 @@ def test_a_model_that_the_disk_did_not_take_is_told(tmp_path, monkeypatch):
 def test_the_first_pair_does_not_depend_on_which_thread_is_ready_first(database, tmp_path):
     found = set()
     for _ in range(20):
-        mapping = Incremental(database, tmp_path, Wanted(0, 4, False, 1.5, FRAMES), lambda: None)
+        mapping = Incremental(database, tmp_path, Wanted(0, 4, 1.5, FRAMES), lambda: None)
         pair = mapping._first_pair(mapping._mapper([]), 1)
         assert pair is not None
         found.add(tuple(sorted(pair.reg_image_ids())))

@@ -22,9 +22,9 @@ from ground_station.mapping.construction.placing.placed import Placed
 
 F64 = npt.NDArray[np.float64]
 
-_SPEAKS = 15
+SPEAKS = 15
 """Fewer landmarks in common say nothing about two images."""
-_HOLDS, _BREAKS = 0.5, 0.2
+HOLDS, _BREAKS = 0.5, 0.2
 """Shares of the landmarks in common that are in their place: of a link that holds, and of one that
 does not. Between the two a link says nothing."""
 
@@ -45,9 +45,9 @@ def misplaced(
     for pair in sorted(links):
         if {*pair} <= model.wTc.keys():
             good, total = model.in_place(pair, pairs[pair], pixels)
-            if total >= _SPEAKS and good >= _HOLDS * total:
+            if total >= SPEAKS and good >= HOLDS * total:
                 holding.append(pair)
-            elif total >= _SPEAKS and good <= _BREAKS * total:
+            elif total >= SPEAKS and good <= _BREAKS * total:
                 broken.append(pair)
     edges = np.array(holding, dtype=np.int64).reshape(-1, 2)
     piece = components([edges], len(model.landmark))
@@ -80,6 +80,6 @@ def refuted(
         if (i in wrong) == (j in wrong) or pair in links or not {i, j} <= model.wTc.keys():
             continue
         good, total = model.in_place(pair, view, pixels)
-        if total and good >= _HOLDS * total:
+        if total and good >= HOLDS * total:
             found.add(pair)
     return found

@@ -47,6 +47,14 @@ class Placed:
         places = dict(zip(index, model.wTc, strict=True))
         return Placed(landmark, places, model.position, model.pinhole)
 
+    def among(self, images: set[int]) -> Placed:
+        """The same model with these images, by index, only."""
+        landmark = [
+            of if k in images else np.full_like(of, -1) for k, of in enumerate(self.landmark)
+        ]
+        places = {k: wTc for k, wTc in self.wTc.items() if k in images}
+        return Placed(landmark, places, self.position, self.pinhole)
+
     @cached_property
     def depth(self) -> float:
         """The median distance at which landmarks are seen."""

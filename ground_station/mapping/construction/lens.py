@@ -1,0 +1,302 @@
+"""The lens of a build: what is known of it, what the views say, and which one the map has.
+
+Where nobody calibrated the camera, a rough lens is found by how many matches of neighbours agree
+with one geometry; then, as with a calibrated one that misfits, images are placed with what is
+known, the whole lens is adjusted with them, and the images are placed anew, until the lens stands.
+A lens is taken from the views only where they decide it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.errors import MapError
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.construction.images import Images
+from ground_station.mapping.construction.lens_adjustment import (
+    PARAMETERS,
+    Adjusted,
+    Prior,
+    adjust,
+    vector,
+)
+from ground_station.mapping.construction.lens_prior import LensPrior
+from ground_station.mapping.construction.noise import matched_neighbours
+from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.colmap import Model
+
+F64 = npt.NDArray[np.float64]
+
+_MODEL = "opencv5"
+ROUNDS = 5
+"""Models of one build, each with the lens that the one before found, at most."""
+_OPEN_ROUNDS = 3
+"""After so many a lens that is open still is given up."""
+_OPEN = 0.01
+"""A focal length whose standard deviation is a larger share of it is open: the error puts a camera
+so much too near or too far, at a depth of 5 m by 5 cm, what the maps are judged by."""
+_CALIBRATION = 0.002
+"""Standard deviation of a focal length that somebody calibrated, as a share of it."""
+_DENIED = 4.0
+"""The images deny a focal length that is so many standard deviations off theirs."""
+_EXPLAINED, _SETTLED = 0.03, 0.003
+"""A calibrated lens misfits only when another explains the first share of the residuals' variance;
+one that was found stands when another explains less than the second."""
+_GROSS = 0.5
+"""A lens that leaves more of the residuals than all else together misfits, whatever its focal
+length."""
+_CHECKED_FOCAL = 0.1
+"""A calibrated focal length may be off by this share when the views are asked."""
+_ASPECT = 0.01
+"""Standard deviation of fy over fx: pixels are square, and calibrations differ by less."""
+_CENTRE = {True: 0.005, False: 0.02}
+"""Of the principal point, as a share of the width, of a lens that is calibrated or not."""
+_TANGENTIAL = 0.005
+_BENT = 0.5
+"""Of each radial term: it moves an image's corner by so large a share of its distance."""
+_PAIRS = 16
+"""Of the search for a rough lens: compared pairs of images."""
+_FOCALS, _BENDS = 13, (-0.5, -0.35, -0.2, -0.1, 0.0, 0.1)
+_SEARCH_PX, _ROUGH_PX = 0.5, 4.0
+"""Distance from the epipolar line in which a match agrees, at a width of 640 pixels: of the search,
+and of the pairs of the first model, whose lens is still a rough one."""
+_SEARCH_ITERATIONS = 300
+
+
+def prior_of(known: LensPrior, checked: Camera) -> Prior:
+    """The Gaussian that an adjustment takes the lens from: about the known camera, wide."""
+    camera = known.camera if known.calibrated else checked
+    focal = max(known.sigma_focal, _CHECKED_FOCAL)
+    x, y = camera.width_px / 2 / camera.fx_px, camera.height_px / 2 / camera.fy_px
+    corner = x * x + y * y
+    centre = _CENTRE[known.calibrated] * camera.width_px
+    bent = [_BENT / corner, _BENT / corner**2, _BENT / corner**3]
+    sigma = np.array([0.0, 0.0, centre, centre, *bent[:2], _TANGENTIAL, _TANGENTIAL, bent[2]])
+    lengths = np.array([camera.fx_px, camera.fy_px])
+    covariance = np.diag(sigma**2)
+    covariance[:2, :2] = focal**2 * np.outer(lengths, lengths)
+    covariance[:2, :2] += 0.5 * _ASPECT**2 * np.diag(lengths**2)
+    return Prior(vector(camera), covariance)
+
+
+def with_lens(images: Images, camera: Camera) -> Images:
+    """The images with their key points undistorted by another lens."""
+    found = [camera.undistort_to_pinhole(features.keypoints_px) for features in images.features]
+    return replace(images, pinhole_px=found)
+
+
+class SelfCalibration:
+    """One build's lens on its way from what is known to what the map is made with.
+
+    `camera` is the lens to place the images with next; `go_on` says of a finished model whether
+    its lens is not the map's yet. `rounds` counts the models.
+    """
+
+    def __init__(self, known: LensPrior, images: Images, ratio: float) -> None:
+        """`ratio` is that of the ratio test.
+
+        Raises `MapError` when nobody calibrated a lens of another model than the five-parameter
+        one.
+        """
+        self.known = known
+        self._follows = known.camera.model == _MODEL
+        if not (self._follows or known.calibrated):
+            raise MapError(
+                f"the images find a lens of the model {_MODEL} only, not {known.camera.model}: "
+                "calibrate it with 'blimp calibrate' and give the file with --camera"
+            )
+        self.camera = known.camera if known.calibrated else rough_lens(images, known, ratio)
+        self.rounds = 0
+        self._found: Adjusted | None = None
+        self._state = "given" if known.calibrated else "found"
+
+    def settings(self, settings: MappingSettings) -> MappingSettings:
+        """With limits in pixels that hold for a lens as rough as the present one."""
+        if self.known.calibrated or self.rounds:
+            return settings
+        limit = _ROUGH_PX * self.camera.width_px / 640
+        match = replace(settings.match, error_px=max(settings.match.error_px, limit))
+        sfm = replace(settings.sfm, max_error_px=max(settings.sfm.max_error_px, limit))
+        return replace(settings, match=match, sfm=sfm)
+
+    def go_on(self, model: Model, images: Images) -> bool:
+        """Whether images have to be placed anew, by another lens, which is `camera` then.
+
+        A calibrated lens of another model than the five-parameter one stays, unjudged. Raises
+        `MapError` when nobody calibrated the lens and the views leave it open.
+        """
+        if self._state == "open" or not self._follows:  # given up: this model is the given lens's
+            return False
+        self.rounds += 1
+        prior = prior_of(self.known, self.camera)
+        found = adjust(_as_seen(model, images), self.camera, prior)
+        self._found = found or self._found
+        if found is None:
+            return False if self._state == "given" else self._give_up("the model is too small")
+        change = vector(found.camera) - vector(self.camera)
+        distance = float(change @ np.linalg.solve(found.covariance, change))
+        is_open = found.sigma_focal > _OPEN or not _folds_nowhere(found.camera)
+        if self._state == "given":
+            if not self._misfits(found):
+                return False
+            self._state = "found"
+        elif distance < len(change) or found.explained < _SETTLED:
+            return self._give_up(_open(found)) if is_open else False
+        elif is_open and self.rounds >= _OPEN_ROUNDS:
+            return self._give_up(_open(found))
+        elif self.rounds >= ROUNDS:
+            return self._give_up(f"after {self.rounds} rounds it has not settled")
+        self.camera = found.camera
+        return True
+
+    def _misfits(self, found: Adjusted) -> bool:
+        """Whether the views deny a calibrated lens, by its focal length or by what it leaves."""
+        off = abs(np.log(_focal(found.camera) / _focal(self.camera)))
+        denied = off > _DENIED * np.hypot(found.sigma_focal, _CALIBRATION)
+        return bool(denied and found.explained > _EXPLAINED) or found.explained > _GROSS
+
+    def as_built(self) -> dict[str, Any]:
+        """What map.toml says of the lens, beside the one that it holds."""
+        found, notes = self._found, self.notes()
+        result: dict[str, Any] = {
+            "said": notes[0] if notes else "as given; the images do not deny it",
+            "source": self.known.source,
+            "state": self._state,
+            "rounds": self.rounds,
+            "given": _lens_of(self.known.camera),
+        }
+        if found is not None:
+            result["found"] = _lens_of(found.camera)
+            result["sigma"] = dict(zip(PARAMETERS, found.sigmas.round(8).tolist(), strict=True))
+            result["explained"] = round(found.explained, 5)
+        return result
+
+    def notes(self) -> list[str]:
+        """Lines for a person: what was done about the lens, and what to do."""
+        found, given = self._found, self.known.camera
+        if found is None or self._state == "given":
+            return []
+        used, focal, sigma = self.camera, _focal(self.camera), found.sigma_focal
+        said = f"{focal:.1f} ± {focal * sigma:.1f} px ({100 * sigma:.2g} %)"
+        if not self.known.calibrated:
+            return [f"lens found by the images: focal length {said}; {_terms(used, found)}"]
+        if self._state == "found":
+            return [
+                f"the given camera misfits: focal length {_focal(given):.1f} px, the images say "
+                f"{said}; {_terms(used, found)}. The map is made with the lens found; if this is "
+                "another camera than the file's, or another mode, calibrate it: blimp calibrate"
+            ]
+        return [
+            "the given camera misfits, but the images do not decide on another: its focal length "
+            f"of {_focal(given):.1f} px is kept, and the map may be bent; check that the file is "
+            "this camera's, or calibrate it: blimp calibrate"
+        ]
+
+    def _give_up(self, reason: str) -> bool:
+        """Back to the calibrated lens, if there is one; whether images are placed anew by it."""
+        if self.known.calibrated:
+            self._state, self.camera = "open", self.known.camera
+            return True
+        raise MapError(
+            f"the images leave the lens open: {reason}. A camera that flies straight on, or sees "
+            "a flat wall only, does not show its lens: calibrate it with 'blimp calibrate' and "
+            "give the file with --camera, or add a flight that turns"
+        )
+
+
+def rough_lens(images: Images, known: LensPrior, ratio: float) -> Camera:
+    """The lens by which most matches of neighbouring images agree with one geometry each.
+
+    The focal length is searched within twice its deviation around the known one, with the
+    one-parameter division model for the lens (Fitzgibbon, CVPR 2001), which is the same at any
+    focal length where it bends the image's corner by the same share. Without matches of neighbours
+    it is the known one.
+    """
+    matched = matched_neighbours(images, ratio, _PAIRS)
+    camera = known.camera
+    if not matched:
+        return camera
+    reach = np.exp(np.linspace(-2, 2, _FOCALS) * known.sigma_focal)
+    best, most = camera, -1
+    for bend in _BENDS:
+        for share in reach.tolist():
+            tried = _divided(camera, share, bend)
+            if tried is None:
+                continue
+            agree = sum(_agreeing(tried, first, second) for first, second in matched)
+            if agree > most:
+                best, most = tried, agree
+    return best
+
+
+def _agreeing(camera: Camera, first: F64, second: F64) -> int:
+    p, q = camera.undistort_to_pinhole(first), camera.undistort_to_pinhole(second)
+    limit = _SEARCH_PX * camera.width_px / 640
+    try:
+        _, mask = cv2.findEssentialMat(
+            p, q, camera.matrix, cv2.USAC_MAGSAC, 0.999, limit, _SEARCH_ITERATIONS
+        )
+    except cv2.error:  # the solver found no model in a degenerate sample
+        return 0
+    return 0 if mask is None else int(np.count_nonzero(mask))
+
+
+def _divided(camera: Camera, share: float, bend: float) -> Camera | None:
+    """A camera of `share` of the focal lengths whose corner is bent outwards by 1 / (1 + bend).
+
+    None where the five-parameter model cannot follow.
+    """
+    fx, fy = share * camera.fx_px, share * camera.fy_px
+    half = np.array([camera.width_px / 2 / fx, camera.height_px / 2 / fy])
+    radius = np.linspace(0.05, 1.0, 40) * np.linalg.norm(half)
+    straight = radius / (1 + bend * (radius / radius[-1]) ** 2)
+    # Distortion is linear in k1, k2 and k3.
+    powers = np.stack([straight**3, straight**5, straight**7], axis=1)
+    k1, k2, k3 = np.linalg.lstsq(powers, radius - straight, rcond=None)[0].tolist()
+    tried = replace(camera, fx_px=fx, fy_px=fy, k1=k1, k2=k2, k3=k3, p1=0.0, p2=0.0)
+    return tried if _folds_nowhere(tried) else None
+
+
+def _folds_nowhere(camera: Camera) -> bool:
+    """Whether undistorted corners of the image are distorted to where they were again."""
+    w, h = camera.width_px - 1.0, camera.height_px - 1.0
+    edge = np.array([[0, 0], [w, 0], [0, h], [w, h], [w / 2, 0], [0, h / 2]])
+    return bool(np.abs(camera.distort(camera.undistort(edge)) - edge).max() < 0.5)
+
+
+def _as_seen(model: Model, images: Images) -> Model:
+    """The model with the key points as they were found, distorted."""
+    order = np.argsort(model.image, kind="stable")
+    pixels = np.empty((len(order), 2))
+    offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
+    for k, image_id in enumerate(model.image_id.tolist()):
+        rows = order[offset[k] : offset[k + 1]]
+        pixels[rows] = images.features[image_id - 1].keypoints_px[model.feature[rows]]
+    return replace(model, pixel_px=pixels)
+
+
+def _open(found: Adjusted) -> str:
+    if found.sigma_focal <= _OPEN:
+        return "the one that fits them best folds the image's edge back"
+    # No number: a model that a wrong lens bends is wrong in more than its deviations hold.
+    return f"their focal length is uncertain by more than {100 * _OPEN:.2g} %"
+
+
+def _focal(camera: Camera) -> float:
+    return float(np.sqrt(camera.fx_px * camera.fy_px))
+
+
+def _lens_of(camera: Camera) -> dict[str, float]:
+    return dict(zip(PARAMETERS, vector(camera).round(8).tolist(), strict=True))
+
+
+def _terms(camera: Camera, found: Adjusted) -> str:
+    sigma = dict(zip(PARAMETERS, found.sigmas.tolist(), strict=True))
+    return ", ".join(
+        f"{name} {getattr(camera, name):.4f} ± {sigma[name]:.4f}" for name in ("k1", "k2", "k3")
+    )

@@ -1,0 +1,134 @@
+"""One part's structure from motion, in a process that may know nothing but this part."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station import progress
+from ground_station.errors import MapError
+from ground_station.geometry.camera import Camera
+from ground_station.mapping.construction.images import Images
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.structure import reconstruct
+from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm import colmap
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+_ARRAYS = ("index", "wTc", "position", "image", "feature", "point", "pinhole", "notes")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is known of a part: its images, by index in the build (K,), and pairs of them (i, j).
+
+    `pinhole_px` (N, 2) and names are in the order of `index`, and pairs are of places in it.
+    """
+
+    index: I64
+    names: list[str]
+    time_ns: I64
+    pinhole_px: list[F64]
+    pairs: dict[Pair, TwoView]
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A part's largest model, in coordinates of its own.
+
+    `index` (K,) of its images in the build and their `wTc` (K, 4, 4); `position` (M, 3); sight o is
+    key point `feature[o]` of image `image[o]`, a place in `index`, and of point `point[o]`.
+    `pinhole` is fx, fy, cx, cy; `notes` are texts, what structure from motion has to say.
+    """
+
+    index: I64
+    wTc: F64
+    position: F64
+    image: I64
+    feature: I64
+    point: I64
+    pinhole: F64
+    notes: npt.NDArray[np.str_]
+
+
+def given(part: I64, images: Images, pairs: Mapping[Pair, TwoView]) -> Given:
+    """What a part's images (K,) are known by, and pairs of them."""
+    place = {k: n for n, k in enumerate(part.tolist())}
+    return Given(
+        part,
+        [images.names[k] for k in place],
+        images.time_ns[part],
+        [images.pinhole_px[k] for k in place],
+        {(place[i], place[j]): view for (i, j), view in pairs.items()},
+    )
+
+
+def solve(
+    part: Given, camera: Camera, settings: MappingSettings, threads: int, work: str | None
+) -> Solved | None:
+    """The model of a part; None where no two of its images give one.
+
+    `work` is a folder that outlives a killed build, which goes on from what it finds there; without
+    one nothing is kept.
+    """
+    if work is None:
+        with tempfile.TemporaryDirectory(prefix="blimp-part-") as passing:
+            return _solved(part, camera, settings, threads, Path(passing))
+    folder = Path(work)
+    done = folder.with_suffix(".npz")
+    found = _read(done)
+    if found is None:
+        found = _solved(part, camera, settings, threads, folder)
+        if found is not None:
+            _write(done, found)
+        shutil.rmtree(folder, ignore_errors=True)
+    return found
+
+
+def _solved(
+    part: Given, camera: Camera, settings: MappingSettings, threads: int, folder: Path
+) -> Solved | None:
+    folder.mkdir(parents=True, exist_ok=True)
+    images = Images(part.names, part.time_ns, [], part.pinhole_px)
+    try:
+        with progress.silent():  # the build counts parts
+            structure = reconstruct(images, part.pairs, camera, settings, threads, folder)
+    except MapError:  # images that only turn, or show one plane: no part of a map
+        return None
+    model = colmap.to_arrays(structure.reconstruction)
+    return Solved(
+        part.index[model.image_id - 1],
+        model.wTc,
+        model.position,
+        model.image,
+        model.feature,
+        model.point,
+        model.pinhole,
+        np.array(structure.notes, dtype=np.str_),
+    )
+
+
+def _write(path: Path, solved: Solved) -> None:
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        np.savez(file, **{name: getattr(solved, name) for name in _ARRAYS})
+    part.replace(path)
+
+
+def _read(path: Path) -> Solved | None:
+    """What was written there; None where there is nothing whole."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return Solved(*(arrays[name] for name in _ARRAYS))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

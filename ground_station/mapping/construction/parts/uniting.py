@@ -1,0 +1,150 @@
+"""One model of joined parts: each image once, and each landmark with all its sights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ground_station.geometry import poses
+from ground_station.geometry.alignment import Alignment
+from ground_station.mapping.construction.images import Images
+from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.parts.solving import Solved
+from ground_station.mapping.sfm.colmap import Model
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+_SAME_DEPTHS = 0.1
+"""Two parts' landmarks of one key point are one where they stand so near each other, in distances
+to the camera; else one part is mistaken about it."""
+_IN_PLACE_PX = 8.0
+"""A landmark seen so near to where it should be is in its place, as in `placing.placed`."""
+_HOLDS = 0.5
+"""Share of a pair's landmarks in their place, for which what it matches is one."""
+
+
+def unite(
+    parts: Sequence[Solved],
+    cores: Sequence[I64],
+    at: Sequence[Alignment],
+    images: Images,
+    pairs: Mapping[Pair, TwoView],
+) -> Model:
+    """The model of all parts, each moved by its similarity; images have id = index + 1.
+
+    An image's pose is that of the part whose core it is in, or else of the one that sees most of
+    it. Landmarks of several parts become one where they have a key point in common, or where a
+    verified pair of images that no part has both of matches them and they stand where it says.
+    """
+    index, wTc = _poses(parts, cores, at)
+    row = np.full(len(images.names), -1, dtype=np.int64)
+    row[index] = np.arange(len(index))
+    offset = np.cumsum([0, *(len(part.position) for part in parts)])
+    position = np.concatenate([by.apply(part.position) for part, by in zip(parts, at, strict=True)])
+    image = np.concatenate([part.index[part.image] for part in parts])
+    feature = np.concatenate([part.feature for part in parts])
+    point = np.concatenate([part.point + first for part, first in zip(parts, offset, strict=False)])
+    # Key points by number: the first sight of each decides where it belongs.
+    starts = np.cumsum([0, *(len(pixels) for pixels in images.pinhole_px)])
+    key = starts[image] + feature
+    seen, first, place = np.unique(key, return_index=True, return_inverse=True)
+    one, other = point[first][place], point
+    apart = np.linalg.norm(position[one] - position[other], axis=1)
+    away = np.linalg.norm(position[one] - wTc[row[image], :3, 3], axis=1)
+    same = (one != other) & (apart <= _SAME_DEPTHS * away)
+    edges = [np.stack([one[same], other[same]], axis=1)]
+    holder = np.full(starts[-1], -1, dtype=np.int64)
+    holder[seen] = point[first]
+    pinhole = np.median([part.pinhole for part in parts], axis=0)
+    inside = _inside(parts, len(images.names))
+    for (i, j), view in pairs.items():
+        if row[i] >= 0 and row[j] >= 0 and not inside[i] & inside[j]:
+            own = holder[starts[i] : starts[i + 1]], holder[starts[j] : starts[j + 1]]
+            px = images.pinhole_px[i], images.pinhole_px[j]
+            edges.append(_in_place(own, view, position, wTc[row[[i, j]]], px, pinhole))
+    ends = np.concatenate(edges)
+    graph = coo_array((np.ones(len(ends), bool), tuple(ends.T)), shape=(len(position),) * 2)
+    _, landmark = connected_components(graph, directed=False)
+    sums = np.stack([np.bincount(landmark, position[:, k]) for k in range(3)], axis=1)
+    united = sums / np.bincount(landmark)[:, None]
+    # Of each key point one sight: the first. A landmark may have lost its others to another one.
+    track = landmark[point[first]]
+    first = first[np.bincount(track)[track] > 1]
+    used, track = np.unique(landmark[point[first]], return_inverse=True)
+    image, feature = row[image[first]], feature[first]  # sorted by image
+    bounds = np.searchsorted(image, np.arange(1, len(index)))
+    pixels = [
+        images.pinhole_px[k][mine]
+        for k, mine in zip(index.tolist(), np.split(feature, bounds), strict=True)
+    ]
+    return Model(
+        names=[images.names[k] for k in index.tolist()],
+        image_id=index + 1,
+        wTc=wTc,
+        point_id=np.arange(1, len(used) + 1),
+        position=united[used],
+        image=image,
+        feature=feature,
+        point=track,
+        pixel_px=np.concatenate(pixels),
+        pinhole=pinhole,
+    )
+
+
+def _poses(
+    parts: Sequence[Solved], cores: Sequence[I64], at: Sequence[Alignment]
+) -> tuple[I64, F64]:
+    """The images (K,) that have a pose, by index, sorted, and their wTc (K, 4, 4)."""
+    best: dict[int, tuple[bool, int]] = {}
+    wTc: dict[int, F64] = {}
+    for part, core, by in zip(parts, cores, at, strict=True):
+        sights = np.bincount(part.image, minlength=len(part.index)).tolist()
+        own = np.isin(part.index, core).tolist()
+        moved = by.apply_poses(part.wTc)
+        for n, k in enumerate(part.index.tolist()):
+            rank = own[n], sights[n]
+            if k not in best or rank > best[k]:
+                best[k], wTc[k] = rank, moved[n]
+    index = np.array(sorted(wTc), dtype=np.int64)
+    return index, np.array([wTc[k] for k in index.tolist()])
+
+
+def _inside(parts: Sequence[Solved], images: int) -> list[set[int]]:
+    """Which parts each image is in."""
+    inside: list[set[int]] = [set() for _ in range(images)]
+    for number, part in enumerate(parts):
+        for k in part.index.tolist():
+            inside[k].add(number)
+    return inside
+
+
+def _in_place(
+    holder: tuple[I64, I64],
+    view: TwoView,
+    position: F64,
+    wTc: F64,
+    pixels: tuple[F64, F64],
+    pinhole: F64,
+) -> I64:
+    """Landmarks (P, 2) that a pair says are one, where each is in the other one's place.
+
+    `holder` gives the landmark of each key point of the two images, -1 for none; `wTc` (2, 4, 4).
+    """
+    ends = np.stack([of[view.matches[:, k]] for k, of in enumerate(holder)], axis=1)
+    known = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
+    ends, good = ends[known], np.ones(np.count_nonzero(known), dtype=bool)
+    for one, other in ((0, 1), (1, 0)):
+        local = poses.transform(poses.inverse(wTc[other]), position[ends[:, one]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = local[:, :2] / local[:, 2:] * pinhole[:2] + pinhole[2:]
+        off = np.linalg.norm(seen - pixels[other][view.matches[known, other]], axis=1)
+        good &= (local[:, 2] > 0) & (off <= _IN_PLACE_PX)
+    if good.sum() < _HOLDS * len(good):
+        return np.empty((0, 2), np.int64)
+    return ends[good]

@@ -1,0 +1,215 @@
+"""A lens is found where the views decide it, and refused or kept where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ground_station.errors import MapError
+from ground_station.features.extractor import Features
+from ground_station.geometry import poses
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.mapping.construction import lens
+from ground_station.mapping.construction.images import Images
+from ground_station.mapping.construction.lens_adjustment import PARAMETERS, adjust, vector
+from ground_station.mapping.construction.lens_prior import LensPrior
+from ground_station.mapping.sfm import colmap
+
+NOISE_PX = 0.3
+NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Camera axes in the world's, looking along +y."""
+
+
+def _flight(turns: bool, seed: int, images: int = 24, points: int = 500):
+    """True poses and points: through a corridor, turning and swaying, or straight on."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform([-2.0, 2.0, -1.3], [2.0, 16.0, 1.3], (points, 3))
+    side = rng.integers(0, 2, points)
+    xyz[np.arange(points), 2 * side] = np.sign(rng.normal(size=points)) * np.where(side, 1.3, 2.0)
+    y = np.linspace(0, 6, images)
+    centres = np.stack([0 * y, y, 0 * y], axis=1)
+    rotation = np.tile(NORTH, (images, 1, 1))
+    if turns:
+        centres[:, 0], centres[:, 2] = np.sin(1.3 * y), 0.5 * np.cos(2.1 * y)
+        turn = np.stack([0.2 * np.sin(2 * y), 0.5 * np.sin(1.7 * y), 0.3 * np.cos(y)], axis=1)
+        rotation = rotation @ Rotation.from_rotvec(turn).as_matrix()
+    return poses.pose(rotation, centres), xyz
+
+
+def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, colmap.Model]:
+    """What the camera sees as a build has it: noisy key points, and the model they belong to."""
+    rng = np.random.default_rng(seed)
+    image, feature, point, features = [], [], [], []
+    for k, T in enumerate(wTc):
+        local = poses.transform(poses.inverse(T), xyz)
+        pixel = camera.project(local)
+        with np.errstate(invalid="ignore"):
+            radius = np.linalg.norm(local[:, :2], axis=1) / local[:, 2]
+            inside = (local[:, 2] > 0.5) & (radius < 0.8) & (pixel > 0).all(axis=1)
+            inside &= (pixel < [camera.width_px - 1, camera.height_px - 1]).all(axis=1)
+        seen = np.flatnonzero(inside)
+        noisy = pixel[seen] + NOISE_PX * rng.normal(size=(len(seen), 2))
+        count = len(seen)
+        features.append(
+            Features(noisy.astype("f4"), np.ones(count, "f4"), np.zeros((count, 4), "f4"))
+        )
+        image.append(np.full(count, k))
+        feature.append(np.arange(count))
+        point.append(seen)
+    often = np.bincount(np.concatenate(point), minlength=len(xyz)) > 2
+    new, keep = np.cumsum(often) - 1, often[np.concatenate(point)]
+    model = colmap.Model(
+        names=[f"frame-{k:06d}" for k in range(len(wTc))],
+        image_id=np.arange(len(wTc)) + 1,
+        wTc=wTc,
+        point_id=np.flatnonzero(often) + 1,
+        position=xyz[often],
+        image=np.concatenate(image)[keep],
+        feature=np.concatenate(feature)[keep],
+        point=new[np.concatenate(point)[keep]],
+        pixel_px=np.zeros((int(keep.sum()), 2)),
+        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+    )
+    names = model.names
+    time_ns = np.arange(len(names)) * 100_000_000
+    return Images(names, time_ns, features, [f.keypoints_px.astype(float) for f in features]), model
+
+
+def _adjusted_with(camera: Camera, images: Images, model: colmap.Model) -> colmap.Model:
+    """The model as a build makes it with that camera held: poses and points bent by its errors."""
+    undistorted = lens.with_lens(images, camera)
+    pixels = np.empty((len(model.image), 2))
+    for k in range(len(model.names)):
+        rows = model.image == k
+        pixels[rows] = undistorted.pinhole_px[k][model.feature[rows]]
+    model = replace(model, pixel_px=pixels)
+    reconstruction = colmap.from_arrays(model, camera)
+    colmap.adjust(reconstruction, loss_px=1.0, threads=1)
+    wTc, position = colmap.positions(reconstruction, model)
+    return replace(model, wTc=wTc, position=position)
+
+
+def _off(camera: Camera, share: float, distorted: bool = True) -> Camera:
+    wrong = replace(camera, fx_px=share * camera.fx_px, fy_px=share * camera.fy_px)
+    return wrong if distorted else replace(wrong, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
+
+
+def _judged(known: LensPrior, turns: bool = True, seed: int = 1, true: Camera = THESIS_CAMERA):
+    """A build's rounds over one flight, its images placed with each lens in turn."""
+    images, model = _views(true, *_flight(turns, seed), seed)
+    calibration = lens.SelfCalibration(known, images, 0.8)
+    while calibration.go_on(_adjusted_with(calibration.camera, images, model), images):
+        pass
+    return calibration
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lens_is_found_within_what_is_said_of_it(seed):
+    wrong = _off(THESIS_CAMERA, 1.04, distorted=False)
+    images, model = _views(THESIS_CAMERA, *_flight(True, seed), seed)
+    model = _adjusted_with(wrong, images, model)
+    known = LensPrior(wrong, "guess", 0.2)
+    found = adjust(lens._as_seen(model, images), wrong, lens.prior_of(known, wrong))
+    assert found is not None
+    off = np.abs(vector(found.camera) - vector(THESIS_CAMERA)) / found.sigmas
+    assert off.max() < 4, dict(zip(PARAMETERS, off.round(1), strict=True))
+    assert found.sigma_focal < 0.005 and found.explained > 0.5
+    assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
+
+
+def test_the_covariance_holds_over_many_flights():
+    """Of 12 flights the mean square of the focal length's error in sigmas is that of a sigma."""
+    off = []
+    for seed in range(12):
+        images, model = _views(THESIS_CAMERA, *_flight(True, seed, images=16, points=250), seed)
+        known = LensPrior(THESIS_CAMERA, "guess", 0.2)
+        found = adjust(
+            lens._as_seen(model, images), THESIS_CAMERA, lens.prior_of(known, THESIS_CAMERA)
+        )
+        assert found is not None
+        off.append((found.camera.fx_px - THESIS_CAMERA.fx_px) / found.sigmas[0])
+    rms = np.sqrt(np.mean(np.square(off)))
+    assert 0.2 < rms < 1.3
+
+
+def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
+    for share, distorted in ((1.03, True), (0.98, True), (1.05, False)):
+        known = LensPrior(_off(THESIS_CAMERA, share, distorted), "file", 0.02)
+        calibration = _judged(known)
+        assert calibration.camera.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.005)
+        built = calibration.as_built()
+        assert built["state"] == "found"
+        assert built["given"]["fx_px"] == pytest.approx(known.camera.fx_px)
+        (note,) = calibration.notes()
+        assert "the given camera misfits" in note and "blimp calibrate" in note
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_right_camera_file_is_left_as_it_is(turns):
+    for seed in range(3):
+        calibration = _judged(LensPrior(THESIS_CAMERA, "file", 0.02), turns, seed)
+        assert calibration.camera == THESIS_CAMERA and calibration.rounds == 1
+        assert calibration.notes() == [] and calibration.as_built()["state"] == "given"
+
+
+def test_straight_flight_down_a_corridor_leaves_a_guessed_lens_open(monkeypatch):
+    guess = replace(Camera(), fx_px=560.0, fy_px=560.0, cx_px=319.5, cy_px=239.5)
+    monkeypatch.setattr(lens, "rough_lens", lambda images, known, ratio: known.camera)
+    with pytest.raises(MapError, match=r"straight on.*'blimp calibrate'.*--camera") as caught:
+        _judged(LensPrior(guess, "guess", 0.2), turns=False)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_same_guess_is_made_good_where_the_camera_turns(monkeypatch):
+    guess = replace(Camera(), fx_px=560.0, fy_px=560.0, cx_px=319.5, cy_px=239.5)
+    monkeypatch.setattr(lens, "rough_lens", lambda images, known, ratio: known.camera)
+    calibration = _judged(LensPrior(guess, "guess", 0.2))
+    assert calibration.camera.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.005)
+    assert calibration.rounds > 1 and "lens found by the images" in calibration.notes()[0]
+
+
+def test_a_lens_of_another_model_is_refused_by_name_where_nobody_calibrated_it():
+    images, model = _views(THESIS_CAMERA, *_flight(True, 1), 1)
+    other = replace(THESIS_CAMERA)
+    object.__setattr__(other, "model", "fisheye")
+    with pytest.raises(MapError, match=r"opencv5 only, not fisheye: calibrate it with 'blimp"):
+        lens.SelfCalibration(LensPrior(other, "guess", 0.2), images, 0.8)
+    calibration = lens.SelfCalibration(LensPrior(other, "file", 0.02), images, 0.8)
+    assert not calibration.go_on(model, images) and calibration.camera == other
+
+
+def _described(images: Images, model: colmap.Model) -> Images:
+    """The images with descriptors by which their key points are matched."""
+    descriptor = np.random.default_rng(0).normal(size=(len(model.position), 32))
+    descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
+    features = []
+    for k, old in enumerate(images.features):
+        rows = model.image == k
+        pixels = old.keypoints_px[model.feature[rows]]
+        ones = np.ones(len(pixels), "f4")
+        features.append(Features(pixels, ones, descriptor[model.point[rows]].astype("f4")))
+    return replace(images, features=features)
+
+
+def test_a_rough_lens_is_found_from_a_guess_a_third_off():
+    images, model = _views(THESIS_CAMERA, *_flight(True, 2), 2)
+    guess = replace(Camera(), fx_px=670.0, fy_px=670.0, cx_px=319.5, cy_px=239.5)
+    found = lens.rough_lens(_described(images, model), LensPrior(guess, "guess", 0.3), 0.8)
+    assert found.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.15)
+
+
+def test_images_that_share_nothing_leave_the_lens_as_it_is_known():
+    images, _ = _views(THESIS_CAMERA, *_flight(True, 2), 2)
+    known = LensPrior(THESIS_CAMERA, "guess", 0.3)
+    assert lens.rough_lens(images, known, 0.8) == THESIS_CAMERA
+
+
+def test_a_model_too_small_says_nothing_of_the_lens():
+    wTc, xyz = _flight(True, 1, points=4)
+    images, model = _views(THESIS_CAMERA, wTc, xyz, 1)
+    known = LensPrior(THESIS_CAMERA, "file", 0.02)
+    calibration = lens.SelfCalibration(known, images, 0.8)
+    assert not calibration.go_on(model, images) and calibration.notes() == []
