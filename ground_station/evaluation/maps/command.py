@@ -1,4 +1,4 @@
-"""`blimp bench map`: what the size of a map costs in accuracy, in shares of the whole map's."""
+"""`blimp bench map`: what a map's size costs, which builds are true, and what many images cost."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 EPILOG = """\
 examples:
   blimp bench map maps/atrium --json out/bench-map.json
+  blimp bench map --study hallway stills --features rootsift orb --real DATA --json out/study.json
   blimp bench map maps/atrium --flight F.mcap G.mcap --shares 0.5 --descriptor-bytes 32 --seeds 3
+  blimp bench map --campus 1000 3000 10000 --processes 0 3 --plot out/campus.png
 
 Every share of the landmarks is measured with every length of a descriptor, by the localizer's
 preset 'default' from the first true pose. Shares are of one run on one machine; times of two
 machines do not compare."""
+
+_ALLOWED_GB = 6.0
+"""What a build of ten thousand images may take."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,12 +46,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="frames of each flight that are looked for in the whole map (40)")  # fmt: skip
     add("--seeds", type=int, default=1, metavar="N", help="runs of each line, means are shown (1)")
     add("--seed", type=int, default=0, metavar="N", help="of the first run (0)")
+    study = parser.add_argument_group("instead: builds against COLMAP's own on the same images")
+    study.add_argument("--study", nargs="+", metavar="SET",
+        help="atrium, office, corridor, stills, headset (simulated); hallway, kitchen")  # fmt: skip
+    study.add_argument("--features", nargs="+", default=["rootsift"], metavar="NAME",
+        help="extractors or models that the builds use (rootsift)")  # fmt: skip
+    study.add_argument("--real", type=Path, metavar="DIR", help="folder of the real sets' folders")
+    study.add_argument("--images", type=int, metavar="N", help="at most so many of each set")
+    study.add_argument("--work", type=Path, default=Path("out/study"), metavar="DIR",
+        help="where recordings and maps are kept (out/study)")  # fmt: skip
+    add("--campus", type=int, nargs="+", metavar="N",
+        help="instead, build simulated campuses of N images: time and memory")  # fmt: skip
+    add("--processes", type=int, nargs="+", default=[0], metavar="N",
+        help="of --campus: Dask processes on this machine; 0: threads (0)")  # fmt: skip
     add("--json", type=Path, metavar="F", help="write the figures, too")
-    add("--plot", type=Path, metavar="F.png", help="draw errors over sizes")
+    add("--plot", type=Path, metavar="F.png", help="draw errors, or time and memory, over sizes")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `BlimpError` for what a person can mend."""
+    _check(args)
+    if args.study:
+        return _study(args)
+    return _campus(args) if args.campus else _compressed(args)
+
+
+def _campus(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from ground_station.evaluation.maps import scale
+    from ground_station.files import write_json
+    from ground_station.localization.bench import machine
+    from ground_station.mapping.settings import load_settings
+
+    rows: list[dict[str, Any]] = []
+    for row in scale.measured(
+        args.campus, args.processes, replace(load_settings(), seed=args.seed)
+    ):
+        rows.append(row)
+        if args.json:  # the next may take an hour
+            write_json(args.json, {"machine": machine(), "seed": args.seed, "campus": rows})
+    print("\n".join(scale.table(rows)))
+    if args.plot:
+        from ground_station.evaluation.maps.plot import scaling_plot
+        from ground_station.presentation.dress import write_png
+
+        write_png(scaling_plot(rows, _ALLOWED_GB), args.plot)
+    return 0
+
+
+def _compressed(args: argparse.Namespace) -> int:
     import tempfile
 
     from ground_station.errors import InputError
@@ -59,7 +108,6 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.recording.frames import ALL_FRAMES
     from ground_station.recording.open import parse_range
 
-    _check(args)
     paths = args.flight or [args.map / "flight.mcap"]
     if args.truth is not None and len(paths) > 1:
         raise InputError(f"--truth {args.truth}: is of one flight; {len(paths)} are given")
@@ -97,6 +145,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _study(args: argparse.Namespace) -> int:
+    """Builds every set with every feature and seed; 1 where a map is folded and did not say so."""
+    from ground_station.errors import InputError
+    from ground_station.evaluation.maps import study
+    from ground_station.files import write_json
+    from ground_station.localization.bench import machine
+    from ground_station.mapping.settings import load_settings
+
+    there = [*study.SIMULATED, *study.REAL]
+    for name in args.study:
+        if name not in there:
+            raise InputError(f"--study has '{name}'; allowed: {', '.join(there)}")
+    if args.images is not None and not 2 <= args.images <= 10_000:
+        raise InputError(f"--images is {args.images}; allowed: 2 to 10000")
+    seeds = range(args.seed, args.seed + args.seeds)
+    rows = study.run(
+        args.study, args.features, seeds, load_settings(), args.real, args.work, args.images
+    )
+    if rows:
+        print("\n".join(study.table(rows)))
+    if args.json:
+        write_json(args.json, {"machine": machine(), "seeds": list(seeds), "rows": rows})
+    return int(any(row["ours"].get("silent_fold", False) for row in rows))
+
+
 def _check(args: argparse.Namespace) -> None:
     from ground_station.errors import InputError
     from ground_station.mapping.compression.choice import METHODS
@@ -105,6 +178,8 @@ def _check(args: argparse.Namespace) -> None:
         ("--sought", args.sought, 0, 10_000),
         ("--seeds", args.seeds, 1, 100),
         ("--seed", args.seed, 0, 2**31 - 101),
+        *(("--campus", each, 50, 100_000) for each in args.campus or ()),
+        *(("--processes", each, 0, 256) for each in args.processes),
         *(("--descriptor-bytes", each, 0, 4096) for each in args.descriptor_bytes or ()),
     ):
         if not low <= value <= high:
