@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.features.extractor import Extractor
+from ground_station.geometry import poses
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Observations, no_observations
 from ground_station.localization.estimator import Estimator
@@ -29,6 +30,10 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 
+_ALLOWED = 22.5
+"""Squared Mahalanobis distance from a prediction: 99.9 % of six degrees of freedom."""
+_CLOSER = 3
+"""Solutions at most that are matched around once more."""
 _FOUND_RADIUS_PX = 15.0
 """Around a pose that was found in the whole map: it explains its inliers to a few pixels, and what
 is left is the shear of a shutter whose motion nobody knows yet."""
@@ -38,8 +43,9 @@ is left is the shear of a shutter whose motion nobody knows yet."""
 class Located:
     """A frame solved from features of its own, or why not.
 
-    Observations are in the order of the matches. `relocalized`: found in the whole map, without a
-    prediction.
+    Observations are in the order of the matches. `relocalized`: found in the whole map, away from
+    any prediction. `significance`: by how many standard deviations more landmarks are seen than by
+    chance; 0 where that was not asked.
     """
 
     solution: Solution
@@ -47,6 +53,7 @@ class Located:
     observations: Observations
     features: int
     relocalized: bool = False
+    significance: float = 0.0
 
     def teach(self, thresholds: DescriptorThresholds | None) -> None:
         """What a solved frame says about its landmarks' descriptors."""
@@ -108,32 +115,64 @@ class Acquirer:
         watch: Stopwatch,
         radius_px: float | None = None,
     ) -> Located:
-        """Matches around a prediction and solves; once more, closer, if the settings say.
+        """Matches around a prediction and solves; closer again, if the settings say, till it stays.
 
         Without a radius it follows the prediction's covariance.
         """
         found = self._locate_once(seen, expected, expected, estimator, radius_px, watch)
         closer_px = self._settings.association.refine_radius_px
-        if found.solution.state is not None and closer_px > 0:
+        for _ in range(_CLOSER):
             state = found.solution.state
+            if state is None or closer_px == 0:
+                break
             found = self._locate_once(seen, state, expected, estimator, closer_px, watch)
+            after = found.solution.state
+            if (
+                after is None
+                or self.matcher.reach_px(poses.log(poses.inverse(state.wTc) @ after.wTc))
+                < closer_px
+            ):
+                break
         return found
 
-    def relocalize(
-        self, seen: Described, time_ns: int, make: Callable[[], Estimator], watch: Stopwatch
+    def find(
+        self,
+        seen: Described,
+        time_ns: int,
+        expected: Kinematics | None,
+        estimator: Estimator,
+        make: Callable[[], Estimator],
+        watch: Stopwatch,
     ) -> Located:
-        """The frame anywhere in the map, solved with an estimator that knows of nothing else."""
-        assert self._relocalizer is not None, "the settings say whether it may be asked"
+        """The frame near its prediction, or else anywhere in the map.
+
+        Where a pose that was found anywhere is one that the prediction allows, it is solved with
+        that prediction; else with an estimator of `make`, which knows of nothing else.
+        """
+        if self._relocalizer is None:
+            if expected is None:
+                return _nothing(seen, "no first pose")
+            return self.locate(seen, expected, estimator, watch)
+        if expected is not None and self.matcher.within_reach(expected):
+            near = self._verified(seen, self.locate(seen, expected, estimator, watch), watch)
+            if near.solution.state is not None:
+                return near
         found = self._relocalizer.find(seen.features, seen.normalized)
         watch.lap("relocalization")
         if isinstance(found, str):
             return _nothing(seen, found)
+        sure = found.significance
+        if expected is not None and _allowed(expected, found.wTc):
+            around = replace(expected, wTc=found.wTc)
+            located = self._locate_once(seen, around, expected, estimator, _FOUND_RADIUS_PX, watch)
+            if located.solution.state is not None:
+                return replace(located, significance=sure)
         estimator = make()
         estimator.restart(time_ns, found.wTc)
-        expected = estimator.predict(time_ns)
-        assert expected is not None
-        located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX)
-        return replace(located, relocalized=True)
+        alone = estimator.predict(time_ns)
+        assert alone is not None
+        located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
+        return replace(located, relocalized=True, significance=sure)
 
     def keyframe(self, time_ns: int, image: Image, wTc: Array, found: Located) -> Keyframe:
         """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.
@@ -189,11 +228,7 @@ class Acquirer:
         def job() -> Acquired:
             watch = Stopwatch()
             seen = self.describe(image, taken)
-            found = _nothing(seen, "no prediction")
-            if expected is not None:
-                found = self._verified(seen, self.locate(seen, expected, make(), watch), watch)
-            if found.solution.state is None and self._relocalizer is not None:
-                found = self.relocalize(seen, time_ns, make, watch)
+            found = self.find(seen, time_ns, expected, make(), make, watch)
             return self._acquired(time_ns, image, found, watch, searched=True)
 
         return job
@@ -206,7 +241,7 @@ class Acquirer:
         sure = self.matcher.significance(seen, state.wTc)
         watch.lap("verification")
         if sure >= least:
-            return found
+            return replace(found, significance=sure)
         reason = f"only {sure:.1f} sigma more landmarks than by chance"
         return _nothing(seen, reason)
 
@@ -258,6 +293,18 @@ def believed(solution: Solution, settings: LocalizerSettings, least: int | None 
     if solution.state is None or inliers >= max(least, pose.min_inlier_share * total):
         return solution
     return no_solution(total, f"{inliers} inliers of {total} observations", solution.iterations)
+
+
+def _allowed(expected: Kinematics, wTc: Array) -> bool:
+    """Whether a prediction's own covariance lets the camera be at a pose (4, 4)."""
+    step = poses.log(poses.inverse(expected.wTc) @ wTc)
+    covariance = expected.covariance[:6, :6]
+    if not np.isfinite(covariance).all():
+        return False
+    try:
+        return bool(step @ np.linalg.solve(covariance, step) < _ALLOWED)
+    except np.linalg.LinAlgError:
+        return False
 
 
 def _nothing(seen: Described, reason: str) -> Located:

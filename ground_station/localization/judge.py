@@ -56,10 +56,14 @@ class Judge:
         """Whether the pose rests on a relocalization that no other features confirmed."""
         return self._doubtful_ns is not None
 
-    def found_again(self, time_ns: int) -> None:
-        """A frame was searched and found: others with features of their own must agree."""
-        self._owe(self.settings.confirm_frames, "found again, to be confirmed")
-        self._doubtful_ns = time_ns
+    def found_again(self, time_ns: int, significance: float) -> None:
+        """A frame was searched and found: others with features of their own must agree.
+
+        Not so where its own features leave nothing to confirm.
+        """
+        sure = significance >= self.settings.sure_significance
+        self._owe(0 if sure else self.settings.confirm_frames, "found again, to be confirmed")
+        self._doubtful_ns = None if sure else time_ns
 
     def _owe(self, frames: int, why: str) -> None:
         """Before TRACKING so many good frames in a row are needed, `why` is said until then."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
+from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization import following, gate
 from ground_station.localization.acquisition import Acquired, Acquirer, Located
@@ -27,7 +28,7 @@ from ground_station.localization.publishing import (
     evidence_of,
     publish,
 )
-from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.settings import LocalizerSettings, in_units
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
 from ground_station.mapping.registration.accuracy import accuracy
@@ -36,6 +37,12 @@ from pi_firmware.wire.entropy import entropy_bits
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
+
+
+_USUAL_DEPTH_M = 5.0
+"""How far off the landmarks of a map without units are taken to be: it says how fast is fast."""
+_FASTEST = 3.0
+"""Standard deviations of the velocity that a camera may have."""
 
 
 class LocalizationError(GroundStationError):
@@ -51,10 +58,12 @@ class Localizer:
         """Raises `MapError` when the map has other features, or says no numbers of its accuracy."""
         check_features(map_.info, extractor.name, extractor.sha256)
         self._accuracy = accuracy(map_.info)
+        if not map_.info.registered and np.isfinite(map_.depth_m):
+            settings = in_units(settings, map_.depth_m / _USUAL_DEPTH_M)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
-        self._worker: Worker[Acquired] = Worker(settings.tracking.features_lag_frames)
+        self._worker: Worker[Acquired] = Worker(settings.tracking.features_lag_s)
         self.reset()
 
     def reset(self) -> None:
@@ -72,7 +81,7 @@ class Localizer:
         self._last_frame_ns: int | None = None
         self._last_worked_ns: int | None = None
         self._last_search_ns: int | None = None
-        self._idle_since_s = 0.0
+        self._idle_since_s = self._describing_s = 0.0
 
     @property
     def state(self) -> State:
@@ -182,23 +191,27 @@ class Localizer:
     def _unhurried(self, time_ns: int) -> bool:
         """Whether there is time for a frame's own features.
 
-        Skipped frames take none. Where nothing may wait it is idle time before the frame came:
-        frames that are far apart because others were dropped are no leisure.
+        Skipped frames take none. Where nothing may wait there also was as much idle time before the
+        frame as describing one took: frames that are far apart because others were dropped are no
+        leisure.
         """
         last, tracking = self._last_worked_ns, self.settings.tracking
         if not tracking.enabled or last is None:
             return True
-        if tracking.features_lag_frames == 0:
-            return perf_counter() - self._idle_since_s >= tracking.describe_gap_s
-        return time_ns - last >= tracking.describe_gap_s * 1e9
+        if time_ns - last < tracking.describe_gap_s * 1e9:
+            return False
+        waiting = tracking.features_lag_s > 0
+        return waiting or perf_counter() - self._idle_since_s >= self._describing_s
 
     # Frames that are described themselves
 
     def _describe(self, attempt: Attempt, image: Image) -> PoseEstimate:
         self._worker.drop()
+        began_s = perf_counter()
         seen = self._acquirer.describe(image, attempt.taken)
         attempt.watch.lap("features")
         estimate = self._locate(attempt, seen)
+        self._describing_s = perf_counter() - began_s
         if self.settings.tracking.enabled and estimate.wTc is not None and self._located:
             self._keyframe = self._acquirer.keyframe(
                 attempt.time_ns, image, estimate.wTc, self._located
@@ -207,25 +220,17 @@ class Localizer:
 
     def _locate(self, attempt: Attempt, seen: Described) -> PoseEstimate:
         attempt.predicted = self._estimator.predict(attempt.time_ns)
-        reason = "no first pose"
-        if attempt.predicted is not None:
-            found = self._acquirer.locate(seen, attempt.predicted, self._estimator, attempt.watch)
-            self._note(attempt, found)
-            if found.solution.state is not None:
-                return self._solved(attempt, found.solution)
-            reason = found.solution.reason
-        else:
-            attempt.counts = Counts(features=len(seen))
-        relocalize = self.settings.recovery.relocalize and self._gone(attempt.time_ns)
-        if relocalize and self._may_search(attempt.time_ns):
-            self._last_search_ns = attempt.time_ns
-            found = self._acquirer.relocalize(seen, attempt.time_ns, self._fresh, attempt.watch)
-            self._note(attempt, found)
-            if (state := found.solution.state) is not None:
-                self._begin_again(state)
-                return self._solved(attempt, found.solution, relocalized=True)
-            reason = found.solution.reason
-        return self._unsolved(attempt, reason)
+        found = self._acquirer.find(
+            seen, attempt.time_ns, attempt.predicted, self._estimator, self._fresh, attempt.watch
+        )
+        self._note(attempt, found)
+        state = found.solution.state
+        if state is None:
+            return self._unsolved(attempt, found.solution.reason)
+        if found.relocalized:
+            sure = found.significance if self._within_speed(state, attempt) else 0.0
+            self._begin_again(state, sure)
+        return self._solved(attempt, found.solution, relocalized=found.relocalized)
 
     def _note(self, attempt: Attempt, found: Located) -> None:
         inliers = int(found.solution.inlier.sum())
@@ -279,12 +284,13 @@ class Localizer:
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
             hurried = self._judge.doubtful or followed.moved_px > settings.hurry_px_s * age_s
-            lag = settings.hurried_lag_frames if hurried else None
+            lag_s = settings.hurried_lag_s if hurried else None
             self._worker.submit(
                 self._acquirer.promote(
                     attempt.time_ns, image, state, self._estimator, attempt.taken
                 ),
-                lag,
+                attempt.time_ns,
+                lag_s,
             )
 
     def _search(self, attempt: Attempt, image: Image) -> None:
@@ -295,12 +301,13 @@ class Localizer:
         expected = None if self._gone(attempt.time_ns) else attempt.predicted
         self._worker.submit(
             self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
-            self.settings.tracking.search_lag_frames,
+            attempt.time_ns,
+            self.settings.tracking.search_lag_s,
         )
 
     def _land(self, attempt: Attempt) -> bool:
         """Takes what the job beside the frames brings; whether it was found in the whole map."""
-        landed = self._worker.collect()
+        landed = self._worker.collect(attempt.time_ns)
         if landed is None:
             return False
         attempt.watch.lap("wait")
@@ -320,19 +327,37 @@ class Localizer:
         attempt.watch.lap("catch_up")
         if not caught_up:
             return False
+        assert landed.state is not None
+        sure = landed.found.significance if self._within_speed(landed.state, attempt) else 0.0
         self._replace(estimator)
         self._keyframe = landed.keyframe
-        self._judge.found_again(landed.time_ns)
+        self._judge.found_again(landed.time_ns, sure)
         return landed.relocalized
 
     # What becomes of a frame
 
-    def _begin_again(self, state: Kinematics) -> None:
+    def _within_speed(self, found: Kinematics, attempt: Attempt) -> bool:
+        """Whether the camera can have come where it was found since a frame was solved.
+
+        If not, one of the two poses is of a place that looks the same.
+        """
+        last_ns, expected = self._judge.last_solved_ns, self._estimator.predict(attempt.time_ns)
+        if last_ns is None or expected is None:
+            return True
+        elapsed_s, start = (attempt.time_ns - last_ns) / 1e9, self.settings.start
+        step = poses.log(poses.inverse(expected.wTc) @ found.wTc)
+        turn, way = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+        most_s = _FASTEST * elapsed_s
+        return bool(
+            way <= most_s * start.speed_m_s and np.rad2deg(turn) <= most_s * start.turn_deg_s
+        )
+
+    def _begin_again(self, state: Kinematics, significance: float) -> None:
         estimator = self._fresh()
         estimator.restart(state.time_ns, state.wTc, state.covariance[:6, :6])
         self._replace(estimator)
         self._keyframe = None
-        self._judge.found_again(state.time_ns)
+        self._judge.found_again(state.time_ns, significance)
 
     def _solved(
         self,

@@ -94,6 +94,7 @@ class Matcher:
         self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
         self._lens = Lens(camera)
+        self._depth_m = map_.depth_m
         self._index = LandmarkIndex(landmarks)
         self._covisibility = (
             Covisibility(len(landmarks), keyframes)
@@ -161,6 +162,16 @@ class Matcher:
             len(projected.landmark),
             len(pairs),
         )
+
+    def reach_px(self, step: Array) -> float:
+        """How far a tangent step (6,) of the pose moves the picture of what lies at usual depth."""
+        angle = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:]) / self._depth_m
+        return float(self.camera.fx_px * angle)
+
+    def within_reach(self, expected: Kinematics) -> bool:
+        """Whether landmarks are as near to where they are expected as they are looked for."""
+        sigma = np.sqrt(np.diag(expected.covariance)[:6])
+        return not self.reach_px(_REACH * sigma) > self.radius_px
 
     def significance(self, seen: Described, wTc: Array) -> float:
         """By how many standard deviations a pose (4, 4) explains more landmarks than chance does.

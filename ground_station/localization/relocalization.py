@@ -32,11 +32,16 @@ _BLOCK = 8_000_000
 
 @dataclass(frozen=True)
 class Relocalization:
-    """A pose (4, 4) and its inliers: `feature` (N,) and `landmark` (N,) indices."""
+    """A pose (4, 4) and its inliers: `feature` (N,) and `landmark` (N,) indices.
+
+    `significance`: by how many standard deviations more landmarks are where they should be than
+    chance puts there.
+    """
 
     wTc: Array
     feature: Indices
     landmark: Indices
+    significance: float = 0.0
 
 
 def match_all(
@@ -125,14 +130,15 @@ def pose_from_matches(
 
 _RETRIEVED, _PLACES, _MIN_SHARED = 24, 3, 0.15
 """Keyframes retrieved, places tried, the share of landmarks that makes keyframes one place."""
-_NEIGHBOUR_M, _NEIGHBOUR_COS, _NEIGHBOURS = 4.0, 0.5, 12
-"""Keyframes near a found pose that look the same way (60 degrees): what they saw should be seen."""
+_NEIGHBOURS = 12
+"""Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
 """Inliers of RANSAC that are worth the check that follows."""
-_MAX_SIGMA_M = 0.04
-"""Of the position, from the inliers alone: beyond, a rolling shutter's shear moves it by a foot."""
-_SAME_M = 0.5
-"""Two poses nearer than this are one."""
+_MAX_SIGMA = 0.005
+"""Of the position, from the inliers alone, over their depth: beyond, a rolling shutter's shear
+moves it far. Right finds of an atrium, a kitchen and a corridor had 0.003 at most."""
+_SAME = 0.05
+"""Two poses nearer than this share of the map's depth are one."""
 _RIVAL = 0.5
 """A pose elsewhere with this share of the best one's inliers leaves the place undecided."""
 
@@ -158,8 +164,8 @@ class _Search:
         self.pinhole_px = normalized * focal + centre
         self.witness = Witness(features, lens, modes)
 
-    def propose(self, candidates: Indices) -> Array | str:
-        """wTc from matches with some landmarks (M,), or why there is none."""
+    def propose(self, candidates: Indices) -> tuple[Array, Indices] | str:
+        """wTc and its inliers from matches with some landmarks (M,), or why there is none."""
         settings, lm = self.settings, self.landmarks
         rows, mode = described(lm.descriptor, self.modes, candidates)
         feature, row = match_all(self.features.descriptors, rows, settings.max_ratio, mode)
@@ -177,7 +183,7 @@ class _Search:
         wTc, inliers = found
         if len(inliers) < max(_MIN_MATCHED, settings.min_inlier_share * len(feature)):
             return f"{len(inliers)} inliers of {len(feature)} matches"
-        return wTc
+        return wTc, candidates[row[inliers]]
 
     def confirm(self, wTc: Array, expected: Indices) -> Relocalization | str:
         """The pose refined over all landmarks that should be seen, or why it is refused."""
@@ -200,12 +206,12 @@ class _Search:
         if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)
-        if (sigma_m := self._sigma_m(wTc, landmark)) > _MAX_SIGMA_M:
-            return f"the inliers leave the position open by {sigma_m:.2f} m"
-        return Relocalization(wTc, feature, landmark)
+        if (open_by := self._sigma(wTc, landmark)) > _MAX_SIGMA:
+            return f"the inliers leave the position open by {open_by:.1%} of their depth"
+        return Relocalization(wTc, feature, landmark, support.significance)
 
-    def _sigma_m(self, wTc: Array, landmark: Indices) -> float:
-        """Standard deviation of the position by the inliers' geometry, at half the threshold."""
+    def _sigma(self, wTc: Array, landmark: Indices) -> float:
+        """Standard deviation of the position over the inliers' depth, at half the threshold."""
         X, Y, Z = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark]).T
         x, y, none = X / Z, Y / Z, np.zeros_like(Z)
         u = np.stack([x * y, -1 - x * x, y, -1 / Z, none, x / Z], axis=1) * self.camera.fx_px
@@ -215,7 +221,7 @@ class _Search:
             covariance = np.linalg.inv((u.T @ u + v.T @ v) / sigma_px**2)
         except np.linalg.LinAlgError:
             return float("inf")
-        return float(np.sqrt(np.trace(covariance[3:, 3:])))
+        return float(np.sqrt(np.trace(covariance[3:, 3:])) / np.median(Z))
 
     def _residual_px(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
         points = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark])
@@ -238,7 +244,8 @@ class Relocalizer:
     """Finds frames in one map, whose keyframes are indexed once."""
 
     def __init__(self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int) -> None:
-        self._landmarks, self._keyframes, self._modes = map_.landmarks, map_.keyframes, map_.modes
+        self._landmarks, self._modes = map_.landmarks, map_.modes
+        self._same_m = _SAME * map_.depth_m
         self._lens, self._settings, self._seed = Lens(camera), settings, seed
         self._index: PlaceIndex | None = None
         if len(map_.keyframes):
@@ -275,35 +282,28 @@ class Relocalizer:
             alone = self._try(self._index, search, self._index.seen_by(place))
             if not isinstance(alone, str):
                 found.append(alone)
-        return _undisputed(found) if found else f"{together} in the most alike places"
+        return _undisputed(found, self._same_m) if found else f"{together} in the most alike places"
 
     def _try(self, index: PlaceIndex, search: _Search, candidates: Indices) -> Relocalization | str:
-        wTc = search.propose(candidates)
-        if isinstance(wTc, str):
-            return wTc
-        return search.confirm(wTc, index.seen_by(self._around(wTc)))
-
-    def _around(self, wTc: Array) -> Indices:
-        """The nearest keyframes to a pose that look the same way."""
-        all_wTc = self._keyframes.wTc
-        distance = np.linalg.norm(all_wTc[:, :3, 3] - wTc[:3, 3], axis=1)
-        distance[all_wTc[:, :3, 2] @ wTc[:3, 2] < _NEIGHBOUR_COS] = np.inf
-        nearest = np.argsort(distance, kind="stable")[:_NEIGHBOURS]
-        return np.asarray(nearest[distance[nearest] < _NEIGHBOUR_M], np.intp)
+        proposed = search.propose(candidates)
+        if isinstance(proposed, str):
+            return proposed
+        wTc, inliers = proposed
+        return search.confirm(wTc, index.seen_by(index.seeing(inliers, _NEIGHBOURS)))
 
 
-def _undisputed(found: list[Relocalization]) -> Relocalization | str:
+def _undisputed(found: list[Relocalization], same_m: float) -> Relocalization | str:
     """The best of several poses unless another, elsewhere, is nearly as good."""
     found.sort(key=lambda one: -len(one.feature))
     best = found[0]
     for other in found[1:]:
         apart_m = float(np.linalg.norm(other.wTc[:3, 3] - best.wTc[:3, 3]))
-        if apart_m > _SAME_M and len(other.feature) > _RIVAL * len(best.feature):
-            return f"two places {apart_m:.1f} m apart fit alike"
+        if apart_m > same_m and len(other.feature) > _RIVAL * len(best.feature):
+            return "two places fit alike"
     return best
 
 
 def _only_place(search: _Search) -> Relocalization | str:
     everything = np.arange(len(search.landmarks))
-    wTc = search.propose(everything)
-    return wTc if isinstance(wTc, str) else search.confirm(wTc, everything)
+    proposed = search.propose(everything)
+    return proposed if isinstance(proposed, str) else search.confirm(proposed[0], everything)

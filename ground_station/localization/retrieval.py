@@ -110,6 +110,14 @@ class PlaceIndex:
         seen = [landmark[offset[k] : offset[k + 1]] for k in np.atleast_1d(keyframes).tolist()]
         return np.unique(np.concatenate(seen)).astype(np.intp) if seen else np.empty(0, np.intp)
 
+    def seeing(self, landmarks: Indices, most: int) -> Indices:
+        """The keyframes that observed most of some landmarks (N,), best first; none without any."""
+        wanted = np.zeros(self._seen.shape[1], np.float32)
+        wanted[landmarks] = 1
+        count = self._seen @ wanted
+        best = np.argsort(-count, kind="stable")[:most]
+        return np.asarray(best[count[best] > 0], np.intp)
+
     def nearest(self, descriptors: F32) -> tuple[Indices, F32]:
         """Each descriptor's two nearest landmarks among those of its words.
 

@@ -234,23 +234,23 @@ class TrackingSettings:
         0.6, "and one of which a smaller share of points is found again", low=0, high=1
     )
     describe_gap_s: float = config.key(
-        0.12,
+        0.09,
         "a frame that comes this long after the one before is described itself: there is time",
         unit="s", low=0, high=1000,
     )  # fmt: skip
-    features_lag_frames: int = config.key(
-        6, "frames after which a keyframe's features land, waited for; 0: when ready",
-        low=0, high=30,
+    features_lag_s: float = config.key(
+        0.19, "time after which a keyframe's features land, waited for; 0: when ready", unit="s",
+        low=0, high=10,
     )  # fmt: skip
     hurry_px_s: float = config.key(
         150.0, "points faster than this need their next keyframe sooner", unit="px/s",
         low=0, high=1e5,
     )  # fmt: skip
-    hurried_lag_frames: int = config.key(
-        4, "and that keyframe's features land after so many frames at most", low=0, high=30
+    hurried_lag_s: float = config.key(
+        0.12, "and that keyframe's features land after so long at most", unit="s", low=0, high=10
     )
-    search_lag_frames: int = config.key(
-        6, "a search's result lands after so many frames at most", low=0, high=30
+    search_lag_s: float = config.key(
+        0.19, "a search's result lands after so long at most", unit="s", low=0, high=10
     )
 
 
@@ -305,6 +305,10 @@ class StateSettings:
         low=0,
         high=100,
     )
+    sure_significance: float = config.key(
+        1e9, "and none, where it shows more landmarks than by chance by so many deviations",
+        low=0, high=1e9,
+    )  # fmt: skip
     recover_frames: int = config.key(
         0, "good frames in a row from DEGRADED back to TRACKING", low=0, high=100
     )
@@ -410,6 +414,24 @@ def load_preset(name: str) -> LocalizerSettings:
         return config.load(path, LocalizerSettings)
 
 
+def in_units(settings: LocalizerSettings, per_metre: float) -> LocalizerSettings:
+    """The same for a map in which a metre is `per_metre` of its units."""
+    of = {
+        "motion": {
+            "translation_density_m2_s3": 2, "walk_translation_m2_s": 2, "swing_arm_m": 1,
+        },
+        "pose": {"landmark_sigma_m": 1},
+        "start": {"sigma_m": 1, "speed_m_s": 1},
+        "state": {"good_sigma_m": 1},
+    }  # fmt: skip
+    tables = {}
+    for name, powers in of.items():
+        table = getattr(settings, name)
+        changes = {key: getattr(table, key) * per_metre**power for key, power in powers.items()}
+        tables[name] = replace(table, **changes)
+    return replace(settings, **tables)
+
+
 def for_live(settings: LocalizerSettings) -> LocalizerSettings:
     """The same where frames come at their own pace: no frame waits for a keyframe's features."""
-    return replace(settings, tracking=replace(settings.tracking, features_lag_frames=0))
+    return replace(settings, tracking=replace(settings.tracking, features_lag_s=0.0))

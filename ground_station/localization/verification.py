@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
-from ground_station.geometry.lens import Lens
+from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.mapping.modes import Modes, described
@@ -65,7 +65,7 @@ class Witness:
         """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
         cTw = poses.inverse(wTc)
         points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
-        ahead = points[:, 2] > 0.05
+        ahead = points[:, 2] > NEAREST_M
         index, points = index[ahead], points[ahead]
         flat = points[:, :2] / points[:, 2:]
         seen = self.lens.inside(flat)

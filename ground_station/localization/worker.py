@@ -16,26 +16,26 @@ BESIDE_NICE = 5
 
 
 class Worker(Generic[Result]):
-    """At most one job at a time; its result lands some calls of `collect` after it was given.
+    """At most one job at a time; its result lands some time of the frames after it was given.
 
-    With `lag` 1 or more it lands at exactly that call, which waits if it must: the same frames then
-    give the same poses, however fast the machine. With 0 it lands when it is ready.
+    With a `lag_s` it lands at the first frame that is so much later, which waits if it must: the
+    same frames then give the same poses, however fast the machine. With 0 it lands when it is
+    ready.
     """
 
-    def __init__(self, lag: int) -> None:
-        self.lag = lag
+    def __init__(self, lag_s: float) -> None:
+        self.lag_s = lag_s
         self._executor: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
-        self._age = 0
-        self._due = lag
+        self._due_ns = 0
 
     @property
     def busy(self) -> bool:
         """Whether a job was given whose result has not landed."""
         return self._job is not None
 
-    def submit(self, job: Callable[[], Result], lag: int | None = None) -> None:
-        """Starts a job; one that has not landed is forgotten. It may have a lag of its own.
+    def submit(self, job: Callable[[], Result], time_ns: int, lag_s: float | None = None) -> None:
+        """Starts a frame's job; one that has not landed is forgotten. It may have its own lag.
 
         A lag of its own is no more than the worker's, so that with 0 nothing is ever waited for.
         """
@@ -44,16 +44,16 @@ class Worker(Generic[Result]):
                 1, thread_name_prefix="keyframes", initializer=_step_aside
             )
         self.drop()
-        self._due = self.lag if lag is None else min(lag, self.lag)
-        self._job, self._age = self._executor.submit(job), 0
+        lag_s = self.lag_s if lag_s is None else min(lag_s, self.lag_s)
+        self._due_ns = time_ns + int(1e9 * lag_s)
+        self._job = self._executor.submit(job)
 
-    def collect(self) -> Result | None:
-        """The result that lands at this call, or None. What the job raised is raised here."""
+    def collect(self, time_ns: int) -> Result | None:
+        """The result that lands at a frame, or None. What the job raised is raised here."""
         job = self._job
         if job is None:
             return None
-        self._age += 1
-        if self._age < self._due or (self._due == 0 and not job.done()):
+        if time_ns < self._due_ns or (self.lag_s == 0 and not job.done()):
             return None
         self._job = None
         return job.result()

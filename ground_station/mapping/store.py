@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,12 @@ class Map:
     keyframes: Keyframes
     folder: Path | None = None
     modes: Modes | None = None
+
+    @cached_property
+    def depth_m(self) -> float:
+        """How far off its landmarks were seen, the median: by it a map has a scale. NaN without."""
+        seen_m = self.landmarks.distance_m.mean(axis=1)
+        return float(np.median(seen_m)) if len(seen_m) else float("nan")
 
 
 _Arrays = compact.Arrays

@@ -78,7 +78,7 @@ def test_a_bad_frame_among_the_good_ones_starts_the_count_again(judge):
 
 def test_what_was_found_again_needs_features_of_later_frames(judge):
     frame(judge, 0)
-    judge.found_again(10 * STEP_NS)
+    judge.found_again(10 * STEP_NS, judge.settings.sure_significance - 1)
     assert judge.doubtful
     for k in range(11, 20):  # its own points, followed for as long as they like
         state, reason = frame(judge, k, support_ns=10 * STEP_NS)
@@ -86,6 +86,14 @@ def test_what_was_found_again_needs_features_of_later_frames(judge):
     assert frame(judge, 20, support_ns=15 * STEP_NS)[0] is State.DEGRADED
     assert frame(judge, 21, support_ns=15 * STEP_NS)[0] is State.TRACKING
     assert not judge.doubtful
+
+
+def test_what_was_found_beyond_doubt_needs_no_other_frame(judge):
+    frame(judge, 0)
+    judge.unsolved(100 * STEP_NS)
+    judge.found_again(101 * STEP_NS, judge.settings.sure_significance)
+    assert not judge.doubtful
+    assert frame(judge, 101, support_ns=101 * STEP_NS)[0] is State.TRACKING
 
 
 def test_unsolved_frames_are_degraded_and_then_lost_until_one_is_solved(judge):

@@ -103,8 +103,11 @@ def path(count):
     return np.round(t * 1e9).astype(np.int64).tolist(), wTc
 
 
-def make(wall, **changes):
+def make(wall, sure_significance=None, **changes):
     settings = load_preset("default")
+    if sure_significance is not None:
+        state = dataclasses.replace(settings.state, sure_significance=sure_significance)
+        settings = dataclasses.replace(settings, state=state)
     tracking = dataclasses.replace(settings.tracking, **({"enabled": True} | changes))
     settings = dataclasses.replace(settings, tracking=tracking)
     extractor = Counting()
@@ -239,9 +242,9 @@ def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wal
     assert State.LOST not in states[:15] and set(states[22:35]) == {State.LOST}
     found = next(k for k in range(35, 70) if frames[k].localized)
     assert frames[found].relocalized and (found == 35 if covered == "dark" else found < 50)
-    assert frames[found].reason.startswith("found again, to be confirmed")
+    # The wall leaves no doubt; but that a camera gets anywhere in the dark does.
     sure = states.index(State.TRACKING, 35)
-    assert found < sure < 62 and all(state is State.TRACKING for state in states[sure:])
+    assert found <= sure < 62 and all(state is State.TRACKING for state in states[sure:])
     for k in range(found, 70):
         assert np.linalg.norm(frames[k].wTc[:3, 3] - truth[k][:3, 3]) < 0.02
     here = extractor.threads.count(threading.current_thread().name)
@@ -250,8 +253,8 @@ def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wal
     assert described == ({0, 35} if covered == "dark" else {0})
 
 
-def test_a_relocalization_is_not_confirmed_by_its_own_points(wall):
-    localizer, _ = make(wall)
+def test_a_weak_relocalization_is_not_confirmed_by_its_own_points(wall):
+    localizer, _ = make(wall, sure_significance=1e9)
     times, truth = path(14)
     frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(14)]
     assert frames[0].relocalized and all(frame.tracked for frame in frames[1:])
@@ -287,20 +290,22 @@ def test_the_thesis_preset_describes_every_frame():
 
 def test_the_thread_beside_the_tracking_steps_aside():
     """Both want the same core when a machine has two: the frame goes first."""
-    worker: Worker[int] = Worker(1)
-    worker.submit(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    worker: Worker[int] = Worker(0.1)
+    worker.submit(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), 0)
     mine = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    assert worker.collect() == min(mine + BESIDE_NICE, 19)
+    assert worker.collect(1_000_000_000) == min(mine + BESIDE_NICE, 19)
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == mine
 
 
 def test_a_result_lands_at_its_frame_and_is_waited_for():
-    worker: Worker[int] = Worker(3)
+    worker: Worker[int] = Worker(0.3)
     release = threading.Event()
-    worker.submit(lambda: 7 if release.wait(10) else 0)
-    assert worker.collect() is None and worker.collect() is None and worker.busy
+    s = 1_000_000_000
+    worker.submit(lambda: 7 if release.wait(10) else 0, 5 * s)
+    assert worker.collect(5 * s + s // 5) is None and worker.busy
     release.set()
-    assert worker.collect() == 7 and not worker.busy and worker.collect() is None
+    assert worker.collect(5 * s + s // 5) is None and worker.busy
+    assert worker.collect(6 * s) == 7 and not worker.busy and worker.collect(7 * s) is None
 
 
 def test_without_a_lag_nothing_is_waited_for():
@@ -311,20 +316,20 @@ def test_without_a_lag_nothing_is_waited_for():
         release.wait(10)
         return 7
 
-    worker.submit(job)
-    assert worker.collect() is None and worker.busy
+    worker.submit(job, 0)
+    assert worker.collect(1) is None and worker.busy
     release.set()
     for _ in range(1000):
-        if (result := worker.collect()) is not None or done.wait(0.01):
+        if (result := worker.collect(2)) is not None or done.wait(0.01):
             break
     assert result == 7
 
 
 def test_what_a_job_raised_is_raised_where_it_lands_and_a_dropped_one_never():
-    worker: Worker[int] = Worker(1)
-    worker.submit(lambda: 1 // 0)
+    worker: Worker[int] = Worker(0.1)
+    worker.submit(lambda: 1 // 0, 0)
     with pytest.raises(ZeroDivisionError):
-        worker.collect()
-    worker.submit(lambda: 1 // 0)
+        worker.collect(1_000_000_000)
+    worker.submit(lambda: 1 // 0, 0)
     worker.drop()
-    assert not worker.busy and worker.collect() is None
+    assert not worker.busy and worker.collect(1_000_000_000) is None

@@ -81,8 +81,15 @@ def test_the_given_first_pose_is_a_prediction_and_no_result(room, extractor):
     assert np.allclose(estimate.predicted_wTc, guess)
 
 
-def test_without_a_first_pose_it_finds_itself_and_waits_for_confirmation(room, extractor):
+def test_without_a_first_pose_it_finds_itself_and_is_sure(room, extractor):
     localizer = make(room, extractor)
+    times, path = room.path(1)
+    first = localizer.process_features(int(times[0]), room.features(path[0]))
+    assert first.relocalized and first.state is State.TRACKING
+
+
+def test_a_weak_find_waits_for_confirmation(room, extractor):
+    localizer = make(room, extractor, state={"sure_significance": 1e9})
     times, path = room.path(3)
     first = localizer.process_features(int(times[0]), room.features(path[0]))
     assert first.localized and first.relocalized and first.state is State.DEGRADED
@@ -115,7 +122,7 @@ def test_a_blackout_ends_in_lost_and_the_default_comes_back_elsewhere(room, extr
     assert all(state is State.LOST for state in states[lost_from:])
     assert (times[3 + lost_from] - times[2]) / 1e9 == pytest.approx(0.3, abs=0.05)
     back = localizer.process_features(int(times[250]), room.features(path[250]))
-    assert back.relocalized and back.state is State.DEGRADED
+    assert back.relocalized and back.state is State.TRACKING
     localizer.process_features(int(times[251]), room.features(path[251]))
     after = localizer.process_features(int(times[252]), room.features(path[252]))
     assert after.state is State.TRACKING and errors(after, path[252])[0] < 0.02
@@ -247,3 +254,50 @@ def test_an_empty_map_localizes_nothing(room, extractor):
     features = NOTHING
     assert not localizer.process_features(1, features).localized
     assert GateSettings().min_entropy_bits == 0.0
+
+
+def test_what_the_prediction_misses_is_found_in_the_same_frame(room, extractor):
+    """At a few frames a second the direction changes between two of them."""
+    localizer = make(room, extractor)
+    _, path = room.path(200)
+    order = [0, 20, 10, 60, 30, 90, 150]
+    for n, k in enumerate(order):
+        found = localizer.process_features(n * 500_000_000, room.features(path[k]))
+        assert found.localized and found.state is State.TRACKING
+        assert errors(found, path[k])[0] < 0.02
+
+
+def test_a_find_that_the_camera_cannot_have_reached_waits_for_confirmation(room, extractor):
+    localizer = make(room, extractor)
+    times, path = room.path(300)
+    localizer.set_initial_pose(path[0], int(times[0]))
+    for k in range(3):
+        localizer.process_features(int(times[k]), room.features(path[k]))
+    there = localizer.process_features(int(times[3]), room.features(path[250]))
+    assert there.localized and there.relocalized and there.state is State.DEGRADED
+    assert "to be confirmed" in there.reason
+
+
+@pytest.mark.parametrize("units", [0.05, 0.5, 2.0, 30.0])
+def test_a_map_without_units_localizes_as_one_in_metres(room, extractor, units):
+    lm, kf = room.map.landmarks, room.map.keyframes
+    wTc = kf.wTc.copy()
+    wTc[:, :3, 3] *= units
+    scaled = dataclasses.replace(
+        room.map,
+        info=dataclasses.replace(room.map.info, frame="map"),
+        landmarks=dataclasses.replace(
+            lm,
+            position_m=lm.position_m * units,
+            covariance_m2=lm.covariance_m2 * np.float32(units**2),
+            distance_m=lm.distance_m * np.float32(units),
+        ),
+        keyframes=dataclasses.replace(kf, wTc=wTc),
+    )
+    localizer = Localizer(scaled, room.camera, extractor, load_preset("default"))
+    times, path = room.path(20, rate_hz=10.0)
+    for time_ns, true in zip(times.tolist(), path, strict=True):
+        found = localizer.process_features(time_ns, room.features(true))
+        assert found.state is State.TRACKING
+        found_m = found.wTc[:3, 3] / units
+        assert np.linalg.norm(found_m - true[:3, 3]) < 0.02

@@ -60,7 +60,7 @@ def test_a_service_finds_its_first_pose_itself_whatever_the_preset(shelf: Path) 
     chosen = station(SAMPLE, shelf, localizer={"preset": "thesis"})
     localizer = prepare(SAMPLE, chosen)
     assert localizer.settings.recovery.relocalize
-    assert localizer.settings.tracking.features_lag_frames == 0
+    assert localizer.settings.tracking.features_lag_s == 0
     assert localizer.camera == localizer.map.info.camera
 
 

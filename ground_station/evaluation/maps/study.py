@@ -13,13 +13,11 @@ import numpy as np
 
 from ground_station.errors import BlimpError, InputError
 from ground_station.evaluation.maps.folds import is_silent_fold, judge, said
-from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.settings import MappingSettings, with_changes
 from ground_station.mapping.sfm import plain
-from ground_station.mapping.store import Map
 from ground_station.presentation.text import columns
 from ground_station.progress import Progress
 from ground_station.recording.flight import trajectory_of
@@ -113,17 +111,6 @@ def _judged(
     return judged.as_dict() | {"registered": len(names), "judged": len(kept), "of": judged}
 
 
-def median_depth(map_: Map) -> float:
-    """The median depth at which a map's keyframes see its landmarks, in its own units."""
-    lm, kf = map_.landmarks, map_.keyframes
-    depths = [np.empty(0)]
-    for k, wTc in enumerate(kf.wTc):
-        seen = lm.position_m[kf.landmark[kf.offset[k] : kf.offset[k + 1]]]
-        depths.append(poses.transform(poses.inverse(wTc), seen)[:, 2])
-    every = np.concatenate(depths)
-    return float(np.median(every)) if len(every) else float("nan")
-
-
 def ours(pictures: Pictures, settings: MappingSettings, work: Path) -> dict[str, Any]:
     """Our build's figures; `failed` has the one line where it made no map."""
     started = time.monotonic()
@@ -135,7 +122,7 @@ def ours(pictures: Pictures, settings: MappingSettings, work: Path) -> dict[str,
         return {"failed": str(error), "registered": 0, "seconds": time.monotonic() - started}
     seconds = time.monotonic() - started
     kf = map_.keyframes
-    row = _judged(pictures, kf.names, kf.wTc, median_depth(map_), settings.seed)
+    row = _judged(pictures, kf.names, kf.wTc, map_.depth_m, settings.seed)
     told = said(map_.info.built)
     silent = is_silent_fold(row.pop("of"), told)
     models = len(map_.info.built.get("model_sizes", ())) or 1
