@@ -147,6 +147,17 @@ def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
         assert "the given camera misfits" in note and "blimp calibrate" in note
 
 
+def test_the_views_may_change_both_focal_lengths_but_hardly_one_of_them():
+    """A rolling shutter stretches a picture's height; a calibration knew fy over fx already."""
+    for source, ratio in (("file", 0.0005), ("guess", 0.002)):
+        known = LensPrior(THESIS_CAMERA, source, 0.02)
+        prior = lens.prior_of(known, THESIS_CAMERA)
+        fx, fy = prior.mean[:2]
+        relative = prior.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
+        assert np.sqrt([1, -1] @ relative @ [1, -1]) == pytest.approx(ratio)
+        assert np.sqrt(relative[0, 0]) == pytest.approx(0.1, rel=0.01)
+
+
 @pytest.mark.parametrize("turns", [True, False])
 def test_a_right_camera_file_is_left_as_it_is(turns):
     for seed in range(3):
