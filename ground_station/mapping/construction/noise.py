@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.special import gammaln
 
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.epipolar import sampson_px
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import mutual_matches
 
@@ -89,11 +90,4 @@ def _distances(p: F64, q: F64, camera_matrix: F64, limit_px: float) -> F64 | Non
         return None
     if E is None or E.shape != (3, 3):
         return None
-    inverse = np.linalg.inv(camera_matrix)
-    F = inverse.T @ E @ inverse
-    one = np.column_stack([p, np.ones(len(p))])
-    other = np.column_stack([q, np.ones(len(q))])
-    lines, back = one @ F.T, other @ F
-    across = np.abs(np.sum(other * lines, axis=1))
-    slope = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    return np.asarray(across / np.sqrt(np.maximum(slope, 1e-12)))
+    return sampson_px(p, q, np.asarray(E, np.float64), camera_matrix)

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from ground_station.errors import MapError
-from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView, mutual_matches
 from ground_station.mapping.construction.verification import rules_of
@@ -47,31 +47,6 @@ def covisible_pairs(
     return sorted(pairs)
 
 
-def essential(first_wTc: F64, second_wTc: F64) -> F64:
-    """E (3, 3) with x₂ᵀ E x₁ = 0 on the planes z = 1 of two cameras with these poses (4, 4)."""
-    T = poses.inverse(second_wTc) @ first_wTc
-    x, y, z = T[:3, 3]
-    return np.asarray(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3])
-
-
-def epipolar_px(first_px: F64, second_px: F64, E: F64, camera_matrix: F64) -> F64:
-    """How far matched undistorted pixels (N, 2) lie off each other's epipolar lines (N,), px.
-
-    The larger of the two distances; NaN where the cameras stand at one place. Hartley and
-    Zisserman, "Multiple View Geometry", section 11.4.3.
-    """
-    K_inv = np.linalg.inv(camera_matrix)
-    F = K_inv.T @ E @ K_inv
-    p, q = (np.column_stack([px, np.ones(len(px))]) for px in (first_px, second_px))
-    in_second, in_first = p @ F.T, q @ F
-    off = np.abs(np.sum(q * in_second, axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        nearer = np.minimum(
-            np.linalg.norm(in_second[:, :2], axis=1), np.linalg.norm(in_first[:, :2], axis=1)
-        )
-        return np.asarray(off / nearer)
-
-
 def match(
     images: Images,
     wTc: F64,
@@ -92,7 +67,7 @@ def match(
         matches = mutual_matches(first, second, rules.ratio)
         E = essential(wTc[i], wTc[j])
         pixels = images.pinhole_px[i][matches[:, 0]], images.pinhole_px[j][matches[:, 1]]
-        fits = epipolar_px(*pixels, E, matrix) <= settings.sfm.max_error_px
+        fits = sampson_px(*pixels, E, matrix) <= settings.sfm.max_error_px
         if fits.sum() < rules.min_inliers:
             return None
         return TwoView(matches[fits], E / np.linalg.norm(E), None, False)

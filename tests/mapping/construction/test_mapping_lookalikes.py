@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ground_station.mapping.construction import structure
+from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import sequences
 from ground_station.mapping.construction.placing import chains, lookalikes, loops
 from ground_station.mapping.construction.placing.placed import Placed
@@ -137,16 +138,17 @@ def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
     assert np.abs(again.wTc - before.wTc).max() < 1e-6
 
 
-def test_images_in_no_order_are_judged_by_rotations_alone(corridor, plain, tmp_path):
+@pytest.mark.xfail(strict=True, reason="equal bays confirm each other's rotations, and fold")
+def test_pictures_in_no_order_of_equal_bays_are_placed_or_doubted(corridor, tmp_path):
     rng = np.random.default_rng(0)
     order = rng.permutation(len(corridor.images.names))
     at = np.argsort(order)
     pairs = {}
     for (i, j), view in corridor.pairs.items():
         a, b = int(at[i]), int(at[j])
-        pairs[min(a, b), max(a, b)] = (
-            view if a < b else dataclasses.replace(view, matches=view.matches[:, ::-1])
-        )
+        if a > b:
+            a, b, view = b, a, TwoView(view.matches[:, ::-1], view.essential.T, None, False)
+        pairs[a, b] = view
     sequence = np.zeros(len(order), dtype=np.int64)
     assert not chains.in_order(sequence, pairs).any()
     shuffled = dataclasses.replace(
@@ -158,7 +160,5 @@ def test_images_in_no_order_are_judged_by_rotations_alone(corridor, plain, tmp_p
         pairs=pairs,
     )
     found = _judged(shuffled, tmp_path)
-    # What a chain would have said of the others, nothing says: equal bays confirm each other.
-    assert found.notes == [] and len(found.parts) == 1
-    whole = found.reconstruction.num_reg_images() + found.parts[0].num_reg_images()
-    assert whole == plain.num_reg_images()
+    right = geometry.error_m(shuffled, found.reconstruction).max() < 0.02
+    assert right or found.doubts or found.notes

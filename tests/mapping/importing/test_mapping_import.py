@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from foreign_model import foreign_model, image_name, write, write_pictures
@@ -12,12 +13,13 @@ from foreign_model import foreign_model, image_name, write, write_pictures
 from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
 from ground_station.geometry import poses
+from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
 from ground_station.mapping import command, store
 from ground_station.mapping.importing.build import import_model
-from ground_station.mapping.importing.matching import covisible_pairs, epipolar_px, essential
+from ground_station.mapping.importing.matching import covisible_pairs
 from ground_station.mapping.importing.pictures import open_pictures, taken_by
 from ground_station.mapping.sfm import colmap, foreign
 
@@ -211,13 +213,19 @@ def test_epipolar_distances_are_those_of_the_geometry(scene):
         local = poses.transform(poses.inverse(scene.wTc[k]), scene.points[both])
         pixels.append(local[:, :2] / local[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2])
     E = essential(scene.wTc[i], scene.wTc[j])
-    assert epipolar_px(*pixels, E, K).max() < 1e-6
-    # A point shifted across its line is as far off as it was shifted.
+    assert sampson_px(*pixels, E, K).max() < 1e-6
+    # Of a shift across its line a pixel needs to move back by a part, the other by the rest.
     F = np.linalg.inv(K).T @ E @ np.linalg.inv(K)
     line = np.column_stack([pixels[0], np.ones(len(both))]) @ F.T
     normal = line[:, :2] / np.linalg.norm(line[:, :2], axis=1, keepdims=True)
-    assert epipolar_px(pixels[0], pixels[1] + 3 * normal, E, K).min() >= 3 - 1e-6
-    assert np.isnan(epipolar_px(*pixels, essential(scene.wTc[i], scene.wTc[i]), K)).all()
+    shifted = sampson_px(pixels[0], pixels[1] + 3 * normal, E, K)
+    assert (shifted > 1.5).all() and (shifted < 3).all()
+    theirs = [
+        cv2.sampsonDistance(np.append(p, 1)[:, None], np.append(q, 1)[:, None], F)
+        for p, q in zip(pixels[0], pixels[1] + 3 * normal, strict=True)
+    ]
+    assert shifted == pytest.approx(np.sqrt(theirs), rel=1e-6)
+    assert np.isnan(sampson_px(*pixels, essential(scene.wTc[i], scene.wTc[i]), K)).all()
 
 
 def test_pairs_are_those_that_share_most():

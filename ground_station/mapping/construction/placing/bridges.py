@@ -1,8 +1,8 @@
 """Where a model hangs together by few landmarks, so that one part's scale says little of another's.
 
-Of two sets of images, only landmarks that both triangulate, each by two sights, carry position and
-scale across. Where there are too few, a bundle adjustment moves one set against the other for next
-to nothing.
+Of two sets of images, scale is carried across by landmarks that both triangulate, each by two
+sights, or by two images of one set that stand each among the other's landmarks. Where there are too
+few, a bundle adjustment moves one set against the other for next to nothing.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from ground_station.mapping.construction.placing.placed import Placed
 
 I32 = npt.NDArray[np.int32]
 
-
 _FEWEST = 30
-"""Landmarks that carry a scale across; as many as join two models."""
+"""Landmarks that place one set in another; as many as join two models."""
 
 _PART = 5
 """Images; fewer do not drift by themselves: with two, a right simulated map lost four of 125."""
@@ -47,12 +46,26 @@ def separated(model: Placed) -> list[set[int]]:
         kept[n] = False
         part = _components(edges[kept], len(index))
         sides = part == part[i], part == part[j]
-        both = [np.bincount(sights[side].indices, minlength=shape[1]) >= 2 for side in sides]
         few = min(int(np.count_nonzero(side)) for side in sides) < _PART
-        kept[n] = few or np.count_nonzero(both[0] & both[1]) >= _FEWEST
+        kept[n] = few or _carries(sights[sides[0]], sights[sides[1]])
     part = _components(edges[kept], len(index))
     sets = [{*index[part == number].tolist()} for number in np.unique(part).tolist()]
     return sorted(sets, key=lambda each: -len(each))
+
+
+def _carries(one: csr_array, other: csr_array) -> bool:
+    """Whether two sets of images have a scale in common."""
+    first, second = (
+        np.bincount(each.indices, minlength=each.shape[1]) >= 2 for each in (one, other)
+    )
+    if np.count_nonzero(first & second) >= _FEWEST:
+        return True
+    return max(_stand_among(one, second), _stand_among(other, first)) >= 2
+
+
+def _stand_among(images: csr_array, triangulated: npt.NDArray[np.bool_]) -> int:
+    """How many images see as many of the landmarks as place one."""
+    return int(np.count_nonzero(images @ triangulated.astype(float) >= _FEWEST))
 
 
 def _components(edges: npt.NDArray[np.int32], nodes: int) -> I32:
