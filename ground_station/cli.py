@@ -15,27 +15,23 @@ _COMMANDS = (
     # name, room's command module, help
     ("simulate", "ground_station.simulator.command", "fly a simulated blimp and record it"),
     ("calibrate", "ground_station.calibration.command", "print a board, calibrate a camera by it"),
-    ("map", "ground_station.mapping.command", "build, register and inspect maps"),
-    (
-        "models",
-        "ground_station.features.importing.command",
-        "bring, inspect and quantize learned features",
-    ),
+    ("map", "ground_station.commands.maps", "build, register and inspect maps"),
+    ("models", "ground_station.commands.models", "bring, inspect and quantize learned features"),
     ("localize", "ground_station.localization.command", "find the camera in a map, frame by frame"),
-    ("replay", "ground_station.service.replay_command", "stream a recording through the firmware"),
+    ("replay", "ground_station.replay.command", "stream a recording through the firmware"),
     ("record", "ground_station.service.record_command", "record payloads without the service"),
     ("command", "ground_station.stream.command", "ask a payload to do something"),
     ("serve", "ground_station.service.serve_command", "run the ground station and its dashboard"),
     (
         "doctor",
-        "ground_station.service.doctor.command",
+        "ground_station.doctor.command",
         "check this machine, and say how to mend it",
     ),
-    ("export", "ground_station.service.export_command", "a recording's poses for other programs"),
+    ("export", "ground_station.recording.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("experiments", "ground_station.experiments.command", "fly the thesis's experiments again"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
-    ("bench", "ground_station.service.bench_command", "measure what each step costs"),
+    ("bench", "ground_station.bench.command", "measure what each step costs"),
 )
 
 

@@ -17,8 +17,9 @@ if os.environ.get("CI"):
     settings.load_profile("ci")
 
 _ROOMS = {
-    "calibration", "cli", "deploy", "evaluation", "experiments", "features", "fuzz", "geometry",
-    "hw", "localization", "mapping", "maps", "recording", "simulator", "wire",
+    "bench", "calibration", "cli", "commands", "deploy", "evaluation", "experiments",
+    "feature_models", "features", "fuzz", "geometry", "hw", "inspection", "localization", "map",
+    "map_update", "mapping", "maps", "recording", "simulator", "training", "wire",
 }  # fmt: skip
 """Rooms in whose tests nothing flies: no program that another one disturbs by using a core."""
 

@@ -98,7 +98,7 @@ sys.version_info >= (3, 11) and print(os.path.realpath(sys._base_executable))' 2
 build_environment() {
   python=$(find_python)
   [ -x "$source/.venv/bin/python" ] || die "no environment in $source/.venv: run make setup first"
-  lock=$(cd "$source" && .venv/bin/python -m ground_station.service.doctor.locked)
+  lock=$(cd "$source" && .venv/bin/python -m ground_station.doctor.locked)
   key=$({ printf '%s\n' "$lock"; "$python" -VV; printf '%s\n' "$python"; } | hash_of)
   environment=$opt/environments/$key
   [ ! -f "$environment/.complete" ] || return 0

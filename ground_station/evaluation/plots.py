@@ -17,7 +17,7 @@ from matplotlib.transforms import Affine2D
 from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping.floorplan import FloorPlan
+from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.dress import LIGHT, Dress, dressed, figure_of, legend
 
 Array = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping.floorplan import load_floorplan
+from ground_station.map.floorplan import load_floorplan
 from ground_station.presentation.pages import Shown, data_uri, shown, write_page
 from ground_station.presentation.text import columns
 

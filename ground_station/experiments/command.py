@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
     from dataclasses import replace
 
+    from ground_station.bench.steps import machine
     from ground_station.errors import InputError
     from ground_station.experiments import (
         claims,
@@ -60,7 +61,6 @@ def run(args: argparse.Namespace) -> int:
     )
     from ground_station.experiments.store import Store
     from ground_station.files import write_json
-    from ground_station.localization.bench import machine
     from ground_station.mapping.settings import load_settings
 
     if not 0 <= args.jobs <= 256:

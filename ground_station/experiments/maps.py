@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ground_station.experiments.declaration import MapSpec
 from ground_station.experiments.material import flown
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.refinement.refine import straighten

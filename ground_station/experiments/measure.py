@@ -22,7 +22,7 @@ from ground_station.localization.extraction import extractor_for
 from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 
 F64 = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ground_station.evaluation.plots import show_floorplan
-from ground_station.mapping.floorplan import FloorPlan
+from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.dress import Dress, dressed
 
 _MOST_PATHS = 4

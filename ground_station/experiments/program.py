@@ -11,12 +11,12 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 ROOMS = {
     "flight": ("experiments/flights.py", "simulator", "geometry"),
-    "map": ("experiments/maps.py", "experiments/material.py", "mapping", "features", "geometry",
-            "recording"),
+    "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
+            "geometry", "recording"),
     "run": ("experiments/measure.py", "experiments/alter.py", "experiments/material.py",
-            "evaluation/ate.py", "localization", "mapping/store.py", "mapping/descriptors.py",
-            "mapping/registration/accuracy.py", "mapping/registration/uncertainty.py",
-            "mapping/compression", "features", "geometry", "recording"),
+            "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
+            "map/accuracy.py", "map/uncertainty.py", "map_update/compression", "features",
+            "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""
 

@@ -8,7 +8,7 @@ from typing import Any
 from ground_station.experiments import claims, pictures, tables
 from ground_station.experiments.quick import FLIGHT_S, IMAGES
 from ground_station.files import write_json, write_text
-from ground_station.mapping.floorplan import FloorPlan, load_floorplan
+from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"

@@ -64,14 +64,14 @@ def _build(job: MapJob, store: Store, data: Path) -> None:
 def _run(job: RunJob, store: Store, data: Path) -> None:
     from ground_station.experiments.material import flown
     from ground_station.experiments.measure import measure
-    from ground_station.mapping import store as maps
+    from ground_station.map import store as maps
 
     recording = store.flight(job.recording) if job.recording else None
     flight = flown(job.flight, recording, data)
     map_ = maps.load(store.map(job.map_key))
     if job.alter.landmarks < 1:
-        from ground_station.mapping.compression.choice import choose
-        from ground_station.mapping.compression.compress import subset
+        from ground_station.map_update.compression.choice import choose
+        from ground_station.map_update.compression.compress import subset
 
         map_ = subset(map_, choose(map_, round(job.alter.landmarks * len(map_.landmarks))))
     store.write(job.key, measure(map_, flight, job.alter, job.settings, job.seed))

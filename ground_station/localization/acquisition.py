@@ -24,7 +24,7 @@ from ground_station.localization.relocalization import Relocalizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import RIGHT_PX, DescriptorThresholds
 from ground_station.localization.tracking import Keyframe, spread_out
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]

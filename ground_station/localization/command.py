@@ -95,8 +95,8 @@ def run(args: argparse.Namespace) -> int:
         write_estimates,
         write_smoothed,
     )
-    from ground_station.mapping import store
-    from ground_station.mapping.refinement.observations import save_observations
+    from ground_station.map import store
+    from ground_station.map.observations import save_observations
     from ground_station.recording.look import look
     from ground_station.recording.open import open_input, parse_range
 

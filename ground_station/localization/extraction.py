@@ -6,7 +6,7 @@ from ground_station.errors import MapError
 from ground_station.features import extractors
 from ground_station.features.extractor import Extractor
 from ground_station.features.settings import OF_THE_MAP, FeatureSettings
-from ground_station.mapping.store import MapInfo, check_features
+from ground_station.map.store import MapInfo, check_features
 
 
 def extractor_for(info: MapInfo, settings: FeatureSettings) -> Extractor:

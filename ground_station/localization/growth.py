@@ -28,9 +28,9 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.localization.visibility import LandmarkIndex
-from ground_station.mapping import store
-from ground_station.mapping.descriptors import Descriptors
-from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
+from ground_station.map import store
+from ground_station.map.descriptors import Descriptors
+from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
 Array = npt.NDArray[np.float64]
 

@@ -31,8 +31,8 @@ from ground_station.localization.publishing import (
 from ground_station.localization.settings import LocalizerSettings, in_units
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
-from ground_station.mapping.registration.accuracy import accuracy
-from ground_station.mapping.store import Map, check_features
+from ground_station.map.accuracy import accuracy
+from ground_station.map.store import Map, check_features
 from pi_firmware.wire.entropy import entropy_bits
 
 Array = npt.NDArray[np.float64]

@@ -20,8 +20,8 @@ from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import DescriptorThresholds
 from ground_station.localization.verification import Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
-from ground_station.mapping.modes import described
-from ground_station.mapping.store import Map
+from ground_station.map.modes import described
+from ground_station.map.store import Map
 
 Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.mapping.store import Landmarks
+from ground_station.map.store import Landmarks
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]

@@ -12,7 +12,7 @@ from ground_station.localization.judge import Evidence
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.relocalization import spread
 from ground_station.localization.settings import CovarianceSettings
-from ground_station.mapping.registration.accuracy import Accuracy
+from ground_station.map.accuracy import Accuracy
 
 Array = npt.NDArray[np.float64]
 

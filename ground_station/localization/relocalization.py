@@ -19,8 +19,8 @@ from ground_station.geometry.lens import Lens
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
 from ground_station.localization.verification import Witness
-from ground_station.mapping.modes import Modes, described
-from ground_station.mapping.store import Landmarks, Map
+from ground_station.map.modes import Modes, described
+from ground_station.map.store import Landmarks, Map
 
 Array = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]

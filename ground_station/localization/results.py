@@ -14,8 +14,8 @@ from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.mapping.refinement.observations import FlightObservations, landmarks_sha256
-from ground_station.mapping.store import Map
+from ground_station.map.observations import FlightObservations, landmarks_sha256
+from ground_station.map.store import Map
 from pi_firmware.wire.text import printable
 
 

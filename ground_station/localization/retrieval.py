@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from ground_station.mapping.descriptors import Descriptors, joined
-from ground_station.mapping.modes import Modes
-from ground_station.mapping.store import Keyframes, Landmarks
+from ground_station.map.descriptors import Descriptors, joined
+from ground_station.map.modes import Modes
+from ground_station.map.store import Keyframes, Landmarks
 
 F32 = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.intp]

@@ -13,8 +13,8 @@ from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.mapping.modes import Modes, described
-from ground_station.mapping.store import Landmarks
+from ground_station.map.modes import Modes, described
+from ground_station.map.store import Landmarks
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]

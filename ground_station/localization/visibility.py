@@ -15,7 +15,7 @@ from scipy import sparse
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.mapping.store import Keyframes, Landmarks
+from ground_station.map.store import Keyframes, Landmarks
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]

@@ -1,1 +1,1 @@
-"""The ground station as a service, its processes and its page; replay, demo and the benches."""
+"""The ground station as a service: its processes, their bus, and its page."""

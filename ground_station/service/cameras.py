@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ground_station.geometry.camera import Camera, load_camera
-from ground_station.mapping.store import MapInfo, load_info
+from ground_station.map.store import MapInfo, load_info
 from ground_station.service.settings import MapSettings
 
 

@@ -28,7 +28,7 @@ from ground_station.evaluation.report import (
     write_report,
 )
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping.floorplan import load_floorplan
+from ground_station.map.floorplan import load_floorplan
 from ground_station.presentation.dress import write_png
 
 

@@ -8,10 +8,10 @@ import math
 import kept_runs
 import pytest
 
+from ground_station.bench.steps import machine
 from ground_station.experiments import declaration, report, summary, tables
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
-from ground_station.localization.bench import machine
 
 
 def document(tmp_path, runs, thesis="thesis.position_m = 0.2"):

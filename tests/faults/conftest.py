@@ -8,7 +8,7 @@ import pytest
 
 from ground_station.features import extractors
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.mapping import store
+from ground_station.map import store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "stream"))  # for numbered_flight
 

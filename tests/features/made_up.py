@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ground_station.features.importing.graph import Graph
+from ground_station.feature_models.graph import Graph
 from ground_station.features.model import ModelInfo
 
 

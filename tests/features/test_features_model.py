@@ -10,9 +10,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from ground_station.feature_models.graph import Graph
 from ground_station.features import inspection, model
 from ground_station.features.extractor import FeatureError
-from ground_station.features.importing.graph import Graph
 from ground_station.features.model import ModelInfo
 
 

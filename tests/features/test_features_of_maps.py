@@ -14,9 +14,9 @@ from ground_station.features.extractor import FeatureError
 from ground_station.features.settings import FeatureSettings, LearnedSettings
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.extraction import extractor_for
+from ground_station.map.store import MapInfo
 from ground_station.mapping.construction import images, verification
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.store import MapInfo
 from ground_station.recording.frames import Frame
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from ground_station.evaluation.features import homographies
+from ground_station.bench.features import homographies
+from ground_station.feature_models.importer import import_weights
 from ground_station.features import extractors
-from ground_station.features.importing.importer import import_weights
 
 SHARED = Path(__file__).parents[2] / "../shared"
 WEIGHTS = SHARED / "models" / "alike-t.safetensors"

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground_station.feature_models import homographic, scale
+from ground_station.feature_models.degrade import degrade
+from ground_station.feature_models.images import procedural
 from ground_station.features import catalogue, extractors, inspection
-from ground_station.features.importing import homographic, scale
-from ground_station.features.training.degrade import degrade
-from ground_station.features.training.images import procedural
 
 SEED = 90_210
 

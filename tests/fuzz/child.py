@@ -21,7 +21,7 @@ from types import FrameType, ModuleType
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parents[1])]  # of the checkout, `deploy` is not installed
 # What the tests of these rooms make, too: small models, weights, networks.
-sys.path += [str(HERE.parent / "mapping"), str(HERE.parent / "features")]
+sys.path += [str(HERE.parent / room) for room in ("mapping", "features", "feature_models")]
 import pieces  # noqa: E402
 
 MEMORY_BYTES = 1 << 30

@@ -15,15 +15,15 @@ from links.namespace import NamespaceLink
 from links.proxy import ProxyLink
 
 from ground_station.localization.settings import load_preset
-from ground_station.mapping import store
-from ground_station.service.cases.case import LOOPBACK, NAMESPACE, Case
-from ground_station.service.cases.judge import Judged, judged
-from ground_station.service.cases.observed import Observed
-from ground_station.service.cases.outcome import Outcome, write_outcome
-from ground_station.service.cases.source import check_case
-from ground_station.service.cases.taken import outcome_of
-from ground_station.service.replay import replay, settings_for
-from ground_station.service.stand import Running, Stand
+from ground_station.map import store
+from ground_station.replay.cases.case import LOOPBACK, NAMESPACE, Case
+from ground_station.replay.cases.judge import Judged, judged
+from ground_station.replay.cases.observed import Observed
+from ground_station.replay.cases.outcome import Outcome, write_outcome
+from ground_station.replay.cases.source import check_case
+from ground_station.replay.cases.taken import outcome_of
+from ground_station.replay.replay import replay, settings_for
+from ground_station.replay.stand import Running, Stand
 from pi_firmware.wire.errors import BlimpError
 
 AGAIN = "again"

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from ground_station.service.live import LiveFrame
+    from ground_station.replay.live import LiveFrame
 
 TESTS = Path(__file__).resolve().parents[1]
 SETTLE_S = 3.0
@@ -94,10 +94,10 @@ def due(captured: int, clock_ns: list[int], rate_hz: float) -> int:
 def fly(trial: Trial) -> Outcome:
     """One flight in `replay`'s loop. Raises a `BlimpError` when it cannot be flown."""
     from ground_station.localization.settings import load_preset
-    from ground_station.mapping import store
-    from ground_station.service.cases.resources import Watch
-    from ground_station.service.replay import replay, settings_for
-    from ground_station.service.stand import LOOPBACK, Running, Stand
+    from ground_station.map import store
+    from ground_station.replay.cases.resources import Watch
+    from ground_station.replay.replay import replay, settings_for
+    from ground_station.replay.stand import LOOPBACK, Running, Stand
     from ground_station.stream.receiver import Receiver
 
     receivers: list[Receiver] = []
@@ -280,7 +280,7 @@ def serve(trial: Trial) -> Outcome:
 
 def main(path: str) -> int:
     """Reads the trial, flies it, says the result."""
-    from ground_station.service.firmware import FirmwareError
+    from ground_station.replay.firmware import FirmwareError
     from pi_firmware.wire.errors import BlimpError, StreamError
 
     # Whoever started this ends it so: everything that it began is ended as after a flight.

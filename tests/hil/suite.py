@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
 def chosen(names: Sequence[str]) -> list[Any]:
     """The cases by name or file, loaded, all of them before any is flown. Raises `BlimpError`."""
     from ground_station.errors import InputError
-    from ground_station.service.cases.case import load_case
+    from ground_station.replay.cases.case import load_case
 
     paths = [_case_file(name) for name in names] or sorted(CASES.glob("*.toml"))
     cases = [load_case(path) for path in paths]
@@ -182,7 +182,7 @@ def _flown(case: Any, payload: Any, out: Path) -> Any:
         counts = done.outcome.run.link_counts
         print("  packets: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
     for row in done.missed:
-        from ground_station.service.cases.junit import told
+        from ground_station.replay.cases.junit import told
 
         print(f"  MISSED {told(row)}")
     print(f"  {_state(done)}", flush=True)
@@ -201,9 +201,9 @@ def _state(done: Any) -> str:
 
 def _write(args: argparse.Namespace, done: list[Any], began: str, payload: str) -> None:
     """JUnit, JSON, the page and the table; runs of `--against` are shown beside."""
-    from ground_station.service.cases import junit, page
-    from ground_station.service.cases.compare import compare
-    from ground_station.service.cases.outcome import read_outcome
+    from ground_station.replay.cases import junit, page
+    from ground_station.replay.cases.compare import compare
+    from ground_station.replay.cases.outcome import read_outcome
     from pi_firmware.wire.errors import BlimpError
 
     out = args.out

@@ -10,7 +10,7 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.localization.estimate import PoseEstimate, State
-from ground_station.service.live import LiveFrame, LiveResult
+from ground_station.replay.live import LiveFrame, LiveResult
 from ground_station.service.pose_feed import PoseFeed, pose_message
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.autopilot.frames import rotation

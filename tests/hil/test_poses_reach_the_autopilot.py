@@ -15,9 +15,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from ground_station.localization.settings import load_preset
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
-from ground_station.service import replay
+from ground_station.replay import replay
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"

@@ -13,11 +13,11 @@ import pytest
 
 from ground_station.evaluation import ate
 from ground_station.localization.settings import load_preset
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
-from ground_station.service import flight_report
-from ground_station.service.cases.outcome import read_outcome
-from ground_station.service.replay import ReplayResult, replay, settings_for
+from ground_station.replay import flight_report
+from ground_station.replay.cases.outcome import read_outcome
+from ground_station.replay.replay import ReplayResult, replay, settings_for
 
 pytestmark = pytest.mark.alone
 

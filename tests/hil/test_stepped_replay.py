@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ground_station.localization.settings import LocalizerSettings, load_preset
-from ground_station.mapping import store
-from ground_station.service.replay import ReplayResult, replay, settings_for
+from ground_station.map import store
+from ground_station.replay.replay import ReplayResult, replay, settings_for
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 FLOWN_S = 3.0

@@ -20,7 +20,7 @@ from payloads import small
 
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.recording.flight import camera_of
-from ground_station.service.cases.case import Link, load_case
+from ground_station.replay.cases.case import Link, load_case
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader, RecordingWriter
 
 pytestmark = pytest.mark.alone

@@ -10,7 +10,7 @@ import pytest
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
+from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
 DIMENSION = 64
 CAMERA = replace(THESIS_CAMERA, readout_s=0.0)

@@ -19,8 +19,8 @@ from ground_station.localization.relocalization import match_all
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import AssociationSettings, load_preset
 from ground_station.localization.verification import Witness
-from ground_station.mapping.modes import Modes, described
-from ground_station.mapping.store import Keyframes
+from ground_station.map.modes import Modes, described
+from ground_station.map.store import Keyframes
 
 
 def _unit(rng, count, dimension=64):
@@ -128,7 +128,7 @@ def test_the_place_index_finds_landmarks_by_any_look_and_never_one_twice():
 
 
 def _plain_landmarks(descriptor):
-    from ground_station.mapping.store import Landmarks
+    from ground_station.map.store import Landmarks
 
     n = len(descriptor)
     return Landmarks(

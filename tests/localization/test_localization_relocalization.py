@@ -14,7 +14,7 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.relocalization import Relocalization, Relocalizer
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import load_preset
-from ground_station.mapping.store import Keyframes, Landmarks, Map
+from ground_station.map.store import Keyframes, Landmarks, Map
 
 SETTINGS = load_preset("default").recovery
 

@@ -18,7 +18,7 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import TrackingSettings, load_preset
 from ground_station.localization.tracking import Keyframe, spread_out, track
 from ground_station.localization.worker import BESIDE_NICE, Worker
-from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
+from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
 DEPTH_M = 4.0
 

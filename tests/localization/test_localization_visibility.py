@@ -12,7 +12,7 @@ from ground_station.geometry.lens import Lens
 from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
-from ground_station.mapping.store import Keyframes, Landmarks
+from ground_station.map.store import Keyframes, Landmarks
 
 
 def _building(rng: np.random.Generator, count: int, side_m: float) -> Landmarks:

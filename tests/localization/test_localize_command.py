@@ -19,7 +19,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
 from ground_station.localization import command
 from ground_station.localization.localizer import LocalizationError
-from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo, save_tables
+from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo, save_tables
 from pi_firmware.wire.errors import BlimpError, ConfigError
 
 
@@ -147,8 +147,8 @@ def test_smoothed_poses_go_to_a_file_of_their_own(flight, tmp_path):
 
 
 def test_what_was_seen_is_written_for_the_maps_refinement(flight, tmp_path):
-    from ground_station.mapping import store
-    from ground_station.mapping.refinement.observations import landmarks_sha256, load_observations
+    from ground_station.map import store
+    from ground_station.map.observations import landmarks_sha256, load_observations
 
     out = tmp_path / "seen.safetensors"
     more = ["--init", str(flight / "truth.txt"), "--observations", str(out)]

@@ -131,7 +131,7 @@ def error_m(corridor: Corridor, model) -> npt.NDArray:
     Fitted without those that are far off, so that they do not drag the others along.
     """
     from ground_station.geometry.alignment import align
-    from ground_station.mapping.sfm import colmap
+    from ground_station.map import colmap
 
     found = colmap.to_arrays(model)
     centres, truth = found.wTc[:, :3, 3], corridor.wTc[found.image_id - 1, :3, 3]

@@ -12,14 +12,12 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
-from ground_station.mapping import landmarks, store
+from ground_station.map import colmap, landmarks, store
+from ground_station.map.model import Model
+from ground_station.map.observations import FlightObservations, landmarks_sha256
 from ground_station.mapping.refinement import shutter
-from ground_station.mapping.refinement.observations import (
-    FlightObservations,
-    landmarks_sha256,
-)
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import adjustment
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = MappingSettings(threads=2)
@@ -151,7 +149,7 @@ def _world(tmp_path_factory) -> World:
     index = np.concatenate([index for index, _ in rows])
     pixel = np.concatenate([pixel for _, pixel in rows])
     image = np.repeat(np.arange(len(rows)), [len(i) for i, _ in rows])
-    model = colmap.Model(
+    model = Model(
         names=[f"frame-{k:06d}" for k in range(8)],
         image_id=np.arange(8) + 1,
         wTc=wTc,
@@ -164,7 +162,7 @@ def _world(tmp_path_factory) -> World:
         pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
     )
     reconstruction = colmap.from_arrays(model, camera)
-    colmap.adjust(reconstruction, loss_px=1.0, threads=1)
+    adjustment.adjust(reconstruction, loss_px=1.0, threads=1)
     found, position = colmap.positions(reconstruction, model)
     fit = align(position, points, True)  # registered by what it saw
     model = dataclasses.replace(model, wTc=fit.apply_poses(found), position=fit.apply(position))

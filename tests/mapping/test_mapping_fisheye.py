@@ -13,7 +13,7 @@ from ground_station import cli
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
-from ground_station.mapping import store
+from ground_station.map import store
 
 FISHEYE = Camera(
     width_px=320, height_px=240, fx_px=122.2, fy_px=122.5, cx_px=158.3, cy_px=121.0,

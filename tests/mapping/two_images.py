@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
+from ground_station.map.model import Model
 
 
 def write(folder: Path) -> Path:
     """Its binary files in a new folder; gives the folder."""
     wTc = np.tile(np.eye(4), (2, 1, 1))
     wTc[1, 0, 3] = 1.0
-    model = colmap.Model(
+    model = Model(
         names=["a.png", "b.png"],
         image_id=np.array([1, 2]),
         wTc=wTc,

@@ -12,8 +12,8 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.poses import rotation_angle
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.settings import load_preset
-from ground_station.mapping import store
-from ground_station.mapping.floorplan import load_floorplan
+from ground_station.map import store
+from ground_station.map.floorplan import load_floorplan
 from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import load_settings
 from ground_station.recording.flight import camera_of, trajectory_of

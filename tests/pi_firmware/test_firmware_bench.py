@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from ground_station import cli
-from ground_station.service import bench_callgrind as callgrind
-from ground_station.service import bench_figures, bench_flight
+from ground_station.bench import callgrind, figures, flight
 
 pytestmark = pytest.mark.alone
 
@@ -209,17 +208,17 @@ def test_import_times_are_summed_by_package() -> None:
         "import time:       500 |        500 |     json.decoder\n"
         "a line of the program's own\n"
     )
-    modules, packages = bench_figures.imports(text)
+    modules, packages = figures.imports(text)
     assert modules == pytest.approx({"numpy._core": 2e-3, "numpy": 1e-3, "json.decoder": 5e-4})
     assert packages == pytest.approx({"numpy": 3e-3, "the standard library": 5e-4})
 
 
 def test_the_figures_kept_have_every_group() -> None:
-    assert tuple(bench_figures.kept()) == callgrind.GROUPS
+    assert tuple(figures.kept()) == callgrind.GROUPS
 
 
 def test_the_command_measures_the_real_program(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(bench_figures.shutil, "which", lambda _: None)
+    monkeypatch.setattr(figures.shutil, "which", lambda _: None)
     out = tmp_path / "bench.json"
     arguments = ["--repetitions", "1", "--seconds", "1", "--json", str(out)]
     assert cli.main(["bench", "payload", *arguments]) == 0
@@ -239,11 +238,11 @@ def test_the_command_measures_the_real_program(tmp_path, capsys, monkeypatch) ->
 
 def test_a_program_that_fails_says_why() -> None:
     with (
-        bench_flight.Ground(telemetry=False) as ground,
-        bench_flight.fly(ground, ["camera.uri=webcam:"]) as flight,
-        pytest.raises(bench_flight.FlightError, match=r"status 2: .*unknown scheme"),
+        flight.Ground(telemetry=False) as ground,
+        flight.fly(ground, ["camera.uri=webcam:"]) as flown,
+        pytest.raises(flight.FlightError, match=r"status 2: .*unknown scheme"),
     ):
-        flight.end()
+        flown.end()
 
 
 @pytest.mark.parametrize(

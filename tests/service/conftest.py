@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,6 @@ import pytest
 import web_station as station
 
 from ground_station.service.web.app import build
-
-sys.path.append(str(Path(__file__).parents[1] / "evaluation"))  # for parsed_page
 
 HERE = "http://127.0.0.1:8080"
 

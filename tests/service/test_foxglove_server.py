@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.service import notes
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.log import SeldomHandler

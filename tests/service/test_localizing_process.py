@@ -32,9 +32,9 @@ from localizing_stand import (
 from ground_station.localization.localizer import Localizer
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
+from ground_station.replay.firmware import FirmwareProcess
 from ground_station.service import notes
 from ground_station.service.bus import Bus
-from ground_station.service.firmware import FirmwareProcess
 from ground_station.service.localizing import maps
 from ground_station.service.localizing.process import RESTART, Localizing
 from ground_station.service.notes import EstimateNote

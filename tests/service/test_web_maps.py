@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import web_station as station
 
-from ground_station.mapping.store import load_info
+from ground_station.map.store import load_info
 from ground_station.service.settings import MapSettings
 from ground_station.service.web import maps
 from pi_firmware.wire.errors import BlimpError

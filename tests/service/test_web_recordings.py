@@ -95,7 +95,7 @@ def test_no_path_leaves_the_folder(served, shelf, name, rest):
 
 def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypatch):
     client, _, _ = served
-    from ground_station.service import export
+    from ground_station.recording import export
 
     write_recording(shelf / "a.mcap")
     monkeypatch.setattr(export, "tum_lines", lambda path: iter(["# tum\n", "1 2 3 4 5 6 7 8\n"]))

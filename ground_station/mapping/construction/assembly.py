@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import landmarks, store
+from ground_station.map import landmarks, store
+from ground_station.map.model import Model
 from ground_station.mapping.construction.feature_file import Lazily
 from ground_station.mapping.construction.images import Images, extractor_of
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
 
 
 def assemble(
-    model: colmap.Model, images: Images, camera: Camera, settings: MappingSettings, name: str
+    model: Model, images: Images, camera: Camera, settings: MappingSettings, name: str
 ) -> store.Map:
     """The map in memory from a refined model and the features it was made of."""
     extracted = extractor_of(settings)

@@ -15,7 +15,8 @@ import numpy as np
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import landmarks, store
+from ground_station.map import colmap, colmap_files, landmarks, store
+from ground_station.map.folder import replacing
 from ground_station.mapping.construction import noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
@@ -30,9 +31,7 @@ from ground_station.mapping.construction.structure import Structure, adjust_and_
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
-from ground_station.mapping.folder import replacing
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap, colmap_files
 from ground_station.recording.frames import Frame
 
 

@@ -72,13 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Builds; raises `BlimpError` for what a person can mend."""
+    from ground_station.map.folder import PICTURE, check_target
+    from ground_station.map.picture import from_above
+    from ground_station.map.summary import describe
     from ground_station.mapping.construction.build import build_map
     from ground_station.mapping.construction.inputs import open_inputs
     from ground_station.mapping.construction.verdict import next_step, verdict
     from ground_station.mapping.construction.workers import open_workers
-    from ground_station.mapping.folder import PICTURE, check_target
-    from ground_station.mapping.inspection.picture import from_above
-    from ground_station.mapping.inspection.summary import describe
     from ground_station.mapping.refinement.refine import straighten
     from ground_station.mapping.settings import load_settings, with_changes
     from ground_station.presentation.dress import LIGHT, write_png

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.lens_adjustment import (
     PARAMETERS,
@@ -28,7 +29,6 @@ from ground_station.mapping.construction.lens_adjustment import (
 from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.noise import matched_neighbours
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm.colmap import Model
 
 F64 = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from scipy.sparse import bsr_array, csr_array, vstack
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.sfm.colmap import Model
+from ground_station.map.model import Model
 from ground_station.mapping.sfm.models import without_images, without_points
 
 F64 = npt.NDArray[np.float64]

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import landmarks
+from ground_station.map import colmap, landmarks
+from ground_station.map.model import Model
 from ground_station.mapping.construction.consistency import plausible_frames
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView
@@ -26,7 +27,8 @@ from ground_station.mapping.construction.placing import (
 )
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings, SfmSettings
-from ground_station.mapping.sfm import colmap, global_mapping
+from ground_station.mapping.sfm import adjustment, global_mapping
+from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
 from ground_station.mapping.sfm.models import without_points, without_sights
 from ground_station.progress import Progress
@@ -167,7 +169,7 @@ class _Reconstruction:
             for part in large:
                 # Without the others it is another model, of which pieces may come loose.
                 piece = self._kept(model, part)
-                colmap.adjust(
+                adjustment.adjust(
                     piece, loss_px=self._sfm.loss_px, threads=self._wanted.threads,
                     tolerance=_TOLERANCES[0],
                 )  # fmt: skip
@@ -255,7 +257,7 @@ class _Reconstruction:
         database = folder / "database.db"
         if not database.exists():
             pixels = self._images.pinhole_px
-            colmap.write_database(database, self._camera, self._images.names, pixels, pairs)
+            write_database(database, self._camera, self._images.names, pixels, pairs)
         count = len(self._images.names)
         with Progress("structure from motion, images", count) as progress:
             mapping = Incremental(database, folder, self._wanted, progress.step)
@@ -322,7 +324,7 @@ class _Reconstruction:
         colmap.drop_images(reconstruction, model.image_id[judged[~keep]])
 
 
-def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> colmap.Model:
+def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> Model:
     """Takes out observations above `max_error_px`, then points that too few images see.
 
     A point needs `min_track` images and two sights `min_tri_angle_deg` apart. Returns what is left.
@@ -343,14 +345,14 @@ def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> col
 
 def adjust_and_filter(
     reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: int
-) -> colmap.Model:
+) -> Model:
     """Filters and adjusts a model until what is kept fits; raises `MapError` when nothing does.
 
     Robust bundle adjustment, then observations above `max_error_px` and points below `min_track`
     or `min_tri_angle_deg` go; twice, because the first round's outliers bend the second's poses.
     """
     for tolerance in _TOLERANCES:
-        colmap.adjust(reconstruction, loss_px=sfm.loss_px, threads=threads, tolerance=tolerance)
+        adjustment.adjust(reconstruction, loss_px=sfm.loss_px, threads=threads, tolerance=tolerance)
         model = drop_misfits(reconstruction, sfm)
     if not len(model.point_id):
         raise MapError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 
 _MOST_LINES = 4
 _MOST_RUNS = 3

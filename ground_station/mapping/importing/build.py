@@ -15,14 +15,15 @@ import numpy.typing as npt
 
 from ground_station.errors import InputError, MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import landmarks, store
+from ground_station.map import colmap, landmarks, store
+from ground_station.map.folder import replacing
+from ground_station.map.model import Model
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.images import extract
 from ground_station.mapping.construction.structure import drop_misfits
-from ground_station.mapping.folder import replacing
 from ground_station.mapping.importing.matching import covisible_pairs, match
 from ground_station.mapping.settings import MappingSettings, SfmSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.foreign import ForeignModel
 from ground_station.mapping.sfm.triangulation import adjust_points, triangulate
 from ground_station.recording.frames import Frame
@@ -68,9 +69,7 @@ def import_model(
         verified = match(images, wTc, pairs, camera, settings, threads)
         work = folder / "work"
         work.mkdir()
-        colmap.write_database(
-            work / "database.db", camera, images.names, images.pinhole_px, verified
-        )
+        write_database(work / "database.db", camera, images.names, images.pinhole_px, verified)
         reconstruction = triangulate(
             work / "database.db",
             wTc,
@@ -105,7 +104,7 @@ def import_model(
     return map_
 
 
-def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: int) -> colmap.Model:
+def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: int) -> Model:
     """Adjusts and filters the points as a build does, with the poses as they are.
 
     Images that see none of what is left go.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.files import write_json
-from ground_station.mapping.table import print_table
+from ground_station.map.table import print_table
 
 HELP = "Makes a map of a COLMAP model and its pictures."
 
@@ -44,10 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Imports; raises `BlimpError` for what a person can mend."""
     from ground_station.geometry.camera import load_camera
-    from ground_station.mapping.folder import check_target
+    from ground_station.map.folder import check_target
+    from ground_station.map.summary import describe
     from ground_station.mapping.importing.build import import_model
     from ground_station.mapping.importing.pictures import open_pictures, taken_by
-    from ground_station.mapping.inspection.summary import describe
     from ground_station.mapping.settings import load_settings, with_changes
     from ground_station.mapping.sfm.foreign import read
 

@@ -23,11 +23,11 @@ import numpy.typing as npt
 
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
-from ground_station.mapping import landmarks
+from ground_station.map import landmarks
+from ground_station.map.store import Map
 from ground_station.mapping.refinement import graph as graphs
 from ground_station.mapping.refinement.graph import Graph
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
+from ground_station.map.observations import FlightObservations
+from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
-from ground_station.mapping.refinement.observations import FlightObservations
 from ground_station.mapping.settings import RefineSettings
-from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ground_station.mapping.table import print_table
+from ground_station.map.table import print_table
 
 HELP = "Adds what flights saw to a map, and adjusts it."
 
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can mend."""
     from ground_station.errors import InputError, MapError
     from ground_station.files import write_json
-    from ground_station.mapping.refinement.observations import load_observations
+    from ground_station.map.observations import load_observations
     from ground_station.mapping.refinement.refine import refine_map
     from ground_station.mapping.settings import load_settings
 

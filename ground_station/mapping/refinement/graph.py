@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import landmarks
+from ground_station.map import colmap, landmarks
+from ground_station.map.model import Model
+from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.refinement.chosen import Chosen
-from ground_station.mapping.sfm import colmap, models
-from ground_station.mapping.store import Map
+from ground_station.mapping.sfm import adjustment, models
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -37,7 +38,7 @@ class Graph:
     flights; `time_ns` (K,); `sigma_px` (groups,), the standard deviation that a sight counts with.
     """
 
-    model: colmap.Model
+    model: Model
     group: I64
     time_ns: I64
     sigma_px: F64
@@ -65,7 +66,7 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
     image = [np.repeat(np.arange(len(kf)), np.diff(kf.offset))]
     image += [f.frame + start for f, start in zip(flights, starts, strict=False)]
     sights = np.concatenate(image)
-    model = colmap.Model(
+    model = Model(
         names=names,
         image_id=np.arange(len(names)) + 1,
         wTc=np.concatenate([kf.wTc, *(f.wTc for f in flights)]),
@@ -151,7 +152,7 @@ def solve(
     weight = graph.sigma_px[0] / graph.sigma_px[graph.group]
     reconstruction = colmap.from_arrays(graph.model, camera, weight)
     for _ in range(_MOST_ROUNDS):
-        done = colmap.adjust(
+        done = adjustment.adjust(
             reconstruction,
             loss_px=loss_px,
             threads=threads,

@@ -13,17 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import MapError
-from ground_station.mapping import landmarks, store
-from ground_station.mapping.descriptors import Descriptors
-from ground_station.mapping.folder import carry_floorplan, kept_name, replacing
+from ground_station.map import colmap, landmarks, store
+from ground_station.map.descriptors import Descriptors
+from ground_station.map.folder import carry_floorplan, kept_name, replacing
+from ground_station.map.observations import FlightObservations, landmarks_sha256
+from ground_station.map.refined import FRAME_TIME, Refined
 from ground_station.mapping.refinement import graph as graphs
 from ground_station.mapping.refinement.adjust import adjust
 from ground_station.mapping.refinement.chosen import Chosen, choose_frames, thin
 from ground_station.mapping.refinement.graph import Graph
-from ground_station.mapping.refinement.observations import FlightObservations, landmarks_sha256
-from ground_station.mapping.refinement.refined import FRAME_TIME, Refined
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
 from ground_station.progress import Progress
 
 F64 = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from scipy.special import fdtri
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
-from ground_station.mapping.registration.uncertainty import Uncertainty, jacobian
+from ground_station.map.uncertainty import Uncertainty, jacobian
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

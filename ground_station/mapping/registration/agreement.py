@@ -20,8 +20,8 @@ from ground_station.errors import GeometryError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.pose_similarity import Offset, Positions
-from ground_station.mapping.registration.uncertainty import Uncertainty
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

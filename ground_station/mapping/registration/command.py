@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ground_station.errors import MapError
 from ground_station.files import write_json
-from ground_station.mapping.table import print_table
+from ground_station.map.table import print_table
 
 if TYPE_CHECKING:
     from ground_station.mapping.registration.registration import Registration
@@ -129,7 +129,7 @@ def _register(args: argparse.Namespace) -> Registration:
 
 
 def _seen_tags(args: argparse.Namespace) -> Any:
-    from ground_station.mapping import store
+    from ground_station.map import store
     from ground_station.mapping.registration.tags import find_tags, read_tags
     from ground_station.progress import Progress
     from ground_station.recording.open import open_input

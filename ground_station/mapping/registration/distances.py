@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
+from ground_station.map.store import Map
+from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.adjustment import moved
 from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.rows import numbers, read_rows, word
 from ground_station.mapping.registration.sights import Sights, sigma_px, triangulate_sights
-from ground_station.mapping.registration.uncertainty import Uncertainty
-from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
+from ground_station.map.store import Landmarks
 from ground_station.mapping.registration.adjustment import (
     Adjusted,
     KnownPoints,
@@ -28,7 +29,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
 )
 from ground_station.mapping.registration.upright import upright_rotation
-from ground_station.mapping.store import Landmarks
 
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

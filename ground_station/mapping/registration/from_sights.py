@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
+from ground_station.map.store import Map
 from ground_station.mapping.registration.adjustment import KnownPoints, adjust, adjust_agreeing
 from ground_station.mapping.registration.registration import (
     Registration,
@@ -30,7 +31,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
     robust_similarity,
 )
-from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -12,6 +12,8 @@ from ground_station.errors import GeometryError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.map.store import Keyframes, Map
+from ground_station.map.uncertainty import Uncertainty, jacobian
 from ground_station.mapping.registration import agreement
 from ground_station.mapping.registration.pose_similarity import (
     Offset,
@@ -28,8 +30,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
     robust_similarity,
 )
-from ground_station.mapping.registration.uncertainty import Uncertainty, jacobian
-from ground_station.mapping.store import Keyframes, Map
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

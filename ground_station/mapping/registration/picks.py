@@ -13,10 +13,10 @@ import tomli_w
 from ground_station.errors import GeometryError, MapError
 from ground_station.files import write_text
 from ground_station.geometry.alignment import align
+from ground_station.map.store import Landmarks
 from ground_station.mapping.registration.adjustment import Upright
 from ground_station.mapping.registration.plan import PlanScale
 from ground_station.mapping.registration.similarity import MIN_POINTS, check_spread
-from ground_station.mapping.store import Landmarks
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 

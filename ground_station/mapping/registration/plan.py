@@ -94,7 +94,7 @@ def load_plan(folder: Path, path: str | None, resolution_m: float | None) -> Pla
 
     Raises `BlimpError` with one line where there is none, or where two things say its scale.
     """
-    from ground_station.mapping.floorplan import load_floorplan
+    from ground_station.map.floorplan import load_floorplan
     from ground_station.recording.folder import read_grey
 
     file = Path(path) if path is not None else folder / "floorplan.yaml"

@@ -10,8 +10,9 @@ import numpy as np
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import store
-from ground_station.mapping.folder import replacing
+from ground_station.map import colmap, store
+from ground_station.map.folder import replacing
+from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration.distances import Distances, by_distances, with_distances
 from ground_station.mapping.registration.from_picks import by_picks
 from ground_station.mapping.registration.from_sights import by_sights
@@ -19,8 +20,6 @@ from ground_station.mapping.registration.from_trajectory import by_trajectory
 from ground_station.mapping.registration.picks import Picks
 from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.sights import Sights
-from ground_station.mapping.registration.uncertainty import describe
-from ground_station.mapping.sfm import colmap
 
 
 def register_map(

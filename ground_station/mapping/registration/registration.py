@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry.alignment import Alignment
+from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.similarity import MIN_POINTS
-from ground_station.mapping.registration.uncertainty import Uncertainty
 
 F64 = npt.NDArray[np.float64]
 

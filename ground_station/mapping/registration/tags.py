@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.map.store import Map
 from ground_station.mapping.registration.sights import Sights, triangulate_sights
-from ground_station.mapping.store import Map
 from ground_station.recording.frames import Frame
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError

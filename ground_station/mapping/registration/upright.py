@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.map.store import Map
 from ground_station.mapping.registration.adjustment import Upright
-from ground_station.mapping.store import Map
 
 F64 = npt.NDArray[np.float64]
 

@@ -1,1 +1,1 @@
-"""The border to COLMAP: structure from motion, and its models on disk."""
+"""Structure from motion by COLMAP: its database, its mappers, its adjustment; models of others."""

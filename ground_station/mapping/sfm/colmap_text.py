@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ground_station.mapping.sfm.colmap_files import (
+from ground_station.map.colmap_files import (
     NO_POINT,
     OTHERS,
     PARAMETERS,

@@ -17,9 +17,10 @@ from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens_models import MODELS
-from ground_station.mapping.sfm import colmap_files, colmap_text
-from ground_station.mapping.sfm.colmap import HALF_PIXEL
-from ground_station.mapping.sfm.colmap_files import NO_POINT, CameraEntry, ImageEntry
+from ground_station.map import colmap_files
+from ground_station.map.colmap import HALF_PIXEL
+from ground_station.map.colmap_files import NO_POINT, CameraEntry, ImageEntry
+from ground_station.mapping.sfm import colmap_text
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 

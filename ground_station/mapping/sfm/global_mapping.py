@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pycolmap
 
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
 from ground_station.mapping.sfm.incremental import Wanted
 from ground_station.mapping.sfm.snapshots import Snapshots
 

@@ -7,14 +7,16 @@ import numpy.typing as npt
 import pycolmap
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
+from ground_station.map.model import Model
+from ground_station.mapping.sfm import adjustment
 
 F64 = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 
 def adjust_among_fixed(
-    model: colmap.Model,
+    model: Model,
     fixed_points: Flags,
     fixed_images: Flags,
     camera: Camera,
@@ -29,7 +31,7 @@ def adjust_among_fixed(
     sights. A Cauchy loss of scale `loss_px`; `threads` 0 takes one a core.
     """
     reconstruction = colmap.from_arrays(model, camera)
-    options = colmap.adjustment_options(loss_px, threads, max_iterations)
+    options = adjustment.adjustment_options(loss_px, threads, max_iterations)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.image_id.tolist():
         config.add_image(image_id)

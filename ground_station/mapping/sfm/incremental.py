@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
 from ground_station.mapping.sfm.snapshots import Snapshots
 
 F64 = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.mapping.sfm.colmap import Model
+from ground_station.map.model import Model
 
 Flags = npt.NDArray[np.bool_]
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pycolmap
 
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
 
 F64 = npt.NDArray[np.float64]
 

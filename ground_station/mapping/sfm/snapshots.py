@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ground_station.errors import MapError
 from ground_station.files import write_json
-from ground_station.mapping.sfm import colmap, colmap_files
+from ground_station.map import colmap, colmap_files
 
 _KEPT = 2
 """The newest and the one before: after a power cut the newest may hold nothing."""

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
-from ground_station.mapping.sfm import colmap
-from ground_station.mapping.sfm.colmap import pycolmap
+from ground_station.map import colmap
+from ground_station.map.colmap import pycolmap
+from ground_station.mapping.sfm import adjustment
 
 F64 = npt.NDArray[np.float64]
 
@@ -21,7 +22,7 @@ _ITERATIONS = 100
 def triangulate(
     database: Path, wTc: F64, *, seed: int, min_tri_angle_deg: float, max_error_px: float
 ) -> colmap.Reconstruction:
-    """A model of a database of `colmap.write_database`; image k has the pose `wTc[k]` (K, 4, 4).
+    """A model of a database of `write_database`; image k has the pose `wTc[k]` (K, 4, 4).
 
     Schönberger and Frahm, CVPR 2016, section 4.3: tracks are made from verified matches, robustly,
     completed and merged. The poses are not touched.
@@ -54,7 +55,7 @@ def triangulate(
 
 def adjust_points(model: colmap.Reconstruction, *, loss_px: float, threads: int = 0) -> None:
     """Adjusts all points, with a Cauchy loss of scale `loss_px`, and neither poses nor camera."""
-    options = colmap.adjustment_options(loss_px, threads, _ITERATIONS)
+    options = adjustment.adjustment_options(loss_px, threads, _ITERATIONS)
     options.refine_rig_from_world = False
     options.refine_sensor_from_rig = False
     chosen = pycolmap.BundleAdjustmentConfig()

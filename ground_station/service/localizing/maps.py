@@ -11,7 +11,7 @@ from ground_station.errors import MapError
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import for_live, load_preset
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.service.cameras import camera_of
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire.errors import BlimpError

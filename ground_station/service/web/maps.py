@@ -72,7 +72,7 @@ class Maps:
         folder = self._folder(name)
 
         def read() -> dict[str, Any]:
-            from ground_station.mapping import store
+            from ground_station.map import store
             from ground_station.service.cameras import camera_of
 
             info = store.load_info(folder)
@@ -111,7 +111,7 @@ class Maps:
         folder = self._folder(name)
 
         def read() -> bytes:
-            from ground_station.mapping import store
+            from ground_station.map import store
 
             positions = store.load_positions(folder)
             if len(positions) > LANDMARKS:
@@ -136,7 +136,7 @@ class Maps:
         def read() -> tuple[dict[str, Any], bytes]:
             import cv2
 
-            from ground_station.mapping.floorplan import load_floorplan
+            from ground_station.map.floorplan import load_floorplan
 
             plan = load_floorplan(path)
             height, width = plan.image.shape

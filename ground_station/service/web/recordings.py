@@ -75,7 +75,7 @@ class Recordings:
 
         One at a time, and whole before it is sent: who takes it slowly holds up nobody.
         """
-        from ground_station.service.export import tum_lines
+        from ground_station.recording.export import tum_lines
 
         descriptor, _ = self.open(name)
         os.close(descriptor)

@@ -1,4 +1,4 @@
-"""`ground_station.service.cases`: replay cases, accepted runs, and the folders of runs."""
+"""`ground_station.replay.cases`: replay cases, accepted runs, and the folders of runs."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import json
 import numpy as np
 from pieces import Picker, as_json, changed, refusing, scratch, stretch
 
-from ground_station.service.cases.case import load_case
-from ground_station.service.cases.frames import COLUMNS, read_csv
-from ground_station.service.cases.golden import MARK, read_golden
-from ground_station.service.cases.outcome import FRAMES, RESULT, SCHEMA, read_outcome
+from ground_station.replay.cases.case import load_case
+from ground_station.replay.cases.frames import COLUMNS, read_csv
+from ground_station.replay.cases.golden import MARK, read_golden
+from ground_station.replay.cases.outcome import FRAMES, RESULT, SCHEMA, read_outcome
 from pi_firmware.wire.errors import BlimpError
 
 _FOLDER = scratch("cases")

@@ -1,4 +1,4 @@
-"""`ground_station.mapping.sfm.colmap`: a COLMAP model's binary files, read by a library in C++."""
+"""`ground_station.map.colmap`: a COLMAP model's binary files, read by a library in C++."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import two_images
 from pieces import Picker, blocks, refusing, scratch
 
 from ground_station.errors import MapError
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
 
 _FOLDER = scratch("colmap") / "sparse"
 _SPARE = scratch("colmap-seed")

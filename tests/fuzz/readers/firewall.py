@@ -1,4 +1,4 @@
-"""`ground_station.service.doctor`: what nft, iptables and the kernel print of this machine."""
+"""`ground_station.doctor`: what nft, iptables and the kernel print of this machine."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from pieces import Picker, as_json, odd, scratch, stretch
 
-from ground_station.service.doctor import network, sockets
-from ground_station.service.doctor.findings import Check, Finding, _guarded
+from ground_station.doctor import network, sockets
+from ground_station.doctor.findings import Check, Finding, _guarded
 from ground_station.service.settings import StationSettings
 
 _PROC = scratch("firewall")

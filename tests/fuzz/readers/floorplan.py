@@ -1,11 +1,11 @@
-"""`ground_station.mapping.floorplan`: floorplan.yaml and the picture that it names."""
+"""`ground_station.map.floorplan`: floorplan.yaml and the picture that it names."""
 
 from __future__ import annotations
 
 from pieces import Picker, refusing, scratch, stretch
 
 from ground_station.errors import InputError
-from ground_station.mapping.floorplan import load_floorplan
+from ground_station.map.floorplan import load_floorplan
 from readers.image import png
 
 _FOLDER = scratch("floorplan")

@@ -10,7 +10,8 @@ import two_images
 from pieces import Picker, blocks, refusing, scratch, stretch
 
 from ground_station.errors import MapError
-from ground_station.mapping.sfm import colmap, foreign
+from ground_station.map import colmap
+from ground_station.mapping.sfm import foreign
 
 _FOLDER = scratch("foreign") / "model"
 _SPARE = scratch("foreign-seed")

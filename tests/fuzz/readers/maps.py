@@ -1,4 +1,4 @@
-"""`ground_station.mapping.store`: a map's folder."""
+"""`ground_station.map.store`: a map's folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pieces import Picker, blocks, refusing, scratch, stretch
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import store
+from ground_station.map import store
 from readers import safetensors_file
 from readers.safetensors_file import array
 

@@ -1,4 +1,4 @@
-"""`ground_station.mapping.refinement.observations`: what a flight saw, for the map's refinement."""
+"""`ground_station.map.observations`: what a flight saw, for the map's refinement."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pieces import Picker, refusing, scratch
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.refinement.observations import FORMAT, KIND, load_observations
+from ground_station.map.observations import FORMAT, KIND, load_observations
 from readers import safetensors_file
 from readers.safetensors_file import array
 

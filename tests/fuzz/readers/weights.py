@@ -1,4 +1,4 @@
-"""`ground_station.features.importing`: files of torch.save and safetensors, and what they become.
+"""`ground_station.feature_models`: files of torch.save and safetensors, and what they become.
 
 Nothing in a file is executed: the only functions that a pickle reaches are the reader's own.
 """
@@ -12,8 +12,8 @@ import torch_files as made
 from pieces import Picker, blocks, refusing, scratch, stretch
 from safetensors.numpy import save
 
-from ground_station.features.importing import alike, superpoint, torch_file
-from ground_station.features.importing.weights import WeightsError
+from ground_station.feature_models import alike, superpoint, torch_file
+from ground_station.feature_models.weights import WeightsError
 from readers import safetensors_file
 from readers.safetensors_file import array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from contextlib import AbstractContextManager
 
-from ground_station.service.cases.outcome import Outage
+from ground_station.replay.cases.outcome import Outage
 
 
 class LoopbackLink:

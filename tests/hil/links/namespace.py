@@ -23,9 +23,9 @@ from links.proxy import told
 
 from ground_station.errors import GroundStationError
 from ground_station.keys.authority import Authority
-from ground_station.service.cases.case import Link
-from ground_station.service.cases.outcome import Outage
-from ground_station.service.stand import LOOPBACK, Stand
+from ground_station.replay.cases.case import Link
+from ground_station.replay.cases.outcome import Outage
+from ground_station.replay.stand import LOOPBACK, Stand
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener

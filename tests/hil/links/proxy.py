@@ -9,8 +9,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ground_station.service.cases.case import Link
-from ground_station.service.cases.outcome import Outage
+from ground_station.replay.cases.case import Link
+from ground_station.replay.cases.outcome import Outage
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "faults"))
 

@@ -21,7 +21,7 @@ from payloads.ssh import SshPayload
 from payloads.target import Target
 
 from ground_station.errors import InputError
-from ground_station.service.stand import Stand
+from ground_station.replay.stand import Stand
 
 HIL = Path(__file__).resolve().parents[1]
 CHECKOUT = HIL.parents[1]

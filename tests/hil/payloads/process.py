@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from ground_station.service.stand import LOOPBACK, Running, Stand
+from ground_station.replay.stand import LOOPBACK, Running, Stand
 
 
 class ProcessPayload:

@@ -20,7 +20,7 @@ from typing import Any
 from payloads.distant import Flight
 from payloads.target import SshError, Target, parsed, reason
 
-from ground_station.service.stand import Stand
+from ground_station.replay.stand import Stand
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener

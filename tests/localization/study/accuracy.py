@@ -29,7 +29,7 @@ from study.row import Line, Row, Study, seeds, start_from_truth, thesis, ungated
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
-from ground_station.mapping.store import Map, load
+from ground_station.map.store import Map, load
 from ground_station.recording.frames import Frame
 from ground_station.recording.open import open_input
 

@@ -20,7 +20,7 @@ from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 from ground_station.recording.flight import trajectory_of
 from ground_station.recording.frames import Frame
 from ground_station.recording.open import open_input, parse_range

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from ground_station.mapping.store import Keyframes, Landmarks, Map
+from ground_station.map.store import Keyframes, Landmarks, Map
 
 
 def grown(map_: Map, times: int) -> Map:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from ground_station.features.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 
 Array = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from study.feeding import Feed, Flight, Run, close, feed, load_flight, make_loca
 
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings, load_preset
-from ground_station.mapping.store import Map
+from ground_station.map.store import Map
 from ground_station.recording.frames import Frame
 
 

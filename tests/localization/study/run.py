@@ -27,11 +27,11 @@ from study.feeding import feed, feed_paced
 from study.growing import grown
 from study.row import Line, Row, Study
 
+from ground_station.bench.steps import machine
 from ground_station.errors import GroundStationError
 from ground_station.files import write_json
-from ground_station.localization.bench import machine
 from ground_station.localization.settings import LocalizerSettings, load_preset
-from ground_station.mapping.store import load
+from ground_station.map.store import load
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import BlimpError
 

@@ -18,10 +18,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from conftest import SceneExtractor, make_scene
+from built_scene import SceneExtractor, make_scene
 
 from ground_station.features import extractors
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.construction import build, cache, verification
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress

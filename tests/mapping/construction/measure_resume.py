@@ -27,7 +27,7 @@ import numpy as np
 
 from ground_station.files import write_json
 from ground_station.geometry.alignment import align
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -35,15 +35,17 @@ from ground_station.files import write_json
 from ground_station.geometry.alignment import align
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory, read_tum
+from ground_station.map import colmap
+from ground_station.map.table import print_table
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import MappingSettings, load_settings
-from ground_station.mapping.sfm import colmap, global_mapping
+from ground_station.mapping.sfm import global_mapping
+from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted, pipeline_options
-from ground_station.mapping.table import print_table
 from ground_station.progress import Progress
 from ground_station.recording.flight import trajectory_of
 from ground_station.recording.open import open_input, parse_range
@@ -147,7 +149,7 @@ def methods(images: Images, pairs: Any, camera: Camera, truth: Trajectory, seed:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         database = work / "database.db"
-        colmap.write_database(database, camera, images.names, images.pinhole_px, pairs)
+        write_database(database, camera, images.names, images.pinhole_px, pairs)
         solvers: dict[str, Callable[[], Any]] = {
             "incremental": lambda: Incremental(database, work / "i", wanted, lambda: None).run(),
             "global": lambda: global_mapping.reconstruct(database, work / "g", wanted),
@@ -232,7 +234,7 @@ def corridor(flights: Path, with_methods: bool, seed: int) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         database = work / "database.db"
-        colmap.write_database(database, camera, images.names, images.pinhole_px, pairs)
+        write_database(database, camera, images.names, images.pinhole_px, pairs)
         wanted = Wanted(settings.seed, THREADS, 1.5, len(images.names))
         timing: Row = {}
         with timed(timing, "sfm"):

@@ -15,9 +15,8 @@ from ground_station.errors import InputError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.geometry.camera import Camera
-from ground_station.mapping import store
+from ground_station.map import colmap, store
 from ground_station.mapping.construction import build
-from ground_station.mapping.sfm import colmap
 from ground_station.recording.frames import Frame
 
 pycolmap = colmap.pycolmap

@@ -12,11 +12,13 @@ from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.map import colmap
+from ground_station.map.model import Model
 from ground_station.mapping.construction import lens
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.lens_adjustment import PARAMETERS, adjust, vector
 from ground_station.mapping.construction.lens_prior import LensPrior
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import adjustment
 
 NOISE_PX = 0.3
 NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -39,7 +41,7 @@ def _flight(turns: bool, seed: int, images: int = 24, points: int = 500):
     return poses.pose(rotation, centres), xyz
 
 
-def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, colmap.Model]:
+def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
     """What the camera sees as a build has it: noisy key points, and the model they belong to."""
     rng = np.random.default_rng(seed)
     image, feature, point, features = [], [], [], []
@@ -61,7 +63,7 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, colmap.Model]:
         point.append(seen)
     often = np.bincount(np.concatenate(point), minlength=len(xyz)) > 2
     new, keep = np.cumsum(often) - 1, often[np.concatenate(point)]
-    model = colmap.Model(
+    model = Model(
         names=[f"frame-{k:06d}" for k in range(len(wTc))],
         image_id=np.arange(len(wTc)) + 1,
         wTc=wTc,
@@ -78,7 +80,7 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, colmap.Model]:
     return Images(names, time_ns, features, [f.keypoints_px.astype(float) for f in features]), model
 
 
-def _adjusted_with(camera: Camera, images: Images, model: colmap.Model) -> colmap.Model:
+def _adjusted_with(camera: Camera, images: Images, model: Model) -> Model:
     """The model as a build makes it with that camera held: poses and points bent by its errors."""
     undistorted = lens.with_lens(images, camera)
     pixels = np.empty((len(model.image), 2))
@@ -87,7 +89,7 @@ def _adjusted_with(camera: Camera, images: Images, model: colmap.Model) -> colma
         pixels[rows] = undistorted.pinhole_px[k][model.feature[rows]]
     model = replace(model, pixel_px=pixels)
     reconstruction = colmap.from_arrays(model, camera)
-    colmap.adjust(reconstruction, loss_px=1.0, threads=1)
+    adjustment.adjust(reconstruction, loss_px=1.0, threads=1)
     wTc, position = colmap.positions(reconstruction, model)
     return replace(model, wTc=wTc, position=position)
 
@@ -192,7 +194,7 @@ def test_a_lens_of_another_model_is_refused_by_name_where_nobody_calibrated_it()
     assert not calibration.go_on(model, images) and calibration.camera == other
 
 
-def _described(images: Images, model: colmap.Model) -> Images:
+def _described(images: Images, model: Model) -> Images:
     """The images with descriptors by which their key points are matched."""
     descriptor = np.random.default_rng(0).normal(size=(len(model.position), 32))
     descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)

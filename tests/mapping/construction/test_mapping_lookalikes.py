@@ -9,13 +9,14 @@ import corridor_geometry as geometry
 import numpy as np
 import pytest
 
+from ground_station.map import colmap
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import sequences
 from ground_station.mapping.construction.placing import chains, lookalikes, loops
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
 
 SETTINGS = MappingSettings(threads=1)
@@ -45,7 +46,7 @@ def judged(corridor, work) -> structure.Structure:
 
 def _plain(corridor, pairs, work) -> colmap.Reconstruction:
     images, database = corridor.images, work / "database.db"
-    colmap.write_database(database, corridor.camera, images.names, images.pinhole_px, pairs)
+    write_database(database, corridor.camera, images.names, images.pinhole_px, pairs)
     models = Incremental(database, work, Wanted(0, 1, 1.5, len(images.names)), lambda: None).run()
     return max(models, key=lambda model: model.num_reg_images())
 

@@ -10,13 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.alignment import Alignment
-from ground_station.mapping import landmarks
+from ground_station.map import colmap, landmarks
+from ground_station.map.model import Model
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.placing import loops, merging
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
 
 PINHOLE = np.array([500.0, 500.0, 320.0, 240.0])
 LANDMARKS = 120
@@ -135,7 +135,7 @@ def test_models_without_a_pair_between_them_are_reported_by_name(corridor, tmp_p
 def test_ranges_of_names_are_few(corridor, tmp_path):
     names = [f"{k}.png" for k in range(12)]
     model = colmap.from_arrays(
-        colmap.Model(
+        Model(
             names[::2], np.arange(1, 13, 2), np.tile(np.eye(4), (6, 1, 1)), np.empty(0, np.int64),
             np.empty((0, 3)), *[np.empty(0, np.int64)] * 3, np.empty((0, 2)), PINHOLE,
         ),

@@ -8,9 +8,10 @@ import corridor_geometry as geometry
 import numpy as np
 import pytest
 
+from ground_station.map import colmap
 from ground_station.mapping.construction import structure
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap, global_mapping
+from ground_station.mapping.sfm import global_mapping
 from ground_station.mapping.sfm.incremental import Incremental
 
 SHIPPED = MappingSettings()

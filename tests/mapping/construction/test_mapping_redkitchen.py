@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground_station.commands import maps
 from ground_station.geometry.alignment import align
 from ground_station.geometry.trajectory import read_tum
-from ground_station.mapping import command, store
+from ground_station.map import store
 
 DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"
 
@@ -20,8 +21,8 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/redkit
 
 def _run(*words: object) -> int:
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return command.run(parser.parse_args([str(word) for word in words]))
+    maps.add_arguments(parser)
+    return maps.run(parser.parse_args([str(word) for word in words]))
 
 
 @needs_data

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ground_station.geometry.alignment import align
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.construction import build, work
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.workers import under_way

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ground_station.geometry.camera import Camera
+from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 from ground_station.mapping.construction.verdict import next_step, verdict
-from ground_station.mapping.store import Keyframes, Landmarks, Map, MapInfo
 
 EVERY = [f"{k:04d}.jpg" for k in range(40)]
 

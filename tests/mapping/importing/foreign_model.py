@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ground_station.geometry import poses
-from ground_station.mapping.sfm.colmap import pycolmap
+from ground_station.map.colmap import pycolmap
 
 
 def colmap_camera(camera, model="OPENCV", number=1):

@@ -11,9 +11,9 @@ from foreign_model import colmap_camera, foreign_model, image_name, write
 
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.map.colmap import pycolmap
+from ground_station.map.colmap_files import PARAMETERS, CameraEntry
 from ground_station.mapping.sfm import foreign
-from ground_station.mapping.sfm.colmap import pycolmap
-from ground_station.mapping.sfm.colmap_files import PARAMETERS, CameraEntry
 
 KINDS = ("binary", "text")
 

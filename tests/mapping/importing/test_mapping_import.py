@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from foreign_model import foreign_model, image_name, write, write_pictures
 
+from ground_station.commands import maps
 from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
 from ground_station.geometry import poses
@@ -17,17 +18,17 @@ from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
-from ground_station.mapping import command, store
+from ground_station.map import colmap, store
 from ground_station.mapping.importing.build import import_model
 from ground_station.mapping.importing.matching import covisible_pairs
 from ground_station.mapping.importing.pictures import open_pictures, taken_by
-from ground_station.mapping.sfm import colmap, foreign
+from ground_station.mapping.sfm import foreign
 
 
 def run(*words: object) -> int:
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return command.run(parser.parse_args([str(word) for word in words]))
+    maps.add_arguments(parser)
+    return maps.run(parser.parse_args([str(word) for word in words]))
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,12 @@ from refining import ROOT, SETTINGS, _along, _localized
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
-from ground_station.mapping import folder, landmarks, store
-from ground_station.mapping.refinement.observations import (
-    save_observations,
-)
+from ground_station.map import colmap, folder, landmarks, store
+from ground_station.map.observations import save_observations
+from ground_station.map.refined import Refined
 from ground_station.mapping.refinement.refine import refine_map
-from ground_station.mapping.refinement.refined import Refined
 from ground_station.mapping.settings import RefineSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import adjustment
 
 
 def test_a_flight_makes_landmarks_and_poses_better(world):
@@ -196,7 +194,7 @@ def test_ctrl_c_leaves_the_old_map_whole(world, monkeypatch):
             raise KeyboardInterrupt
         return False
 
-    monkeypatch.setattr(colmap, "adjust", adjust)
+    monkeypatch.setattr(adjustment, "adjust", adjust)
     with pytest.raises(KeyboardInterrupt):
         refine_map(world.folder, [world.flight()], SETTINGS)
     assert {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()} == old

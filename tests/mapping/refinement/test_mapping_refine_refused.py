@@ -11,12 +11,8 @@ from refining import SETTINGS
 
 from ground_station.errors import MapError
 from ground_station.geometry import poses
-from ground_station.mapping import store
-from ground_station.mapping.refinement.observations import (
-    landmarks_sha256,
-    load_observations,
-    save_observations,
-)
+from ground_station.map import store
+from ground_station.map.observations import landmarks_sha256, load_observations, save_observations
 from ground_station.mapping.refinement.refine import refine_map
 
 

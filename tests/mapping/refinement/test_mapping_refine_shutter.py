@@ -8,11 +8,11 @@ import numpy as np
 from refining import SETTINGS, _along, _seen, _to_and_fro
 
 from ground_station.geometry import poses
-from ground_station.mapping import store
+from ground_station.map import store
+from ground_station.map.refined import Refined
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.refinement.chosen import choose_frames, thin
 from ground_station.mapping.refinement.refine import refine_map
-from ground_station.mapping.refinement.refined import Refined
 from ground_station.mapping.settings import RefineSettings
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ground_station.map.store import Map
 from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.sights import Sights
-from ground_station.mapping.store import Map
 
 NOISE_M = 0.05
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import BlimpError
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory, write_tum
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration import command
 from ground_station.mapping.registration.from_trajectory import by_trajectory
 from ground_station.recording.flight import trajectory_of

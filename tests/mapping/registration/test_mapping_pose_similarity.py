@@ -13,7 +13,7 @@ from ground_station.errors import BlimpError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory, read_tum
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration import pose_similarity
 from ground_station.mapping.registration.from_trajectory import by_trajectory
 

@@ -11,9 +11,9 @@ import pytest
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import landmarks, store
+from ground_station.map import colmap, landmarks, store
+from ground_station.map.model import Model
 from ground_station.mapping.registration import register, sights
-from ground_station.mapping.sfm import colmap
 
 pycolmap = colmap.pycolmap
 
@@ -227,7 +227,7 @@ def test_triangulation_scatters_as_its_covariance_says(built):
     predicted = np.linalg.inv(np.einsum("ski,skj->ij", J, J))
     ratio = np.linalg.eigvals(np.linalg.solve(predicted, scatter)).real
     assert (ratio > 0.6).all() and (ratio < 1.6).all()
-    model = colmap.Model(
+    model = Model(
         names=[str(k) for k in range(6)],
         image_id=np.arange(6) + 1,
         wTc=T,

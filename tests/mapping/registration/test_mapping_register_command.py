@@ -19,7 +19,7 @@ import pytest
 
 from ground_station.errors import MapError
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration import command
 
 ROOT = Path(__file__).parents[3]

@@ -10,7 +10,7 @@ import pytest
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration.distances import COLUMNS, measure_scale, read_distances
 from ground_station.mapping.registration.register import register_map
 

@@ -21,7 +21,7 @@ import uvicorn
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import align
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration.page import serve as pages
 from ground_station.mapping.registration.page.desk import Desk
 from ground_station.mapping.registration.picks import read_picks

@@ -10,7 +10,7 @@ import pytest
 from known_places import HALL_M, hall, in_map, similarity
 
 from ground_station.errors import InputError, MapError
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration import picks as files
 from ground_station.mapping.registration import plan, upright
 from ground_station.mapping.registration.from_picks import by_picks

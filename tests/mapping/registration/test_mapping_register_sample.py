@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from surveyed_points import NOISE_M, far_apart, only, six_points
 
-from ground_station.mapping import store
+from ground_station.map import store
+from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.register import transform_map
 from ground_station.mapping.registration.sights import read_pairs
-from ground_station.mapping.registration.uncertainty import describe
 from ground_station.recording.flight import trajectory_of
 
 SAMPLE = Path(__file__).parents[3] / "maps" / "atrium"

@@ -16,7 +16,7 @@ from refining import look_at
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration import command, tags
 from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.tags import FAMILIES, find_tags, read_tags

@@ -15,7 +15,7 @@ import pytest
 from test_mapping_register_page import Page, Stand, eventually
 
 from ground_station.errors import MapError
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration.page.clusters import anchors_at, offer_at
 from ground_station.mapping.registration.plan import Plan, PlanScale, load_plan
 from ground_station.mapping.registration.walls import fit_walls

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment, align
+from ground_station.map.uncertainty import Uncertainty, describe, region
 from ground_station.mapping.registration.adjustment import Upright, adjust
 from ground_station.mapping.registration.similarity import robust_similarity
-from ground_station.mapping.registration.uncertainty import Uncertainty, describe, region
 
 NOISE_M = 0.05
 DRAWS = 500

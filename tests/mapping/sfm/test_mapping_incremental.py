@@ -14,7 +14,9 @@ import pytest
 import two_images
 
 from ground_station.errors import MapError
-from ground_station.mapping.sfm import colmap
+from ground_station.map import colmap
+from ground_station.map.model import Model
+from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
 from ground_station.mapping.sfm.snapshots import Snapshots
 
@@ -43,12 +45,12 @@ def database(tmp_path_factory) -> Path:
     corridor = geometry.make_corridor(frames=FRAMES, bays=3, own=110, alike=0)
     path = tmp_path_factory.mktemp("database") / "database.db"
     images = corridor.images
-    colmap.write_database(path, corridor.camera, images.names, images.pinhole_px, corridor.pairs)
+    write_database(path, corridor.camera, images.names, images.pinhole_px, corridor.pairs)
     assert [entry.name for entry in path.parent.iterdir()] == ["database.db"]
     return path
 
 
-def _run(database: Path, work: Path, counted: list[int] | None = None) -> colmap.Model:
+def _run(database: Path, work: Path, counted: list[int] | None = None) -> Model:
     steps: list[int] = [] if counted is None else counted
     wanted = Wanted(0, 1, 1.5, FRAMES)
     (model,) = Incremental(database, work, wanted, lambda: steps.append(1)).run()
@@ -56,7 +58,7 @@ def _run(database: Path, work: Path, counted: list[int] | None = None) -> colmap
 
 
 @pytest.fixture(scope="module")
-def whole(database, tmp_path_factory) -> colmap.Model:
+def whole(database, tmp_path_factory) -> Model:
     return _run(database, tmp_path_factory.mktemp("whole"))
 
 
@@ -85,7 +87,7 @@ def left(killed, tmp_path) -> Path:
     return Path(shutil.copytree(killed, tmp_path / "work"))
 
 
-def _same(one: colmap.Model, other: colmap.Model) -> None:
+def _same(one: Model, other: Model) -> None:
     assert one.names == other.names
     assert np.abs(one.wTc - other.wTc).max() < 1e-6
     assert len(one.point_id) == len(other.point_id)

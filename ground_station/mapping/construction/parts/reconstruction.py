@@ -8,6 +8,7 @@ from typing import Any
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.map import colmap
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.feature_file import Lazily
 from ground_station.mapping.construction.images import Images
@@ -17,7 +18,7 @@ from ground_station.mapping.construction.parts import cutting, joining, solving,
 from ground_station.mapping.construction.structure import Structure
 from ground_station.mapping.construction.workers import Workers
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import adjustment
 from ground_station.progress import Progress
 
 _TOLERANCE = 1e-6
@@ -98,7 +99,7 @@ def _joined(
     pixels = [images.pinhole_px[k] for k in (model.image_id - 1).tolist()]
     notes = [f"structure from motion in {len(parts)} parts, {len(members)} of them joined"]
     reconstruction = colmap.from_arrays(model, camera, keypoints_px=pixels)
-    colmap.adjust(
+    adjustment.adjust(
         reconstruction, loss_px=settings.sfm.loss_px, threads=threads, tolerance=_TOLERANCE
     )
     for part, core, _ in inside:

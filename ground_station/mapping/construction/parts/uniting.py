@@ -11,11 +11,11 @@ from scipy.sparse.csgraph import connected_components
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
+from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.solving import Solved
-from ground_station.mapping.sfm.colmap import Model
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from ground_station.errors import GeometryError
 from ground_station.geometry.alignment import Alignment, align
+from ground_station.map import colmap
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.placed import Placed
-from ground_station.mapping.sfm import colmap
+from ground_station.mapping.sfm import robust_similarity
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -110,7 +111,7 @@ def _similarity(x: F64, y: F64, within: float, seed: int) -> tuple[Alignment | N
     nothing = np.zeros(len(x), dtype=bool)
     if len(x) < _FEWEST:
         return None, nothing
-    found = colmap.similarity(x, y, within, seed)
+    found = robust_similarity.similarity(x, y, within, seed)
     if found is None:
         return None, nothing
     fits = np.linalg.norm(found.apply(x) - y, axis=1) <= within

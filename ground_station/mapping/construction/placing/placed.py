@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
+from ground_station.map.model import Model
 from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
-from ground_station.mapping.sfm.colmap import Model
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

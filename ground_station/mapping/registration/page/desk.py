@@ -13,6 +13,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from ground_station.errors import MapError
+from ground_station.map.store import Map
+from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration import picks as files
 from ground_station.mapping.registration import upright as vertical
 from ground_station.mapping.registration.distances import Distances
@@ -22,9 +24,7 @@ from ground_station.mapping.registration.picks import Pick, Picks, check_picks
 from ground_station.mapping.registration.plan import Plan, keep_plan
 from ground_station.mapping.registration.register import find_similarity, register_map
 from ground_station.mapping.registration.registration import Registration
-from ground_station.mapping.registration.uncertainty import describe
 from ground_station.mapping.registration.walls import WallFit, fit_walls
-from ground_station.mapping.store import Map
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.text import printable
 

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from ground_station.errors import MapError
-from ground_station.mapping import store
+from ground_station.map import store
 from ground_station.mapping.registration.distances import Distances
 from ground_station.mapping.registration.page.desk import Desk
 from ground_station.mapping.registration.plan import load_plan

@@ -1,0 +1,56 @@
+"""`blimp bench`: what each step costs; one module for each of its commands."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+
+_COMMANDS = (
+    # name, module, help, description
+    (
+        "localize",
+        "ground_station.bench.localize",
+        "association, pose, whole frames and growth with the map",
+        "Measures the localizer against the preset 'thesis' and plain methods.",
+    ),
+    (
+        "payload",
+        "ground_station.bench.payload",
+        "start, latency, memory and instructions a frame of the firmware",
+        "Measures the payload's own program on this machine, streaming its test picture.",
+    ),
+    (
+        "features",
+        "ground_station.bench.features.command",
+        "extractors on known homographies, real poses and simulated flights",
+        "Measures all extractors: how often points are found again and matched, errors, time.",
+    ),
+    (
+        "map",
+        "ground_station.bench.maps.command",
+        "size against accuracy: fewer landmarks, shorter descriptors; many images",
+        "Measures what a map loses when 'blimp map compress' makes it smaller, or, with --campus, "
+        "what builds of many images cost.",
+    ),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the commands and their arguments."""
+    commands = parser.add_subparsers(dest="bench", required=True, metavar="WHAT")
+    for name, module, help_text, description in _COMMANDS:
+        measured = importlib.import_module(module)
+        sub = commands.add_parser(
+            name,
+            help=help_text,
+            description=description,
+            epilog=measured.EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        measured.add_arguments(sub)
+        sub.set_defaults(bench_module=module)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measures, prints the tables; raises `BlimpError` for a value out of range."""
+    return int(importlib.import_module(args.bench_module).run(args))

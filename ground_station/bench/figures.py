@@ -1,0 +1,234 @@
+"""The payload's figures: start, latency, memory and instructions a frame of the real program."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ground_station.bench import callgrind as callgrind
+from ground_station.bench.flight import RATE_HZ, Flight, FlightError, Ground, fly, picture
+
+KEPT = Path(__file__).with_name("kept.toml")
+"""Instructions a frame that were measured when the payload was last found good."""
+
+SENT = "all sent"
+_SEND_ALL = ("gate.enabled=false",)  # it measures all the same; the test picture moves too slowly
+_VARIANTS: dict[str, tuple[str, bool, tuple[str, ...]]] = {
+    # name: test picture, telemetry, settings
+    SENT: ("zone-plate", True, _SEND_ALL),
+    "no telemetry": ("zone-plate", False, _SEND_ALL),
+    "gate on": ("zone-plate", True, ()),
+    "all gated": ("black", True, ()),
+}
+# By default one thread can keep the others waiting until its queue to them is full.
+_VALGRIND = ("valgrind", "-q", "--tool=callgrind", "--fair-sched=yes")
+_WARM_UP_FRAMES = 30
+_START_LIMIT_S = 60.0
+_LIMIT_MB = 120.0
+_IMPORT = re.compile(r"import time: +(\d+) \| +\d+ \| +(\S+)")
+_STATUS = re.compile(r"(VmHWM|VmRSS):\s+(\d+) kB")
+_MAPPING = re.compile(r"[0-9a-f]+-[0-9a-f]+ \S+ \S+ \S+ \d+ *(.*)")
+
+
+def start(repetitions: int) -> dict[str, Any]:
+    """Times from exec on, medians: Python alone, all built, first access unit at the port.
+
+    Then the modules whose own import takes longest, by Python's `-X importtime` in one more run,
+    which makes imports somewhat slower.
+    """
+    python_s: list[float] = []
+    ready_s: list[float] = []
+    first_s: list[float] = []
+    with Ground(telemetry=False) as ground:
+        for _ in range(repetitions):
+            begin_ns = time.monotonic_ns()
+            subprocess.run([sys.executable, "-c", "pass"], check=True)
+            python_s.append(1e-9 * (time.monotonic_ns() - begin_ns))
+            ground.arrivals.clear()
+            with fly(ground, [picture(10 / RATE_HZ)]) as flight:
+                first_ns = _first_arrival_ns(ground, flight)
+                flight.end()
+            ready_s.append(1e-9 * (flight.ready_ns - flight.begin_ns))
+            first_s.append(1e-9 * (first_ns - flight.begin_ns))
+    with Ground() as ground, fly(ground, [picture(0.1)], python=("-X", "importtime")) as flight:
+        flight.end()
+    modules, packages = imports(flight.errors)
+    return {
+        "repetitions": repetitions,
+        "python_s": float(np.median(python_s)),
+        "ready_s": float(np.median(ready_s)),
+        "first_access_unit_s": float(np.median(first_s)),
+        "import_s": sum(packages.values()),
+        "packages_s": _largest(packages),
+        "modules_s": _largest(modules),
+    }
+
+
+def imports(text: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Own import times, s, by module and by top-level package, from `-X importtime`."""
+    modules: dict[str, float] = defaultdict(float)
+    packages: dict[str, float] = defaultdict(float)
+    for micros, name in _IMPORT.findall(text):
+        top = name.partition(".")[0]
+        standard = top in sys.stdlib_module_names
+        modules[name] += int(micros) / 1e6
+        packages["the standard library" if standard else top] += int(micros) / 1e6
+    return modules, packages
+
+
+def stream(seconds: float) -> dict[str, Any]:
+    """Latency and memory of `seconds` at `RATE_HZ`, telemetry connected.
+
+    Latency is from a picture's capture to the arrival of its last packet at a socket here; the test
+    picture is captured when it leaves its source. Processor time is of all threads.
+    """
+    with Ground() as ground, fly(ground, [picture(seconds + _START_LIMIT_S), *_SEND_ALL]) as flight:
+        first_ns = _first_arrival_ns(ground, flight)
+        used_s = _processor_s(flight.process.pid)
+        count = len(ground.arrivals)
+        while time.monotonic_ns() - first_ns < seconds * 1e9 and flight.process.poll() is None:
+            time.sleep(0.05)
+        arrivals = ground.arrivals[count:]
+        used_s = _processor_s(flight.process.pid) - used_s
+        memory = _memory_mb(flight.process.pid)
+        flight.end(by_signal=True)
+    latencies_ms = [1e-6 * (a.wall_ns - a.info.clock_ns) for a in arrivals if a.info]
+    if not latencies_ms:
+        raise FlightError(f"no frame came within {seconds:g} s")
+    captured, gated, sent = flight.counters()
+    return {
+        "seconds": seconds,
+        "frames": {"captured": captured, "gated": gated, "sent": sent},
+        "received": len(ground.arrivals),
+        "latency_ms": {
+            "p50": float(np.percentile(latencies_ms, 50)),
+            "p99": float(np.percentile(latencies_ms, 99)),
+            "max": max(latencies_ms),
+        },
+        "processor_ms": 1e3 * used_s / len(arrivals),
+        **memory,
+    }
+
+
+def instructions(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Instructions a captured frame, by object, of each variant; empty without valgrind.
+
+    Each variant flies twice, once for `frames` longer, and the difference counts: the start and the
+    first frames cancel. The test picture waits for a slow program, so that none is dropped; raises
+    `FlightError` if one was. What goes by the clock and not by the frame is counted at the pace of
+    valgrind, whose longer flight took `seconds`.
+    """
+    if shutil.which("valgrind") is None:
+        return {}
+    result: dict[str, Any] = {}
+    for name, (pattern, telemetry, settings) in _VARIANTS.items():
+        progress(f"instructions: {name}")
+        flown = (pattern, telemetry, settings)
+        short = _profile(_WARM_UP_FRAMES, *flown)
+        long = _profile(_WARM_UP_FRAMES + frames, *flown)
+        groups = {key: (long.groups[key] - short.groups[key]) / frames for key in long.groups}
+        result[name] = {
+            "groups": groups,
+            "total": sum(groups.values()),
+            "sent": long.sent,
+            "messages": long.messages,
+            "seconds": long.seconds,
+        }
+    return result
+
+
+def payload_alone(groups: dict[str, float]) -> float:
+    """Instructions without x264 and the test picture, which no payload with a camera executes."""
+    return sum(groups.values()) - groups.get("x264", 0.0) - groups.get("test picture", 0.0)
+
+
+def kept() -> dict[str, float]:
+    """The figures kept, by group."""
+    return dict(tomllib.loads(KEPT.read_text(encoding="utf-8"))["instructions"])
+
+
+class _Profile(NamedTuple):
+    groups: dict[str, float]
+    seconds: float
+    sent: int
+    messages: int
+
+
+def _profile(frames: int, pattern: str, telemetry: bool, settings: Sequence[str]) -> _Profile:
+    with tempfile.TemporaryDirectory() as folder, Ground(telemetry=telemetry) as ground:
+        out = Path(folder, "callgrind.out")
+        before = (*_VALGRIND, f"--callgrind-out-file={out}")
+        # A Pi Zero's one core gives BLAS no second thread, and one that waits would be counted.
+        blas = {"OPENBLAS_NUM_THREADS": "1"}
+        flown = [picture(frames / RATE_HZ, pattern), *settings]
+        with fly(ground, flown, before=before, environment=blas) as flight:
+            flight.end()
+            ended_ns = time.monotonic_ns()
+        captured, gated, sent = flight.counters()
+        if captured != frames or gated + sent != captured:
+            raise FlightError(
+                f"of {frames} frames under valgrind {captured} were captured, {gated} gated and"
+                f" {sent} sent; each must be gated or sent"
+            )
+        seconds = 1e-9 * (ended_ns - flight.begin_ns)
+        groups = callgrind.by_group(callgrind.read(out))
+        return _Profile(groups, seconds, sent, ground.messages)
+
+
+def _first_arrival_ns(ground: Ground, flight: Flight) -> int:
+    until_ns = flight.begin_ns + int(_START_LIMIT_S * 1e9)
+    while not ground.arrivals:
+        if flight.process.poll() is not None:
+            flight.end()
+            if not ground.arrivals:
+                raise FlightError("the firmware ended without a frame")
+        if time.monotonic_ns() > until_ns:
+            raise FlightError(f"no frame came within {_START_LIMIT_S:g} s")
+        time.sleep(0.005)
+    return ground.arrivals[0].monotonic_ns
+
+
+def _processor_s(process: int) -> float:
+    """User and system time of a process so far."""
+    schedstat = _proc(process, "stat").rpartition(")")[2].split()
+    return (int(schedstat[11]) + int(schedstat[12])) / 100.0
+
+
+def _memory_mb(process: int) -> dict[str, Any]:
+    """What is resident, at most and now, and the mappings that most of it lies in, MB of 10^6."""
+    status = {name: int(kb) * 1.024e-3 for name, kb in _STATUS.findall(_proc(process, "status"))}
+    mappings: Counter[str] = Counter()
+    name = ""
+    for line in _proc(process, "smaps").splitlines():
+        if match := _MAPPING.fullmatch(line):
+            name = match[1].rpartition("/")[2] or "anonymous"
+        elif line.startswith("Rss:"):
+            mappings[name] += int(line.split()[1])
+    return {
+        "peak_mb": status["VmHWM"],
+        "resident_mb": status["VmRSS"],
+        "limit_mb": _LIMIT_MB,
+        "mappings_mb": _largest({key: 1.024e-3 * kb for key, kb in mappings.items()}),
+    }
+
+
+def _largest(values: dict[str, float]) -> dict[str, float]:
+    return dict(sorted(values.items(), key=lambda item: -item[1])[:8])
+
+
+def _proc(process: int, name: str) -> str:
+    try:
+        return Path(f"/proc/{process}/{name}").read_text()
+    except OSError:
+        raise FlightError("the firmware ended while it was measured") from None

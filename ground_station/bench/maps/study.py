@@ -1,0 +1,221 @@
+"""Features on sets of pictures with true poses: our build and COLMAP's own on the same images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ground_station.bench.maps.folds import is_silent_fold, judge, said
+from ground_station.errors import BlimpError, InputError
+from ground_station.geometry.camera import Camera, load_camera
+from ground_station.geometry.trajectory import Trajectory, read_tum
+from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.settings import MappingSettings, with_changes
+from ground_station.mapping.sfm import plain
+from ground_station.presentation.text import columns
+from ground_station.progress import Progress
+from ground_station.recording.flight import trajectory_of
+from ground_station.recording.frames import Frame, FrameRange
+from ground_station.recording.open import open_input
+from pi_firmware.wire.recording import TRUTH_TOPIC
+
+SIMULATED: dict[str, dict[str, Any]] = {
+    "atrium": {"scene": "atrium", "plan": "mapping", "rate_hz": 1.0},
+    "office": {"scene": "office", "plan": "mapping", "rate_hz": 1.0},
+    "corridor": {"scene": "corridor", "plan": "corridor", "rate_hz": 1.0},
+    "stills": {"scene": "hall", "plan": "stills", "lens_error": 0.01},
+    "headset": {"scene": "rooms", "plan": "headset", "lens_error": 0.01},
+}
+REAL: dict[str, dict[str, Any]] = {
+    "hallway": {"folder": "hallway", "truth": "truth.txt", "rate_hz": 10.0,
+                "range": FrameRange(0, 91, 2)},
+    "kitchen": {"folder": "redkitchen", "truth": "official_groundtruth.txt", "rate_hz": 30.0,
+                "range": FrameRange(0, 500, 5)},
+}  # fmt: skip
+"""By name: folder in the data, file of the true poses there, and which frames make the map."""
+
+SAME_NS = 5_000_000
+"""A frame is judged by a true pose within this time of its own."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The images of one set, their camera as it is given to a build, and their true poses."""
+
+    name: str
+    simulated: bool
+    frames: list[Frame]
+    camera: Camera
+    truth: Trajectory
+
+
+def gather(name: str, seed: int, real: Path | None, work: Path, images: int | None) -> Pictures:
+    """The set `name`, of at most `images` spread evenly; a simulated one is made once in `work`.
+
+    Raises `InputError` for a real set that is not there.
+    """
+    if name in SIMULATED:
+        path = _recorded(name, seed, work)
+        source = open_input(path)
+        camera, truth = source.camera, trajectory_of(path, TRUTH_TOPIC, [])
+        if camera is None:
+            raise InputError(f"{path}: it carries no camera calibration")
+    else:
+        about = REAL[name]
+        folder = None if real is None else real / about["folder"]
+        if folder is None or not folder.is_dir():
+            raise InputError(f"{name}: left out, no folder '{about['folder']}' in --real")
+        inside = folder / "frames"
+        source = open_input(inside if inside.is_dir() else folder, about["rate_hz"], about["range"])
+        camera, truth = load_camera(folder / "camera.toml"), read_tum(folder / about["truth"])
+    frames = list(source)
+    if images is not None and images < len(frames):
+        frames = [frames[k] for k in np.linspace(0, len(frames) - 1, images).round().astype(int)]
+    return Pictures(name, name in SIMULATED, frames, camera, truth)
+
+
+def _recorded(name: str, seed: int, work: Path) -> Path:
+    from ground_station.simulator.simulate import SimulationSettings, simulate
+
+    path = work / f"{name}-{seed}.mcap"
+    if path.is_file():
+        return path
+    settings = SimulationSettings(out=path, seed=seed, **SIMULATED[name])
+    with Progress(f"simulate {path.name}, frames", None) as progress:
+        if simulate(settings, lambda done, total: progress.step(total)).interrupted:
+            path.unlink()
+            raise KeyboardInterrupt
+    return path
+
+
+def _judged(
+    pictures: Pictures, names: Sequence[str], wTc: np.ndarray[Any, Any], depth: float, seed: int
+) -> dict[str, Any]:
+    """The figures of a model's images that have a true pose."""
+    time_ns = {frame.name: frame.time_ns for frame in pictures.frames}
+    truth = pictures.truth
+    rows, kept, true = [], [], []
+    for k, name in enumerate(names):
+        near = truth.nearest(time_ns[name])
+        if abs(int(truth.time_ns[near]) - time_ns[name]) <= SAME_NS:
+            rows.append(k)
+            kept.append(name)
+            true.append(truth.wTc[near])
+    judged = judge(kept, wTc[rows], np.array(true).reshape(-1, 4, 4), depth, seed)
+    return judged.as_dict() | {"registered": len(names), "judged": len(kept), "of": judged}
+
+
+def ours(pictures: Pictures, settings: MappingSettings, work: Path) -> dict[str, Any]:
+    """Our build's figures; `failed` has the one line where it made no map."""
+    started = time.monotonic()
+    try:
+        map_ = build_map(
+            pictures.frames, pictures.camera, settings, work / "map", total=len(pictures.frames)
+        )
+    except BlimpError as error:
+        return {"failed": str(error), "registered": 0, "seconds": time.monotonic() - started}
+    seconds = time.monotonic() - started
+    kf = map_.keyframes
+    row = _judged(pictures, kf.names, kf.wTc, map_.depth_m, settings.seed)
+    told = said(map_.info.built)
+    silent = is_silent_fold(row.pop("of"), told)
+    models = len(map_.info.built.get("model_sizes", ())) or 1
+    return row | {"models": models, "said": told, "silent_fold": silent, "seconds": seconds}
+
+
+def colmaps(pictures: Pictures, seed: int, threads: int, work: Path) -> dict[str, Any]:
+    """COLMAP's own figures on the same images."""
+    folder = work / "pictures"
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.iterdir():
+        old.unlink()
+    for frame in pictures.frames:
+        cv2.imwrite(str(folder / f"{frame.name}.png"), frame.image)
+    started = time.monotonic()
+    models = plain.reconstruct(folder, pictures.camera, work / "plain", seed, threads)
+    seconds = time.monotonic() - started
+    if not models:
+        return {"failed": "no model", "registered": 0, "seconds": seconds}
+    largest = models[0]
+    names = [name.removesuffix(".png") for name in largest.names]
+    row = _judged(pictures, names, largest.wTc, largest.depth, seed)
+    del row["of"]
+    return row | {"models": len(models), "seconds": seconds}
+
+
+def run(
+    sets: Sequence[str], features: Sequence[str], seeds: Sequence[int], settings: MappingSettings,
+    real: Path | None, work: Path, images: int | None,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """A row a case, printed as it is done; sets that are not there are said and left out."""
+    rows: list[dict[str, Any]] = []
+    for name in sets:
+        for seed in seeds:
+            try:
+                pictures = gather(name, seed, real, work, images)
+            except InputError as error:
+                print(error)
+                break
+            place = work / f"{name}-{seed}"
+            yardstick = colmaps(pictures, seed, settings.threads, place)
+            for feature in features:
+                changed = with_changes(settings, {"features": feature, "seed": seed}, "--features")
+                row: dict[str, Any] = {
+                    "set": name, "seed": seed, "features": feature,
+                    "simulated": pictures.simulated, "images": len(pictures.frames),
+                    "ours": ours(pictures, changed, place / feature), "plain": yardstick,
+                }  # fmt: skip
+                rows.append(row)
+                print(
+                    f"{name}, {feature}, seed {seed}: {row['ours']['registered']} registered,"
+                    f" plain COLMAP {yardstick['registered']}, of {row['images']}", flush=True,
+                )  # fmt: skip
+    return rows
+
+
+_HEAD = (
+    "set", "features", "seed", "images", "registered", "models", "median, cm", "max, cm",
+    "RMSE, cm", "misplaced", "doubts", "parts", "left out", "folded, unsaid", "s",
+)  # fmt: skip
+
+
+def table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Lines: each build beside COLMAP's own of the same images, and the sum that must be 0."""
+    lines = [[*_HEAD]]
+    shown: set[tuple[str, int]] = set()
+    for row in rows:
+        kind = f"{row['set']}{' (simulated)' if row['simulated'] else ''}"
+        start = [str(row["seed"]), str(row["images"])]
+        if (row["set"], row["seed"]) not in shown:
+            shown.add((row["set"], row["seed"]))
+            lines.append([kind, "plain COLMAP", *start, *_cells(row["plain"])])
+        lines.append([kind, row["features"], *start, *_cells(row["ours"])])
+    fewer = sum(row["ours"]["registered"] < row["plain"]["registered"] for row in rows)
+    silent = sum(row["ours"].get("silent_fold", False) for row in rows)
+    return [
+        *columns(lines),
+        "",
+        f"builds with fewer images registered than plain COLMAP: {fewer} of {len(rows)}",
+        f"folded maps that were not said: {silent} of {len(rows)}",
+    ]
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    seconds = f"{row['seconds']:.0f}"
+    if "failed" in row:
+        return ["0", *["-"] * 9, seconds]
+    errors = (
+        "-" if np.isnan(row[key]) else f"{100 * row[key]:.1f}"
+        for key in ("median_m", "max_m", "rmse_m")
+    )
+    told = row.get("said")
+    notes = [str(told[key]) for key in ("doubts", "parts", "left_out")] if told else ["-"] * 3
+    silent = "-" if told is None else "YES" if row["silent_fold"] else "no"
+    return [str(row["registered"]), str(row["models"]), *errors, str(len(row["misplaced"])),
+            *notes, silent, seconds]  # fmt: skip

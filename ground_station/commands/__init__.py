@@ -1,0 +1,1 @@
+"""Commands of `blimp` whose sub-commands come from several rooms."""

@@ -1,0 +1,99 @@
+"""Checks of what runs: the installed service, and the payloads that are heard."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+from ground_station.doctor import ROOT, network, sockets, versions
+from ground_station.doctor.findings import Finding, ok, problem, warning
+from ground_station.service.settings import StationSettings
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware.wire.errors import TelemetryError
+
+UNIT = "blimp-station.service"
+_SYSTEMD = Path("/run/systemd/system")
+_COMMAND_S = 3.0
+_LISTEN_S = 2.0
+
+
+def unit(systemd: Path = _SYSTEMD) -> Finding:
+    """The installed service runs, where it is installed."""
+    if not systemd.is_dir() or shutil.which("systemctl") is None:
+        return ok("service", "systemd does not run here; blimp serve runs without it")
+    names = "LoadState,ActiveState,SubState,NRestarts,UnitFileState"
+    run = subprocess.run(
+        ["systemctl", "show", f"--property={names}", UNIT],
+        capture_output=True,
+        text=True,
+        timeout=_COMMAND_S,
+    )
+    return judge_unit(dict(line.split("=", 1) for line in run.stdout.splitlines() if "=" in line))
+
+
+def judge_unit(state: dict[str, str]) -> Finding:
+    """What systemd's properties of the unit mean."""
+    loaded, active = state.get("LoadState", ""), state.get("ActiveState", "")
+    if loaded in ("", "not-found"):
+        return ok("service", f"{UNIT} is not installed (make install-service)")
+    said = f"{UNIT} is {active} ({state.get('SubState', '?')})"
+    look = f"journalctl -u {UNIT} -n 50; then sudo systemctl restart {UNIT}"
+    restarts = int(state.get("NRestarts") or 0)
+    if loaded != "loaded":
+        return problem("service", f"{UNIT} cannot be loaded ({loaded})", "make install-service")
+    if active == "failed" or state.get("SubState") == "auto-restart":
+        return problem("service", said, look)
+    if active != "active":
+        return warning("service", said, f"sudo systemctl start {UNIT}")
+    if restarts:
+        return warning("service", f"{said}, restarted {restarts} times", look)
+    if state.get("UnitFileState") != "enabled":
+        mend = f"sudo systemctl enable {UNIT}"
+        return warning("service", f"{said}, but not from the next start of the machine", mend)
+    return ok("service", said)
+
+
+def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
+    """Who is heard within 2 s, whether they speak this program's messages, and which version.
+
+    Where a port is held, nobody is asked: the service itself is listening then.
+    """
+    telemetry = settings.telemetry
+    ports = [port for port in network.ports_of(settings) if port.setting == "telemetry.listen"]
+    if any(sockets.refusal(socket.SOCK_STREAM, port.host, port.number) for port in ports):
+        return ok("payloads", "not listened for: the telemetry port is held")
+    try:
+        with TelemetryListener(
+            telemetry.listen, connect=telemetry.connect, certificates=telemetry.certificates
+        ) as listener:
+            time.sleep(listen_s)
+            heard = {name: listener.state(name) for name in listener.payloads()}
+    except TelemetryError as error:
+        return problem("payloads", str(error), "mend telemetry.listen and telemetry.certificates")
+    if not heard:
+        return ok("payloads", f"none within {listen_s:g} s")
+    other = [name for name, state in heard.items() if state is not None and state.refused]
+    if other:
+        found = f"{', '.join(other)}: messages of another version than this station's"
+        return problem("payloads", found, "update payload and ground station to the same release")
+    return judge_payloads(heard, ROOT)
+
+
+def judge_payloads(heard: dict[str, PayloadState | None], root: Path) -> Finding:
+    """The versions of those that are heard, beside the firmware at `root`."""
+    found, mend = [], []
+    for name, state in heard.items():
+        said = f"{name} runs {versions.told(state)}"
+        version = state.health.version if state is not None and state.health is not None else ""
+        if reason := versions.trouble(state):
+            said += f": {reason}"
+            mend.append(f"mend that and update {name} again")
+        if differs := versions.difference(version, root) if version else "":
+            said += f"; {differs}"
+            mend.append(f"make update PAYLOAD={name}, or leave it: both speak the same messages")
+        found.append(said)
+    told = "; ".join(found)
+    return warning("payloads", told, "; ".join(mend)) if mend else ok("payloads", told)

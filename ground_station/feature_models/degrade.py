@@ -1,0 +1,175 @@
+"""What light, lens, sensor and link do to a view: the same place, never the same picture.
+
+In the order in which it happens: light and shadow, defocus and motion, exposure and tone curve,
+noise, compression. Pictures are grey, (H, W), uint8 outside and float32 0..1 in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.feature_models.compression import round_trip
+
+Bytes = npt.NDArray[np.uint8]
+F32 = npt.NDArray[np.float32]
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class Chances:
+    """How often each thing happens to a view; what happens is then of a random strength."""
+
+    light: float = 0.7
+    shadow: float = 0.35
+    defocus: float = 0.35
+    motion: float = 0.35
+    tone: float = 0.85
+    noise: float = 0.8
+    compression: float = 0.55
+
+
+def degrade(picture: Bytes, rng: Rng, chances: Chances | None = None) -> Bytes:
+    """A picture (H, W), H and W even, as a payload in other light might have sent it."""
+    c = chances or Chances()
+    linear = (picture.astype(np.float32) * np.float32(1 / 255)) ** np.float32(2.2)
+    if rng.random() < c.light:
+        linear *= light(linear.shape, rng)
+    if rng.random() < c.shadow:
+        linear *= shadow(linear.shape, rng)
+    if rng.random() < c.defocus:
+        linear = defocus(linear, float(rng.gamma(2.0, 0.45)))
+    motion = np.zeros(2)
+    if rng.random() < c.motion:
+        motion = rng.normal(0, 1, 2) * rng.uniform(0.5, 4)
+        linear = motion_blur(linear, motion)
+    # A blur by a Fourier transform leaves black a little below nought, which has no power.
+    linear = np.maximum(linear, 0)
+    tone = rng.random() < c.tone
+    code = developed(linear, rng) if tone else linear ** np.float32(1 / 2.2)
+    if rng.random() < c.noise:
+        code = noisy(code, rng)
+    result = quantized(code)
+    if rng.random() < c.compression:
+        # The frame before was taken a little elsewhere, and has another noise.
+        step = np.array([[1, 0, 2 * motion[0]], [0, 1, 2 * motion[1]]], np.float32)
+        before = cv2.warpAffine(
+            code, step, (code.shape[1], code.shape[0]), borderMode=cv2.BORDER_REPLICATE
+        )
+        before = quantized(np.asarray(before, np.float32) + _grain(code.shape, 0.01, rng))
+        result = round_trip([before, result], int(rng.integers(22, 41)))
+    return result
+
+
+def quantized(code: F32) -> Bytes:
+    """Values 0..1, clipped, as eight bits."""
+    return (np.clip(code, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+
+
+def light(shape: tuple[int, ...], rng: Rng) -> F32:
+    """A factor (H, W): a gradient over the picture, cones of lamps, the lens's vignette."""
+    y, x = _grid(shape)
+    angle, slope = rng.uniform(0, 2 * np.pi), rng.normal(0, 0.6)
+    factor = np.exp(np.float32(slope) * (np.float32(np.cos(angle)) * x + np.sin(angle) * y))
+    for _ in range(int(rng.integers(0, 4))):
+        cx, cy = rng.uniform(-1.2, 1.2, 2)
+        wide, turn = rng.uniform(0.15, 1.0), rng.uniform(0, np.pi)
+        a = np.cos(turn) * (x - cx) + np.sin(turn) * (y - cy)
+        b = (np.cos(turn) * (y - cy) - np.sin(turn) * (x - cx)) * rng.uniform(1, 3)
+        factor = factor + np.float32(rng.uniform(0.3, 4)) * np.exp(-(a * a + b * b) / wide**2)
+    factor *= 1 - np.float32(rng.uniform(0, 0.45)) * (x * x + y * y) / 2
+    return (factor / factor.mean()).astype(np.float32)
+
+
+def shadow(shape: tuple[int, ...], rng: Rng) -> F32:
+    """A factor (H, W): window bars, people, edges of roofs, as polygons with soft edges."""
+    rows, columns = shape
+    mask = np.zeros((rows, columns), np.float32)
+    size = np.array([columns, rows])
+    for _ in range(int(rng.integers(1, 4))):
+        if rng.random() < 0.5:  # parallel stripes, as of a window's frame
+            a = rng.uniform(0, np.pi)
+            along, across = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
+            wide, gap = rng.uniform(6, 50), rng.uniform(10, 90)
+            start = rng.uniform(0, 1, 2) * size
+            for k in range(int(rng.integers(1, 6))):
+                middle = start + across * k * (wide + gap)
+                corners = [
+                    middle + s * along * columns + t * across * wide / 2
+                    for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+                ]
+                cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1.0)
+        else:
+            angle = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
+            radius = rng.uniform(0.08, 0.6) * columns * rng.uniform(0.6, 1, len(angle))
+            ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius[:, None]
+            corners = ring + rng.uniform(0, 1, 2) * size
+            cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1.0)
+    soft = cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(0.7, 6)))
+    return np.asarray(1 - np.float32(rng.uniform(0.3, 0.9)) * soft, np.float32)
+
+
+def defocus(linear: F32, radius_px: float) -> F32:
+    """The mean over a disc, its edge antialiased; a radius below half a pixel changes nothing."""
+    if radius_px < 0.5:
+        return linear
+    reach = int(np.ceil(radius_px))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel = np.clip(radius_px + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
+    blurred = cv2.filter2D(linear, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(blurred, np.float32)
+
+
+def motion_blur(linear: F32, motion_px: npt.ArrayLike) -> F32:
+    """The mean over a straight way of `motion_px` (x, y), centred, so that nothing shifts."""
+    dx, dy = np.asarray(motion_px, np.float64).tolist()
+    reach = int(np.ceil(max(abs(dx), abs(dy)) / 2)) + 1
+    side = 2 * reach + 1
+    kernel = np.zeros(side * side, np.float64)
+    count = 4 * side
+    t = (np.arange(count) + 0.5) / count - 0.5
+    x, y = reach + t * dx, reach + t * dy
+    for sx in (0, 1):
+        for sy in (0, 1):
+            i, j = np.floor(x).astype(int) + sx, np.floor(y).astype(int) + sy
+            np.add.at(kernel, j * side + i, (1 - abs(x - i)) * (1 - abs(y - j)))
+    square = (kernel / kernel.sum()).reshape(side, side).astype(np.float32)
+    return np.asarray(
+        cv2.filter2D(linear, -1, square, borderType=cv2.BORDER_REFLECT_101), np.float32
+    )
+
+
+def developed(linear: F32, rng: Rng) -> F32:
+    """Exposure, white balance as grey sees it, gamma and the S of a contrast curve: 0..1."""
+    # Auto exposure aims at the mean, and misses it.
+    target = np.exp(rng.normal(np.log(0.19), 0.55))
+    level = linear * np.float32(target / max(float(linear.mean()), 1e-4))
+    shoulder = np.float32(rng.uniform(2, 8))
+    level = level * (1 + level / shoulder**2) / (1 + level)  # Reinhard et al. 2002, eq. 4
+    code = np.clip(level, 0, 1) ** np.float32(1 / rng.uniform(1.6, 2.8))
+    code += np.float32(rng.uniform(-0.3, 0.9)) * (code * code * (3 - 2 * code) - code)
+    if rng.random() < 0.3:
+        code = code * np.float32(rng.uniform(0.35, 1)) + np.float32(rng.uniform(0, 0.25))
+    return np.asarray(code, np.float32)
+
+
+def noisy(code: F32, rng: Rng) -> F32:
+    """Shot noise, which grows with the light, and the noise of reading; sometimes scaled up."""
+    gain = np.exp(rng.uniform(np.log(0.003), np.log(0.06)))
+    deviation = np.float32(gain) * np.sqrt(0.25 + np.clip(code, 0, 1)).astype(np.float32)
+    return code + deviation * _grain(code.shape, 1.0, rng)
+
+
+def _grain(shape: tuple[int, ...], deviation: float, rng: Rng) -> F32:
+    grain = rng.standard_normal(shape, dtype=np.float32)
+    if rng.random() < 0.3:  # a sensor's picture scaled: neighbours share some of it
+        grain = 1.8 * cv2.GaussianBlur(grain, (0, 0), 0.6)
+    return np.float32(deviation) * grain
+
+
+def _grid(shape: tuple[int, ...]) -> tuple[F32, F32]:
+    y = np.linspace(-1, 1, shape[0], dtype=np.float32)[:, None]
+    return y, np.linspace(-1, 1, shape[1], dtype=np.float32)[None, :]

@@ -1,0 +1,143 @@
+"""Smaller forms of a model: int8, calibrated on pictures of the user's, and fp16 weights."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+from onnxruntime.quantization import (
+    CalibrationDataReader,
+    CalibrationMethod,
+    QuantFormat,
+    QuantType,
+    quantize_static,
+)
+
+from ground_station.feature_models.graph import serialized
+from ground_station.features.extractor import FeatureError
+from ground_station.features.model import Model, ModelInfo
+from ground_station.features.padding import padded
+
+KINDS = ("int8", "fp16")
+
+_OPERATORS = ["Conv", "Relu", "Clip", "MaxPool", "AveragePool", "Add", "Concat", "Resize"]
+"""Those that onnxruntime's CPU runs on integers; what stands between others stays float."""
+_READY = ("onnx.quant.pre_process", "onnxruntime.quant")
+"""Says to the quantizer that nothing is left to fold: our graphs are built folded."""
+_FEW_VALUES = 64
+_LONGEST_ORIGIN = 180
+"""Of the characters that `ModelInfo` allows a source."""
+
+Image = npt.NDArray[np.uint8]
+
+
+def variant(model: Model, kind: str, images: Sequence[Image], name: str) -> tuple[bytes, ModelInfo]:
+    """The file of a model in another form, with its own name, and what it is.
+
+    `images` (H, W) uint8 calibrate int8: static, per channel of the weights, unsigned activations,
+    with the range that each had at most (Jacob et al., CVPR 2018). The last convolutions of the
+    detector, and at low resolution of the descriptors, stay float: rounding there makes ties.
+    fp16 halves the file only: the weights are widened when the model is loaded. Raises
+    `FeatureError`.
+    """
+    proto = check(model, kind)
+    changed = _int8(proto, model.info, images) if kind == "int8" else _fp16(proto, model.info)
+    origin = model.info.source[:_LONGEST_ORIGIN]
+    source = f"{origin}; {kind} of {model.info.name} {model.sha256[:16]}"
+    info = replace(model.info, name=name, source=source)
+    return serialized(changed, info), info
+
+
+def check(model: Model, kind: str) -> onnx.ModelProto:
+    """The graph of a model that can take this form; raises `FeatureError` for another."""
+    if kind not in KINDS:
+        raise FeatureError(f"there is no form '{kind:.40}' (known: {', '.join(KINDS)})")
+    proto = onnx.load_model_from_string(model.data)
+    if any(node.op_type in ("QuantizeLinear", "Cast") for node in proto.graph.node):
+        raise FeatureError(f"{model.path}: the model '{model.info.name}' is no fp32 model")
+    return proto
+
+
+def network_input(info: ModelInfo, image: Image) -> npt.NDArray[np.float32]:
+    """What a model's network takes, (1, channels, H', W') 0..1, of a picture (H, W)."""
+    grey = padded(image, info.multiple).astype(np.float32)[None, None] * np.float32(1 / 255)
+    return grey if info.layout == "cells" else np.repeat(grey, 3, axis=1)
+
+
+def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[Image]) -> onnx.ModelProto:
+    if not images:
+        raise FeatureError("int8 needs pictures to calibrate by, and there is none")
+    helper.set_model_props(proto, dict([_READY]))
+    outputs = ("logits", "descriptors") if info.layout == "cells" else ("scores",)
+    with tempfile.TemporaryDirectory(prefix="blimp-quantize-") as folder:
+        path = Path(folder) / "model.onnx"
+        try:
+            quantize_static(
+                proto,
+                path,
+                _Reader(info, images),
+                quant_format=QuantFormat.QDQ,
+                op_types_to_quantize=_OPERATORS,
+                per_channel=True,
+                # Seven bits of weights: without VNNI a CPU's sums of two products overflow at
+                # eight. On ALIKE-t and -n (simulated flight, 8 pairs) both lose the same.
+                reduce_range=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                nodes_to_exclude=[name for end in outputs for name in _last(proto.graph, end)],
+                calibrate_method=CalibrationMethod.MinMax,
+            )
+            return onnx.load(path)
+        except Exception as error:  # onnxruntime's and the quantizer's have no common base
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise FeatureError(f"{info.name}: cannot be quantized: {reason:.200}") from None
+
+
+class _Reader(CalibrationDataReader):
+    """Gives the quantizer one picture after the other."""
+
+    def __init__(self, info: ModelInfo, images: Sequence[Image]) -> None:
+        self._inputs = ({"image": network_input(info, image)} for image in images)
+
+    def get_next(self) -> dict[str, Any] | None:
+        return next(self._inputs, None)
+
+
+def _last(graph: onnx.GraphProto, output: str) -> Iterator[str]:
+    """The nodes from the last convolution to an output, both included."""
+    makers = {name: node for node in graph.node for name in node.output}
+    open_ends, seen = [output], set()
+    while open_ends:
+        node = makers.get(open_ends.pop())
+        if node is None or node.name in seen:
+            continue
+        seen.add(node.name)
+        yield node.name
+        if node.op_type not in ("Conv", "ConvTranspose", "MatMul"):
+            open_ends.extend(node.input)
+
+
+def _fp16(proto: onnx.ModelProto, info: ModelInfo) -> onnx.ModelProto:
+    casts = []
+    for tensor in proto.graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.size < _FEW_VALUES:
+            continue
+        if np.abs(values).max() > np.finfo(np.float16).max:
+            raise FeatureError(f"{info.name}: the weights {tensor.name:.40} exceed fp16's range")
+        name = tensor.name
+        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.fp16"))
+        casts.append(
+            helper.make_node("Cast", [tensor.name], [name], f"{name}.cast", to=TensorProto.FLOAT)
+        )
+    nodes = [*casts, *proto.graph.node]
+    del proto.graph.node[:]
+    proto.graph.node.extend(nodes)
+    return proto

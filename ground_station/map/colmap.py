@@ -1,0 +1,252 @@
+"""The border to COLMAP: its models in memory and on disk.
+
+Pixels of COLMAP count from the corner of the top-left pixel, half a pixel more than ours: that
+stays behind this border and that of its database. Key points go in undistorted, so the
+camera in there is a plain pinhole, whatever the lens.
+"""
+
+from __future__ import annotations
+
+# pycolmap's wheel exports zlib symbols that corrupt PNG writing unless zlib and OpenCV come first.
+import zlib  # noqa: F401  # isort: skip
+import cv2  # noqa: F401  # isort: skip
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from ground_station.errors import MapError
+from ground_station.geometry.camera import Camera
+from ground_station.map import colmap_files
+from ground_station.map.model import Model
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+HALF_PIXEL = 0.5
+CAMERA_ID = 1
+
+Reconstruction = pycolmap.Reconstruction
+
+
+def quiet() -> None:
+    """Silences COLMAP's own log."""
+    # Progress and errors are ours to tell; COLMAP's own log goes to standard error by default.
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+
+
+def pinhole_camera(camera: Camera) -> pycolmap.Camera:
+    """The pinhole that sees what our camera sees, undistorted, in COLMAP's pixels."""
+    return pycolmap.Camera(
+        camera_id=CAMERA_ID,
+        model="PINHOLE",
+        width=camera.width_px,
+        height=camera.height_px,
+        params=[
+            camera.fx_px,
+            camera.fy_px,
+            camera.cx_px + HALF_PIXEL,
+            camera.cy_px + HALF_PIXEL,
+        ],
+        has_prior_focal_length=True,
+    )
+
+
+def from_arrays(
+    model: Model,
+    camera: Camera,
+    weight: F64 | None = None,
+    keypoints_px: Sequence[F64] | None = None,
+) -> Reconstruction:
+    """A reconstruction of a model's arrays, image k with id `image_id[k]`.
+
+    `feature` is made anew, unless all key points of each image (N, 2), undistorted, are given.
+
+    COLMAP's adjustment has one loss for all sights. So `weight` (K,) of the images becomes a camera
+    for each weight whose pixels are so much smaller: the same rays, with residuals scaled. Without
+    it there is one camera, that of the database.
+    """
+    pinhole = pinhole_camera(camera)
+    weights = np.ones(len(model.names)) if weight is None else np.asarray(weight, np.float64)
+    levels, camera_of = np.unique(weights, return_inverse=True)
+    result = pycolmap.Reconstruction()
+    for number, level in enumerate(levels.tolist()):
+        result.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=CAMERA_ID + number,
+                model="PINHOLE",
+                width=int(np.ceil(level * camera.width_px)),
+                height=int(np.ceil(level * camera.height_px)),
+                params=level * np.asarray(pinhole.params),
+                has_prior_focal_length=True,
+            )
+        )
+    order = np.argsort(model.image, kind="stable")
+    offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
+    place = model.feature
+    if keypoints_px is None:
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order)) - offset[model.image[order]]
+    cTw = np.linalg.inv(model.wTc) if len(model.wTc) else model.wTc
+    for k, name in enumerate(model.names):
+        mine = order[offset[k] : offset[k + 1]]
+        seen = model.pixel_px[mine] if keypoints_px is None else keypoints_px[k]
+        pixels = (seen + HALF_PIXEL) * weights[k]
+        result.add_image_with_trivial_frame(
+            pycolmap.Image(
+                name=name,
+                keypoints=pixels,
+                camera_id=CAMERA_ID + int(camera_of[k]),
+                image_id=int(model.image_id[k]),
+            ),
+            pycolmap.Rigid3d(cTw[k, :3]),
+        )
+    by_point = np.argsort(model.point, kind="stable")
+    tracks = np.searchsorted(model.point[by_point], np.arange(len(model.position) + 1)).tolist()
+    sights = np.stack([model.image_id[model.image], place], axis=1)[by_point]
+    for m, point_id in enumerate(model.point_id.tolist()):
+        mine = sights[tracks[m] : tracks[m + 1]].tolist()  # all of them as lists would be large
+        track = [pycolmap.TrackElement(*sight) for sight in mine]
+        point = pycolmap.Point3D(xyz=model.position[m], track=pycolmap.Track(track))
+        result.add_point3D_with_id(point_id, point)
+    return result
+
+
+def positions(reconstruction: Reconstruction, model: Model) -> tuple[F64, F64]:
+    """Where a reconstruction has a model's images, wTc (K, 4, 4), and its points (M, 3)."""
+    wTc = np.tile(np.eye(4), (len(model.names), 1, 1))
+    for k, image_id in enumerate(model.image_id.tolist()):
+        wTc[k, :3] = reconstruction.images[image_id].cam_from_world().inverse().matrix()
+    points = [reconstruction.points3D[point_id].xyz for point_id in model.point_id.tolist()]
+    return wTc, np.array(points).reshape(-1, 3)
+
+
+def to_arrays(model: Reconstruction) -> Model:
+    """A model as arrays; pixels lose COLMAP's half pixel here."""
+    ids = sorted(model.reg_image_ids())
+    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    position = np.array([model.points3D[int(i)].xyz for i in point_ids]).reshape(-1, 3)
+    wTc = np.tile(np.eye(4), (len(ids), 1, 1))
+    names, images, features, seen, pixels = [], [], [], [], []
+    for k, image_id in enumerate(ids):
+        image = model.images[image_id]
+        names.append(image.name)
+        wTc[k, :3] = image.cam_from_world().inverse().matrix()
+        index = np.asarray(image.get_observation_point2D_idxs(), dtype=np.int64)
+        points = image.get_observation_points2D()
+        images.append(np.full(len(index), k))
+        features.append(index)
+        seen.append(np.array([point.point3D_id for point in points], dtype=np.int64))
+        pixels.append(np.array([point.xy for point in points]).reshape(-1, 2) - HALF_PIXEL)
+    camera = model.cameras[CAMERA_ID]
+    return Model(
+        names=names,
+        image_id=np.array(ids, dtype=np.int64),
+        wTc=wTc,
+        point_id=point_ids,
+        position=position,
+        image=np.concatenate(images).astype(np.int64),
+        feature=np.concatenate(features).astype(np.int64),
+        point=np.searchsorted(point_ids, np.concatenate(seen)),
+        pixel_px=np.concatenate(pixels),
+        pinhole=np.asarray(camera.params) - [0.0, 0.0, HALF_PIXEL, HALF_PIXEL],
+    )
+
+
+def copied(model: Reconstruction) -> Reconstruction:
+    """A model of its own that is the same."""
+    return pycolmap.Reconstruction(model)
+
+
+def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
+    """Takes images out of a model, with their sights."""
+    for image_id in np.asarray(image_ids).tolist():
+        model.deregister_frame(model.images[image_id].frame_id)
+
+
+def drop_observations(
+    model: Reconstruction, image_ids: npt.ArrayLike, features: npt.ArrayLike
+) -> None:
+    """Takes sights out of a model; a point that keeps only one goes, too."""
+    pairs = zip(np.asarray(image_ids).tolist(), np.asarray(features).tolist(), strict=True)
+    for image_id, feature in pairs:
+        if model.images[image_id].points2D[feature].has_point3D():
+            model.delete_observation(image_id, feature)
+
+
+def drop_points(model: Reconstruction, point_ids: npt.ArrayLike) -> None:
+    """Takes points out of a model; those that went with their sights are gone already."""
+    for point_id in np.asarray(point_ids).tolist():
+        if model.exists_point3D(point_id):
+            model.delete_point3D(point_id)
+
+
+def compact(model: Reconstruction) -> Reconstruction:
+    """A copy that holds the sights of points only, without the key points that none came of.
+
+    Two thirds of a model's size on disk are key points without a point.
+    """
+    result = pycolmap.Reconstruction()
+    result.add_camera_with_trivial_rig(model.cameras[CAMERA_ID])
+    place: dict[int, I64] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.images[image_id]
+        kept = [int(i) for i in image.get_observation_point2D_idxs()]
+        place[image_id] = np.full(len(image.points2D), -1, np.int64)
+        place[image_id][kept] = np.arange(len(kept))
+        pixels = np.array([image.points2D[i].xy for i in kept]).reshape(-1, 2)
+        result.add_image_with_trivial_frame(
+            pycolmap.Image(
+                name=image.name, keypoints=pixels, camera_id=CAMERA_ID, image_id=image_id
+            ),
+            image.cam_from_world(),
+        )
+    for point_id in sorted(model.point3D_ids()):
+        point = model.points3D[point_id]
+        track = pycolmap.Track(
+            [
+                pycolmap.TrackElement(e.image_id, place[e.image_id][e.point2D_idx])
+                for e in point.track.elements
+            ]
+        )
+        moved = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=track)
+        result.add_point3D_with_id(point_id, moved)
+    return result
+
+
+def transform(model: Reconstruction, scale: float, rotation: F64, translation: F64) -> None:
+    """Moves a model by x ↦ scale · rotation · x + translation; (3, 3), (3,)."""
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation))
+
+
+def write(model: Reconstruction, folder: Path) -> None:
+    """Writes the binary files of a model into a folder; raises `MapError` when the disk is full."""
+    quiet()
+    folder.mkdir(parents=True, exist_ok=True)
+    model.update_point_3d_errors()
+    model.write(folder)
+    # COLMAP does not look whether the disk took it. By its format a point has 51 bytes, and 8 for
+    # each of its sights, behind the count of points.
+    points = folder / "points3D.bin"
+    wanted = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
+    if points.stat().st_size != wanted:
+        raise MapError(f"{points}: was not written whole; is the disk full?")
+
+
+def reread(folder: Path) -> Reconstruction:
+    """Reads a model that this program has written or checked."""
+    quiet()
+    return pycolmap.Reconstruction(folder)
+
+
+def read(folder: Path) -> Reconstruction:
+    """Reads a model; raises `MapError` with one line."""
+    colmap_files.check(folder)
+    try:
+        return reread(folder)
+    except (ValueError, RuntimeError, OSError, IndexError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise MapError(f"{folder}: not a COLMAP model: {reason}") from None

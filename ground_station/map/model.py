@@ -1,0 +1,53 @@
+"""A COLMAP model as arrays: images, points, and which image sees which point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.map.store import Map
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A COLMAP model as arrays, in our conventions.
+
+    `names`, K image names and `image_id` (K,) their ids, in order of id; `wTc` (K, 4, 4);
+    `point_id` (M,), `position` (M, 3). Observation o is key point `feature[o]` of image `image[o]`
+    (an index into `names`), a sight of point `point[o]` (an index into `point_id`), at
+    `pixel_px[o]` (O, 2), undistorted pixels. `pinhole` is fx, fy, cx, cy in our pixels.
+    """
+
+    names: list[str]
+    image_id: I64
+    wTc: F64
+    point_id: I64
+    position: F64
+    image: I64
+    feature: I64
+    point: I64
+    pixel_px: F64
+    pinhole: F64
+
+
+def model_of(map_: Map) -> Model:
+    """A map's poses, landmarks and sights, its pixels undistorted."""
+    camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
+    image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
+    return Model(
+        names=list(kf.names),
+        image_id=np.arange(len(kf)) + 1,
+        wTc=np.array(kf.wTc),
+        point_id=lm.id,
+        position=np.array(lm.position_m),
+        image=image,
+        feature=np.zeros(len(image), np.int64),
+        point=kf.landmark.astype(np.int64),
+        pixel_px=camera.undistort_to_pinhole(kf.pixel_px),
+        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+    )

@@ -1,0 +1,82 @@
+"""More than one descriptor for a landmark: what it looks like in another light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.map.descriptors import Descriptors, joined
+
+F32 = npt.NDArray[np.float32]
+I32 = npt.NDArray[np.int32]
+Indices = npt.NDArray[np.intp]
+
+MOST = 8
+"""Modes that one landmark may have: a file that claims more is refused."""
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Further descriptors of some landmarks.
+
+    `landmark` (N,), their indices in ascending order, each as often as it has modes; `descriptor`
+    (N, D), unit rows: an array or, from a file, `Descriptors`. They take part wherever the
+    landmarks' own descriptors do, and two of one landmark are never rivals.
+    """
+
+    landmark: I32
+    descriptor: F32 | Descriptors
+
+    def __len__(self) -> int:
+        return len(self.landmark)
+
+    def of(self, index: Indices) -> tuple[Indices, Indices]:
+        """The modes of landmarks `index` (P,): rows (Q,), and the place in `index` of each (Q,).
+
+        Places ascend.
+        """
+        first = np.searchsorted(self.landmark, index)
+        count = np.searchsorted(self.landmark, index, side="right") - first
+        place = np.repeat(np.arange(len(index)), count)
+        shift = first - (np.cumsum(count) - count)
+        return np.arange(len(place)) + shift[place], place
+
+    def among(self, kept: npt.NDArray[np.bool_]) -> Modes | None:
+        """Those of the landmarks that are kept of all M, (M,), which are counted anew."""
+        rows = np.flatnonzero(kept[self.landmark])
+        landmark = (np.cumsum(kept) - 1)[self.landmark[rows]]
+        return Modes(landmark.astype(np.int32), _some(self.descriptor, rows)) if len(rows) else None
+
+
+def with_modes(modes: Modes | None, landmark: npt.NDArray[np.int64], descriptor: F32) -> Modes:
+    """The modes and further ones of landmarks (N,), unit rows (N, D), in any order."""
+    rows: F32 | Descriptors = descriptor
+    if modes is not None:
+        landmark = np.concatenate([modes.landmark, landmark])
+        rows = joined(modes.descriptor, descriptor)
+    order = np.argsort(landmark, kind="stable")
+    return Modes(landmark[order].astype(np.int32), _some(rows, order))
+
+
+def described(
+    descriptors: F32 | Descriptors, modes: Modes | None, index: Indices
+) -> tuple[F32, Indices | None]:
+    """Unit rows of landmarks `index` (P,), then those of their modes: (P + Q, D).
+
+    And the place in `index` of each mode (Q,), ascending; None where they have none.
+    """
+    rows = descriptors[index]
+    if modes is None:
+        return rows, None
+    row, place = modes.of(index)
+    if not len(place):
+        return rows, None
+    return np.concatenate([rows, modes.descriptor[row]]), place
+
+
+def _some(descriptors: F32 | Descriptors, rows: Indices) -> F32 | Descriptors:
+    if isinstance(descriptors, Descriptors):
+        return descriptors.rows(rows)
+    return descriptors[rows]

@@ -1,0 +1,101 @@
+"""Which landmarks a smaller map keeps.
+
+The greedy cover of Li, Snavely and Huttenlocher (ECCV 2010), which wants every view to see enough
+of them, made soft, as by Lynen et al. (IJRR 2020): a landmark's gain falls with what the views that
+see it have already, and with what the same part of their picture has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.map.store import Landmarks, Map
+from ground_station.map_update.compression.viewpoints import ExpectedSights, expected_sights
+from ground_station.progress import Progress
+
+F64 = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+METHODS = ("coverage", "observations", "random")
+"""How landmarks are chosen: the others are there to be compared with."""
+
+_ROUNDS = 200
+"""Those that gain most are taken together in so many rounds, whatever the map's size; one by one
+(then it is the greedy algorithm) takes their number times as long and covers no better."""
+_SIGMA_PX = 1.0
+"""Of a feature's place in the picture: a landmark that is known worse than this counts less."""
+_NEAREST, _FARTHEST = 5.0, 0.2
+"""What a landmark's nearness counts, at most and at least: it fixes the place so much better."""
+_SPREAD = 0.35
+"""Half the distance of descriptors at which the localizer gives up; one that has varied more
+counts less."""
+
+
+def choose(map_: Map, count: int, method: str = "coverage", seed: int = 0) -> Indices:
+    """The landmarks (count,) that are kept, in order; all when there are no more.
+
+    `observations` are those seen most often, `random` any, by the seed.
+    """
+    total = len(map_.landmarks)
+    if count >= total:
+        return np.arange(total)
+    if method == "random":
+        kept = np.random.default_rng(seed).permutation(total)[:count]
+    elif method == "observations":
+        kept = np.argsort(-map_.landmarks.observations, kind="stable")[:count]
+    else:
+        with Progress("viewpoints, keyframes", len(map_.keyframes)) as progress:
+            sights = expected_sights(map_, progress.step)
+        kept = cover(sights, quality(map_.landmarks, map_.info.camera.fx_px), count)
+    return np.sort(kept)
+
+
+def quality(landmarks: Landmarks, focal_px: float) -> F64:
+    """How much a sight of each landmark (M,) tells, above 0.
+
+    More for one that is nearer than most; less for one whose place across the line of sight is not
+    known to a pixel, as seen from the distance it was seen from, and for one that did not always
+    look the same.
+    """
+    covariance = landmarks.covariance_m2.astype(np.float64)
+    ray = landmarks.view_direction.astype(np.float64)
+    along = np.einsum("mi,mij,mj->m", ray, covariance, ray)
+    across = np.maximum(np.trace(covariance, axis1=1, axis2=2) - along, 0) / 2
+    distance = np.sqrt(np.prod(landmarks.distance_m.astype(np.float64), axis=1))
+    square_px = focal_px**2 * across / np.maximum(distance, 1e-9) ** 2
+    steady = 1 / (1 + (landmarks.spread.astype(np.float64) / _SPREAD) ** 2)
+    near = np.clip(np.median(distance) / np.maximum(distance, 1e-9), _FARTHEST, _NEAREST)
+    return np.asarray(near * steady * _SIGMA_PX**2 / (_SIGMA_PX**2 + square_px))
+
+
+def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUNDS) -> Indices:
+    """`count` of M landmarks that cover the views, the best first; quality (M,).
+
+    Greedily minimises the sum over views of w / (1 + A), as a pose's variance falls with what fixes
+    it; A is the sum over a picture's cells of sqrt(1 + n) - 1, n the quality that the chosen
+    landmarks are expected to show there. What one landmark gains only falls while others are
+    chosen (its negative is submodular), so the greedy choice is near the best.
+    """
+    worth = quality[sights.landmark] * sights.chance
+    filled: F64 = np.zeros(sights.cells)
+    covered: F64 = np.zeros(len(sights.weight))
+    left = np.ones(len(quality), bool)
+    kept: list[Indices] = []
+    together = -(-count // rounds)
+    missing = count
+    while missing:
+        before = filled[sights.cell]
+        gain = np.sqrt(1 + before + worth) - np.sqrt(1 + before)
+        gain *= (sights.weight / np.square(1 + covered))[sights.view]
+        total = np.bincount(sights.landmark, gain, len(quality))
+        # What no view sees comes last, by its quality.
+        order = np.lexsort((-quality, np.where(left, -total, np.inf)))[: min(together, missing)]
+        kept.append(order)
+        left[order] = False
+        missing -= len(order)
+        new = np.flatnonzero(~left[sights.landmark] & (worth > 0))
+        filled = np.bincount(sights.cell[new], worth[new], sights.cells).astype(np.float64)
+        in_view = np.sqrt(1 + filled).reshape(len(covered), -1) - 1
+        covered = in_view.sum(axis=1)
+    return np.concatenate([*kept, np.empty(0, np.intp)]).astype(np.intp)

@@ -1,0 +1,134 @@
+"""Features of several frames that are the same thing: matches, joined to tracks."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from ground_station.map.store import MapInfo
+from ground_station.map_update.extension.frames import Frames
+from ground_station.mapping.construction.matching import mutual_matches, verify
+from ground_station.mapping.construction.workers import Threads
+from ground_station.mapping.settings import MappingSettings
+from ground_station.progress import Progress
+
+I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
+Pair = tuple[int, int]
+
+_SHARED = 30
+"""Landmarks of the map that two frames far apart in time must both see to be compared."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """O sights of T tracks: frame[o] shows track[o] as its feature[o]; sorted by track.
+
+    No track is there twice in a frame.
+    """
+
+    frame: I64
+    feature: I64
+    track: I64
+    count: int
+
+
+def pairs_to_match(
+    frames: Frames, seen: Sequence[npt.NDArray[np.intp]], landmarks: int, settings: MappingSettings
+) -> list[Pair]:
+    """Frames (i, j), i < j, to compare: those that follow each other, and that share landmarks.
+
+    `seen` holds, for each frame, the landmarks of the map that it was found to show.
+    """
+    count, near = len(frames), settings.extend.neighbours
+    pairs = {
+        (i, j)
+        for i in range(count)
+        for j in range(i + 1, min(i + 1 + near, count))
+        if frames.flight[i] == frames.flight[j]
+    }
+    offset = np.cumsum([0, *map(len, seen)])
+    every = np.concatenate([*seen, np.empty(0, np.intp)])
+    shows = sparse.csr_matrix(
+        (np.ones(len(every), np.int32), every, offset), shape=(count, landmarks)
+    )
+    shared = np.asarray((shows @ shows.T).todense())
+    for i, row in enumerate(shared):
+        row[i] = 0
+        order = np.argsort(-row, kind="stable")
+        far = [j for j in order.tolist() if (min(i, j), max(i, j)) not in pairs]
+        best = itertools.islice((j for j in far if row[j] >= _SHARED), settings.extend.similar)
+        pairs.update((min(i, j), max(i, j)) for j in best)
+    return sorted(pairs)
+
+
+def match_frames(
+    frames: Frames,
+    pairs: Sequence[Pair],
+    info: MapInfo,
+    settings: MappingSettings,
+    threads: int,
+) -> list[tuple[Pair, I32]]:
+    """Matches (N, 2) of the pairs that share a geometry, verified as in a build."""
+    match, matrix = settings.match.of(info.features), info.camera.matrix
+    pixels = [frames.pixel_px[a:b] for a, b in itertools.pairwise(frames.offset.tolist())]
+
+    def one(pair: Pair) -> tuple[Pair, I32 | None]:
+        i, j = pair
+        matches = mutual_matches(
+            frames.features[i].descriptors, frames.features[j].descriptors, match.ratio
+        )
+        if len(matches) < match.min_inliers:
+            return pair, None
+        view = verify(
+            pixels[i],
+            pixels[j],
+            matches,
+            matrix,
+            error_px=match.error_px,
+            planar_ratio=match.planar_ratio,
+        )
+        enough = view is not None and len(view.matches) >= match.min_inliers
+        return pair, view.matches if enough and view is not None else None
+
+    verified = []
+    with Progress("matching, pairs", len(pairs)) as progress:
+        for pair, matches in Threads(threads).map(one, ((pair,) for pair in pairs)):
+            if matches is not None:
+                verified.append((pair, matches))
+            progress.step()
+    return verified
+
+
+def joined(offset: I64, verified: Sequence[tuple[Pair, I32]]) -> Tracks:
+    """Tracks of matches; `offset` (K + 1,) counts the features of the frames before each.
+
+    Where a track has two features in one frame, it is not seen in that frame.
+    """
+    none = np.empty(0, np.int64)
+    one = np.concatenate([none, *(offset[i] + m[:, 0] for (i, _), m in verified)])
+    other = np.concatenate([none, *(offset[j] + m[:, 1] for (_, j), m in verified)])
+    total = int(offset[-1])
+    graph = sparse.csr_matrix((np.ones(len(one), np.int8), (one, other)), shape=(total, total))
+    _, label = connected_components(graph, directed=False)
+    node = np.unique(np.concatenate([one, other]))
+    frame = np.searchsorted(offset, node, side="right") - 1
+    _, where, times = np.unique(
+        label[node].astype(np.int64) * len(offset) + frame, return_inverse=True, return_counts=True
+    )
+    alone = times[where.ravel()] == 1
+    node, frame = node[alone], frame[alone]
+    names, track = np.unique(label[node], return_inverse=True)
+    order = np.lexsort((frame, track.ravel()))
+    return Tracks(
+        frame[order].astype(np.int64),
+        (node - offset[frame])[order].astype(np.int64),
+        track.ravel()[order].astype(np.int64),
+        len(names),
+    )

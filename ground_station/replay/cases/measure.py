@@ -1,0 +1,189 @@
+"""A run's figures, each with what it was taken from, or why it could not be taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.evaluation import ate
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.estimate import State
+from ground_station.replay.cases.frames import UNKNOWN
+from ground_station.replay.cases.outcome import Outcome
+from ground_station.replay.cases.truth import Reference
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured value, `told` where it comes from; None: not measured, `told` is why."""
+
+    value: float | None
+    told: str = ""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """P poses that have a true one at their time: how far each is off.
+
+    `frame` (P,) are indices into the outcome's frames; `position_m` and `rotation_deg` are (P,).
+    """
+
+    frame: npt.NDArray[np.intp]
+    position_m: Array
+    rotation_deg: Array
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def errors(outcome: Outcome, truth: Trajectory) -> Errors:
+    """The errors of the finite poses, unaligned, by nearest time within `ate.MAX_DIFF_S`."""
+    ordered = outcome.frames.ordered()
+    estimate = outcome.estimate
+    i, j = ate.associate(estimate.time_ns, truth.time_ns)
+    if not len(i):
+        return Errors(ordered[:0], np.empty(0), np.empty(0))
+    found = ate.errors(_of(estimate, i), _of(truth, j))
+    return Errors(ordered[i], found.position_m, found.rotation_deg)
+
+
+def _of(trajectory: Trajectory, k: npt.NDArray[np.intp]) -> Trajectory:
+    return Trajectory(
+        trajectory.time_ns[k], trajectory.position_m[k], trajectory.quaternion_xyzw[k]
+    )
+
+
+def figures(outcome: Outcome, reference: Reference | str | None) -> dict[str, Figure]:
+    """All figures by name, as `Limits` names its bounds but for `_min` and `_max`.
+
+    `reference` is what the poses are held against, None for nothing, or in words why there is none.
+    """
+    return {
+        **_shares(outcome),
+        **_errors(outcome, reference),
+        **_latencies(outcome),
+        "recovery_s": recovery(outcome),
+        **_resources(outcome),
+        "battery_V": _battery(outcome),
+    }
+
+
+def _shares(outcome: Outcome) -> dict[str, Figure]:
+    run, frames = outcome.run, outcome.frames
+    accounts = run.accounts
+    found: dict[str, Figure] = {}
+    parts = {"coverage": (int(frames.finite.sum()), "localized"), "lost": (accounts.lost, "lost")}
+    for name, (count, word) in parts.items():
+        if not run.complete:
+            found[name] = Figure(None, "the payload's final counts did not come")
+        elif accounts.sent <= 0:
+            found[name] = Figure(None, "no frame was sent")
+        else:
+            told = f"{count} of {accounts.sent} sent {word}"
+            found[name] = Figure(count / accounts.sent, told)
+    tracking = int(frames.called(State.TRACKING.value).sum())
+    if len(frames):
+        told = f"{tracking} of {len(frames)} frames"
+        found["tracking"] = Figure(tracking / len(frames), told)
+    else:
+        found["tracking"] = Figure(None, "no frame reached the localizer")
+    return found
+
+
+_OF_ERRORS = ("position_rmse_m", "rotation_rmse_deg", "position_worst_m", "tracking_worst_m")
+
+
+def _errors(outcome: Outcome, reference: Reference | str | None) -> dict[str, Figure]:
+    if not isinstance(reference, Reference):
+        why = reference or "this case has no truth"
+        return {name: Figure(None, why) for name in _OF_ERRORS}
+    found = errors(outcome, reference.poses)
+    if not len(found):
+        why = f"no pose is within {ate.MAX_DIFF_S:g} s of one of {reference.what}"
+        return {name: Figure(None, why) for name in _OF_ERRORS}
+    without = int(outcome.frames.finite.sum()) - len(found)
+    told = f"{len(found)} poses against {reference.what}"
+    if without:
+        told += f"; {without} more have none of it at their time"
+    position, rotation = ate.Statistics.of(found.position_m), ate.Statistics.of(found.rotation_deg)
+    tracking = outcome.frames.called(State.TRACKING.value)[found.frame]
+    worst = Figure(None, f"no pose called TRACKING among {told}")
+    if tracking.any():
+        k = np.flatnonzero(tracking)[np.argmax(found.position_m[tracking])]
+        sequence = int(outcome.frames.sequence[found.frame[k]])
+        worst = Figure(
+            float(found.position_m[k]), f"frame {sequence}, of {int(tracking.sum())} TRACKING"
+        )
+    return {
+        "position_rmse_m": Figure(position.rmse, told),
+        "rotation_rmse_deg": Figure(rotation.rmse, told),
+        "position_worst_m": Figure(position.max, told),
+        "tracking_worst_m": worst,
+    }
+
+
+def _latencies(outcome: Outcome) -> dict[str, Figure]:
+    latency = outcome.frames.latency_ms
+    latency = latency[np.isfinite(latency)]
+    if not len(latency):
+        why = "no frame came" if not len(outcome.frames) else "the payload's clock never answered"
+        return {name: Figure(None, why) for name in ("latency_p50_ms", "latency_p99_ms")}
+    p50, p99 = np.percentile(latency, [50, 99]).tolist()
+    told = f"{len(latency)} frames"
+    return {"latency_p50_ms": Figure(p50, told), "latency_p99_ms": Figure(p99, told)}
+
+
+def recoveries(outcome: Outcome) -> list[tuple[str, float | None]]:
+    """Of each outage or fault its name, and how long after its end (s) the first TRACKING pose was
+    there of a frame that was taken after it; None where none came.
+
+    Where the capture by the ground's clock is not known, the arrival stands in its place.
+    """
+    frames = outcome.frames
+    taken_ns = np.where(frames.captured_ns == UNKNOWN, frames.arrival_ns, frames.captured_ns)
+    good = frames.called(State.TRACKING.value) & frames.finite
+    found: list[tuple[str, float | None]] = []
+    for outage in outcome.outages:
+        after = good & (taken_ns >= outage.end_ns)
+        done_ns = frames.done_ns[after]
+        took_s = float(done_ns.min() - outage.end_ns) / 1e9 if len(done_ns) else None
+        found.append((outage.name, took_s))
+    return found
+
+
+def recovery(outcome: Outcome) -> Figure:
+    """The longest of them."""
+    found = recoveries(outcome)
+    if not found:
+        return Figure(None, "nothing was out in this run")
+    never = [name for name, took_s in found if took_s is None]
+    if never:
+        return Figure(None, f"not TRACKING again after {', '.join(never)}")
+    worst_s, name = max((took_s, name) for name, took_s in found if took_s is not None)
+    return Figure(worst_s, f"after {name}, the slowest of {len(found)}")
+
+
+def _resources(outcome: Outcome) -> dict[str, Figure]:
+    found: dict[str, Figure] = {}
+    for name in ("payload", "ground"):
+        side = outcome.side(name)
+        values = {f"{name}_memory_MB": side.memory_MB, f"{name}_cpu": side.cpu}
+        for key, value in values.items():
+            why = "nobody measured it"
+            found[key] = Figure(value, f"by {side.source}" if side.source else "")
+            if value is None or not np.isfinite(value) or value < 0:
+                found[key] = Figure(None, why)
+    return found
+
+
+def _battery(outcome: Outcome) -> Figure:
+    volt = (outcome.run.battery or {}).get("voltage")
+    if volt is None:
+        return Figure(None, "no battery message came")
+    if isinstance(volt, bool) or not isinstance(volt, int | float) or not abs(volt) < 1e6:
+        return Figure(None, f"the voltage is {str(volt)[:24]!r}")
+    return Figure(float(volt), "its last message")

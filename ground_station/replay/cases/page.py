@@ -1,0 +1,223 @@
+"""Pages of a comparison and of a suite: one HTML file each, no script, nothing fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from ground_station.presentation.pages import Shown, shown, write_page
+from ground_station.replay.cases import measure, pictures
+from ground_station.replay.cases.compare import Comparison, Line
+from ground_station.replay.cases.frames import UNKNOWN
+from ground_station.replay.cases.judge import Judged, digits
+from ground_station.replay.cases.outcome import Outcome
+from ground_station.replay.cases.pictures import Series, Strip
+
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+def write_comparison(path: str | Path, comparison: Comparison, a: str, b: str) -> None:
+    """Writes the page of two runs; `a` and `b` are their names."""
+    c = comparison
+    _write(
+        path,
+        "compare.html",
+        title=f"{b} against {a}",
+        names=(a, b),
+        comparison=c,
+        lines=[(line, *cells(line)) for line in c.lines],
+        accounts=[
+            (name, value, asdict(c.b.run.accounts)[name])
+            for name, value in asdict(c.a.run.accounts).items()
+        ],
+        shown=_of_comparison(c),
+    )
+
+
+def write_suite(
+    path: str | Path,
+    title: str,
+    cases: Sequence[Judged],
+    *,
+    began: str,
+    comparisons: dict[str, Comparison] | None = None,
+) -> None:
+    """Writes the page of a judged suite.
+
+    `comparisons` by a case's name show that run against an earlier one, which is A.
+    """
+    against = comparisons or {}
+    _write(
+        path,
+        "suite.html",
+        title=title,
+        began=began,
+        cases=[
+            (
+                f"case-{number}",
+                case,
+                _of_case(case),
+                _of_comparison(against[case.name]) if case.name in against else [],
+            )
+            for number, case in enumerate(cases, start=1)
+        ],
+        against=against,
+    )
+
+
+def cells(line: Line) -> tuple[str, str, str, str]:
+    """A line's figures for a person: A, B, by how much worse, what is allowed."""
+    a, b = ("—" if v is None else digits(v, None) for v in (line.a, line.b))
+    worse = "" if line.worse is None else digits(line.worse, line.allowed)
+    if line.worse is not None and line.worse > 0:
+        worse = f"+{worse}"
+    allowed = "" if line.allowed is None else f"{line.allowed:g}"
+    return a, b, worse, allowed
+
+
+def _write(path: str | Path, template: str, **values: object) -> None:
+    write_page(path, _TEMPLATES / template, **values)
+
+
+def _of_comparison(c: Comparison) -> list[Shown]:
+    a, b = c.a.frames, c.b.frames
+    found: list[Shown] = []
+    if len(c.time_ns):
+        start_ns = int(min(a.time_ns.min(), b.time_ns.min()))
+        gone = a.finite[c.pairs.a] & ~b.finite[c.pairs.b]
+        missing = np.concatenate(
+            [a.position_m[c.pairs.a[gone]], a.position_m[c.pairs.only_a][a.finite[c.pairs.only_a]]]
+        )
+        first = _place(c)
+        plan = c.b.floorplan or c.a.floorplan
+        found.append(
+            shown(
+                "Where the poses of B are off those of A",
+                "B's path from above, coloured by its distance from A's pose of the same frame",
+                lambda dress: pictures.path(
+                    b.position_m[c.pairs.b],
+                    c.position_m,
+                    under=[("A", c.a.estimate)],
+                    lost_m=missing,
+                    first_m=first,
+                    floorplan=plan,
+                    label="B off A, cm",
+                    dress=dress,
+                ),
+            )
+        )
+        panels = []
+        if c.errors_a is not None and c.errors_b is not None and c.truth is not None:
+            series = [
+                Series(name, (o.frames.time_ns[e.frame] - start_ns) / 1e9, 100 * e.position_m, k)
+                for k, (name, o, e) in enumerate((("A", c.a, c.errors_a), ("B", c.b, c.errors_b)))
+            ]
+            panels.append(("error, cm", series, None))
+        time_s = (c.time_ns - start_ns) / 1e9
+        panels.append(("B off A, cm", [Series("B off A", time_s, 100 * c.position_m, 1)], None))
+        panels.append(("B off A, °", [Series("B off A", time_s, c.rotation_deg, 1)], None))
+        strips = [
+            Strip(name, (f.time_ns - start_ns) / 1e9, f.state) for name, f in (("A", a), ("B", b))
+        ]
+        found.append(
+            shown(
+                "Over time",
+                "Errors of both runs, their difference and their states over time",
+                lambda dress: pictures.over_time(panels, strips, dress=dress),
+            )
+        )
+    sets = []
+    if c.errors_a is not None and c.errors_b is not None:
+        sets.append(
+            ("error, cm", [("A", 100 * c.errors_a.position_m), ("B", 100 * c.errors_b.position_m)])
+        )
+    sets.append(("capture to pose, ms", [("A", a.latency_ms), ("B", b.latency_ms)]))
+    found.append(
+        shown(
+            "How often",
+            "The share of frames up to an error, and up to a latency, of both runs",
+            lambda dress: pictures.distributions(sets, dress),
+        )
+    )
+    return found
+
+
+def _place(c: Comparison) -> np.ndarray | None:
+    """Where the two runs first part, by the pose of either."""
+    if c.first.time_ns is None:
+        return None
+    for frames in (c.b.frames, c.a.frames):
+        k = np.flatnonzero((frames.time_ns == c.first.time_ns) & frames.finite)
+        if len(k):
+            return np.asarray(frames.position_m[k[0]])
+    return None
+
+
+def _of_case(case: Judged) -> list[Shown]:
+    if case.outcome is None or not len(case.outcome.frames):
+        return []
+    outcome, frames = case.outcome, case.outcome.frames
+    start_ns = int(frames.time_ns.min())
+    seconds = (frames.time_ns - start_ns) / 1e9
+    panels: list[tuple[str, Sequence[Series], float | None]] = []
+    bounds = {row.name: row.bound for row in case.rows}
+    off = np.full(len(frames), np.nan)
+    if case.reference is not None:
+        errors = measure.errors(outcome, case.reference.poses)
+        off[errors.frame] = errors.position_m
+        limit = bounds.get("position_max_m")
+        panels.append(
+            (
+                "error, cm",
+                [Series("error", seconds[errors.frame], 100 * errors.position_m)],
+                None if limit is None else 100 * limit,
+            )
+        )
+    latency = np.where(np.isfinite(frames.latency_ms), frames.latency_ms, np.nan)
+    if np.isfinite(latency).any():
+        panels.append(
+            (
+                "latency, ms",
+                [Series("latency", seconds, latency)],
+                bounds.get("latency_p99_ms_max"),
+            )
+        )
+    shown_off = off if case.reference is not None else np.zeros(len(frames))
+    under = [] if outcome.truth is None else [("truth", outcome.truth)]
+    return [
+        shown(
+            "Path",
+            "The path from above, coloured by its error",
+            lambda dress: pictures.path(
+                frames.position_m[frames.finite],
+                shown_off[frames.finite],
+                under=under,
+                floorplan=outcome.floorplan,
+                label="error, cm",
+                dress=dress,
+            ),
+        ),
+        shown(
+            "Over time",
+            "Error, latency and state over time; what was out is shaded",
+            lambda dress: pictures.over_time(
+                panels,
+                [Strip("state", seconds, frames.state)],
+                _outages_s(outcome, start_ns),
+                dress,
+            ),
+        ),
+    ]
+
+
+def _outages_s(outcome: Outcome, start_ns: int) -> list[tuple[float, float]]:
+    """The outages on the axis of capture times, which is another clock's."""
+    frames = outcome.frames
+    known = frames.captured_ns != UNKNOWN
+    if not known.any():
+        return []
+    ahead_ns = int(np.median((frames.captured_ns - frames.time_ns)[known])) + start_ns
+    return [((o.begin_ns - ahead_ns) / 1e9, (o.end_ns - ahead_ns) / 1e9) for o in outcome.outages]

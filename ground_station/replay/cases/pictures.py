@@ -1,0 +1,240 @@
+"""Pictures of runs: paths coloured by how far they are off, errors over time, distributions.
+
+Colours are evaluation's (Okabe and Ito); what is coloured by a number has `cividis`, which people
+of every colour vision read alike. Lines differ in style, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ground_station.evaluation import plots
+from ground_station.evaluation.plots import GAP_S
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.estimate import State
+from ground_station.map.floorplan import FloorPlan
+from ground_station.presentation.dress import LIGHT, Dress, dressed
+
+Array = npt.NDArray[np.float64]
+
+WIDTH_IN = 6.6
+"""Narrow, so that what is written in a picture can be read on a narrow screen."""
+_SMALL = 8.5
+_LEAST = {"cm": 0.1, "°": 0.01, "ms": 1.0}
+_STATES = {
+    State.TRACKING.value: "#009e73",
+    State.DEGRADED.value: "#e69f00",
+    State.LOST.value: "#d55e00",
+    State.INITIALIZING.value: "#8c8c8c",
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values over time of one run: `time_s` and `values`, (N,) each; `style` 0 is A's, 1 is B's."""
+
+    label: str
+    time_s: Array
+    values: Array
+    style: int = 0
+
+
+@dataclass(frozen=True)
+class Strip:
+    """The states of a run over time: `time_s` (N,), `states` N names."""
+
+    label: str
+    time_s: Array
+    states: Sequence[str]
+
+
+def path(
+    points_m: Array,
+    off_m: Array,
+    *,
+    under: Sequence[tuple[str, Trajectory]] = (),
+    lost_m: Array | None = None,
+    first_m: Array | None = None,
+    floorplan: FloorPlan | None = None,
+    label: str = "off, cm",
+    dress: Dress = LIGHT,
+) -> Figure:
+    """A path from above, each of its poses (N, 3) coloured by how far it is off (N,).
+
+    `under` are other paths, as lines; `lost_m` (K, 3) poses that this one is without; `first_m`
+    (3,) where two runs part. Where nothing is off a colour scale would only mislead: it ends at a
+    millimetre at least.
+    """
+    figure = plots.trajectory_plot(None, None, floorplan, dress)
+    figure.set_size_inches(WIDTH_IN, 4.9)
+    axes = figure.axes[0]
+    for k, (name, trajectory) in enumerate(under):
+        x, y = _broken(trajectory.time_ns / 1e9, trajectory.position_m[:, :2].T)
+        style = "-" if k == 0 else "--"
+        axes.plot(x, y, color=dress.truth, lw=3.2 - 2 * k, alpha=0.4, ls=style, label=name)
+    if lost_m is not None and len(lost_m):
+        axes.plot(*lost_m[:, :2].T, "x", color=dress.second, ms=5, mew=1.2, label="without a pose")
+    finite = np.isfinite(off_m)
+    if finite.any():
+        order = np.argsort(off_m[finite])  # the worst on top
+        xy, cm = points_m[finite][order, :2], 100 * off_m[finite][order]
+        # Dark on white paper, light on black: far off stands out on both.
+        scale = "cividis_r" if dress is LIGHT else "cividis"
+        top = max(0.1, float(cm[-1]))
+        drawn = axes.scatter(
+            xy[:, 0], xy[:, 1], s=9, c=cm, cmap=scale, vmin=0.0, vmax=top, zorder=3
+        )
+        bar = figure.colorbar(drawn, ax=axes, fraction=0.045, pad=0.02)
+        bar.set_label(label, color=dress.ink, fontsize=_SMALL)
+        bar.ax.tick_params(colors=dress.ink, labelsize=_SMALL)
+        bar.outline.set_visible(False)
+    if first_m is not None and np.isfinite(first_m).all():
+        axes.plot(*first_m[:2], "o", mfc="none", mec=dress.second, ms=13, mew=2, zorder=4,
+                  label="first difference")  # fmt: skip
+    _zoom(axes, [points_m, *(t.position_m for _, t in under)])
+    _legend_above(axes, dress)
+    return figure
+
+
+def _zoom(axes: Axes, paths_m: Sequence[Array]) -> None:
+    """To the paths with some of the plan around them: in a large hall a short one is a speck."""
+    every = np.vstack([path[:, :2] for path in paths_m])
+    every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        return
+    low, high = every.min(axis=0), every.max(axis=0)
+    margin = max(1.0, 0.15 * float((high - low).max()))
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def over_time(
+    panels: Sequence[tuple[str, Sequence[Series], float | None]],
+    strips: Sequence[Strip] = (),
+    outages_s: Sequence[tuple[float, float]] = (),
+    dress: Dress = LIGHT,
+) -> Figure:
+    """Panels over one another, each a label, its series and a bound; the states below; outages
+    shaded. Times are seconds from the flight's first frame."""
+    rows = len(panels) + bool(strips)
+    heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)] * bool(strips)
+    figure = _sheet((WIDTH_IN, sum(heights) + 0.7), dress)
+    grid = figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (label, series, bound) in zip(grid, panels, strict=False):
+        dressed(axes, dress, _SMALL)
+        # Of what is nothing at all the axis shows a usual span, not the rounding.
+        top = max(_LEAST.get(label.rpartition(", ")[2], 1e-6), bound or 0.0)
+        for one in series:
+            colour, line = _style(one.style, dress)
+            t, v = _broken(one.time_s, one.values[None, :])
+            axes.plot(t, v, color=colour, ls=line, lw=1.2, label=one.label)
+            top = max(top, float(np.nanmax(one.values, initial=0.0)))
+        if bound is not None:
+            axes.axhline(bound, color=dress.limit, ls=":", lw=1.4, label="bound")
+        axes.set_ylim(0, 1.15 * top)
+        axes.set_ylabel(label, fontsize=_SMALL)
+        _shade(axes, outages_s, dress)
+        if len(series) > 1 or bound is not None or outages_s:
+            _legend_above(axes, dress)
+    if strips:
+        _draw_strips(grid[-1], strips, dress)
+        _shade(grid[-1], outages_s, dress)
+    grid[-1].set_xlabel("time, s", fontsize=_SMALL)
+    return figure
+
+
+def distributions(
+    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], dress: Dress = LIGHT
+) -> Figure:
+    """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
+    figure = _sheet((WIDTH_IN, 2.9), dress)
+    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axes, (label, sets) in zip(grid, panels, strict=True):
+        dressed(axes, dress, _SMALL)
+        for k, (name, values) in enumerate(sets):
+            known = np.sort(values[np.isfinite(values)])
+            if not len(known):
+                continue
+            colour, line = _style(k, dress)
+            share = np.arange(1, len(known) + 1) / len(known)
+            axes.step(known, share, where="post", color=colour, ls=line, lw=1.4, label=name)
+        axes.set_xlim(left=0)
+        axes.set_ylim(0, 1.02)
+        axes.set_xlabel(label, fontsize=_SMALL)
+        _legend_above(axes, dress)
+    grid[0].set_ylabel("share of frames", fontsize=_SMALL)
+    return figure
+
+
+def _draw_strips(axes: Axes, strips: Sequence[Strip], dress: Dress) -> None:
+    dressed(axes, dress, _SMALL)
+    axes.grid(False)
+    seen: set[str] = set()
+    for row, strip in enumerate(strips):
+        for name, begin_s, end_s in _stretches(strip):
+            axes.barh(-row, end_s - begin_s, left=begin_s, height=0.72, color=_STATES[name])
+            seen.add(name)
+    axes.set_yticks([-row for row in range(len(strips))], [strip.label for strip in strips])
+    axes.tick_params(axis="y", length=0, labelsize=_SMALL)
+    axes.spines["left"].set_visible(False)
+    axes.legend(
+        handles=[Patch(color=_STATES[name], label=name) for name in _STATES if name in seen],
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
+        labelcolor=dress.ink, fontsize=_SMALL - 1, handlelength=1.0, borderpad=0.0,
+    )  # fmt: skip
+
+
+def _stretches(strip: Strip) -> list[tuple[str, float, float]]:
+    """Runs of the same state without a pause: name, begin, end, seconds."""
+    t = strip.time_s
+    if not len(t):
+        return []
+    step_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.033
+    found: list[tuple[str, float, float]] = []
+    begin = 0
+    for k in range(1, len(t) + 1):
+        ended = k == len(t) or strip.states[k] != strip.states[k - 1]
+        if ended or t[k] - t[k - 1] > max(3 * step_s, 0.2):
+            found.append((strip.states[begin], float(t[begin]), float(t[k - 1]) + step_s))
+            begin = k
+    return found
+
+
+def _sheet(size_in: tuple[float, float], dress: Dress) -> Figure:
+    figure = Figure(figsize=size_in, layout="constrained", facecolor=dress.paper)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _style(k: int, dress: Dress) -> tuple[str, str]:
+    return (dress.estimate, "-") if k == 0 else (dress.second, "--")
+
+
+def _shade(axes: Axes, outages_s: Sequence[tuple[float, float]], dress: Dress) -> None:
+    for number, (begin_s, end_s) in enumerate(outages_s):
+        label = "out" if number == 0 else None
+        axes.axvspan(begin_s, end_s, color=dress.ink, alpha=0.13, lw=0, label=label)
+
+
+def _legend_above(axes: Axes, dress: Dress) -> None:
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
+            labelcolor=dress.ink, fontsize=_SMALL, handlelength=1.6, borderpad=0.0,
+            columnspacing=1.2,
+        )  # fmt: skip
+
+
+def _broken(time_s: Array, values: Array) -> list[Array]:
+    """Rows of values (R, N) with a NaN in every pause; of one row, the times before it."""
+    gaps = np.flatnonzero(np.diff(time_s) > GAP_S) + 1
+    rows = [np.insert(np.asarray(row, np.float64), gaps, np.nan) for row in values]
+    return rows if len(rows) > 1 else [np.insert(time_s.astype(np.float64), gaps, np.nan), *rows]

@@ -1,0 +1,137 @@
+"""The outcome of a replay that has just ended."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from ground_station.geometry.trajectory import Trajectory
+from ground_station.map.floorplan import FloorPlan, load_floorplan
+from ground_station.map.store import Map
+from ground_station.replay.cases import frames, program
+from ground_station.replay.cases.outcome import Accounts, Outage, Outcome, Run, map_sha256
+from ground_station.replay.cases.resources import Side
+from ground_station.replay.live import LiveResult
+from ground_station.replay.replay import ReplayResult
+from pi_firmware.wire import messages
+
+
+def outcome_of(
+    result: ReplayResult,
+    map_: Map,
+    *,
+    title: str = "",
+    case: str = "",
+    payload: str = "process",
+    link: str = "loopback",
+    seconds: float = 0.0,
+    outages: Sequence[Outage] = (),
+    link_counts: dict[str, int] | None = None,
+    health: messages.Health | None = None,
+    refused: int | None = None,
+    payload_side: Side | None = None,
+    ground_side: Side | None = None,
+    truth: Trajectory | None = None,
+    notes: Sequence[str] = (),
+) -> Outcome:
+    """What a replay found, ready to be written, judged and compared.
+
+    `health` and `refused` are what the telemetry listener knows of the payload at the end; `truth`
+    stands in place of the recording's own. `outages` are by this machine's wall clock. Of a payload
+    elsewhere whose resources nobody measured, its health message tells.
+    """
+    settings, live = result.settings, result.live
+    if payload_side is None and health is not None:
+        payload_side = Side(health.memory_MB, health.cpu, "its health message")
+    truth = result.truth if truth is None else truth
+    table = table_of(live)
+    run = Run(
+        title=title or f"Replay of {settings.recording.name}",
+        case=case,
+        payload=payload,
+        link=link,
+        recording=settings.recording.name,
+        map=map_.info.name,
+        map_sha256=map_sha256(map_),
+        preset=settings.preset,
+        init=settings.init if settings.init in ("none", "truth") else "file",
+        stepped=settings.stepped,
+        rate_hz=settings.rate_hz,
+        seed=result.localizer.seed,
+        began=datetime.now(UTC).isoformat(timespec="seconds"),
+        seconds=seconds,
+        complete=live.complete,
+        accounts=Accounts(**live.accounts()),
+        stream=dataclasses.asdict(live.stream),
+        link_counts=dict(link_counts or {}),
+        clock_offset=live.clock_offset(),
+        outages=[dataclasses.asdict(outage) for outage in outages],
+        battery=None if live.battery is None else dataclasses.asdict(live.battery),
+        health=None if health is None else dataclasses.asdict(health),
+        refused=refused,
+        payload_side=dataclasses.asdict(payload_side or Side()),
+        ground_side=dataclasses.asdict(ground_side or Side()),
+        versions=program.versions() | _told(health),
+        settings={
+            "replay": _plain(dataclasses.asdict(settings), without=("recording", "pictures")),
+            "localizer": dataclasses.asdict(result.localizer),
+            "camera": result.camera.as_dict(),
+        },
+        notes=list(notes),
+    )
+    return Outcome(run, table, within(truth, table), floorplan_of(map_))
+
+
+def table_of(live: LiveResult) -> frames.Frames:
+    """The frames of a live session as a table."""
+    known = live.clock_offset() is not None
+    rows = [
+        frames.FrameRow(
+            sequence=frame.sequence,
+            time_ns=frame.estimate.time_ns,
+            captured_ns=frame.done_ns - round(1e6 * late_ms) if known else frames.UNKNOWN,
+            arrival_ns=frame.arrival_ns,
+            done_ns=frame.done_ns,
+            state=frame.estimate.state.value,
+            reason=frame.estimate.reason,
+            relocalized=frame.estimate.relocalized,
+            wTc=frame.estimate.wTc,
+        )
+        for frame, late_ms in zip(live.frames, live.latency_ms().tolist(), strict=True)
+    ]
+    return frames.table(rows)
+
+
+def within(truth: Trajectory | None, table: frames.Frames) -> Trajectory | None:
+    """The truth from the first to the last frame: the stretch that was flown; None when empty."""
+    if truth is None or not len(table):
+        return None
+    keep = (truth.time_ns >= table.time_ns.min()) & (truth.time_ns <= table.time_ns.max())
+    if not np.any(keep):
+        return None
+    return Trajectory(truth.time_ns[keep], truth.position_m[keep], truth.quaternion_xyzw[keep])
+
+
+def floorplan_of(map_: Map) -> FloorPlan | None:
+    """The plan in a map's folder, where it has one."""
+    path = None if map_.folder is None else map_.folder / "floorplan.yaml"
+    return load_floorplan(path) if path is not None and path.is_file() else None
+
+
+def _told(health: messages.Health | None) -> dict[str, str]:
+    if health is None or not health.version:
+        return {}
+    how = f" ({health.release})" if health.release else ""
+    return {"pi_firmware": f"{health.version}{how}"}
+
+
+def _plain(settings: dict[str, Any], without: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in settings.items()
+        if name not in without
+    }

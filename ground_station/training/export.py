@@ -1,0 +1,117 @@
+"""Trained weights to the model's file. Needs no torch: the weights are numpy arrays by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.feature_models import scale
+from ground_station.feature_models.graph import Graph, fold_batch_norm
+from ground_station.features.model import ModelInfo
+from ground_station.training.errors import TrainingError
+from ground_station.training.topology import LOGITS, Conv, Shape, layers
+
+EPSILON = 1e-5
+"""Of the batch normalisations, in training and where they are folded."""
+
+LICENCE = "BSD-3-Clause"
+NMS_PX = 3
+THRESHOLD = 0.005
+SUBPIXEL_PX = 2
+
+Array = npt.NDArray[np.float32]
+Weights = Mapping[str, Array]
+
+
+def info(shape: Shape, source: str) -> ModelInfo:
+    """What the file says of itself."""
+    return ModelInfo(
+        name=shape.name,
+        layout="cells",
+        dimension=shape.dimension,
+        multiple=shape.multiple,
+        licence=LICENCE,
+        source=source,
+        nms_px=NMS_PX,
+        threshold=THRESHOLD,
+        subpixel_px=SUBPIXEL_PX,
+    )
+
+
+def folded(shape: Shape, weights: Weights) -> dict[str, Array]:
+    """`LAYER.weight` (out, in, k, k) and `LAYER.bias` (out,) of all layers, in their order.
+
+    Batch normalisations are folded into the convolutions before them: of SuperPoint's size this is
+    Magic Leap's layout. Raises `TrainingError` as `export`.
+    """
+    result: dict[str, Array] = {}
+    for layer in layers(shape):
+        weight, bias = _folded(layer, weights)
+        result |= {f"{layer.name}.weight": weight, f"{layer.name}.bias": bias}
+    return result
+
+
+def _folded(layer: Conv, weights: Weights) -> tuple[Array, Array]:
+    def take(name: str, *shape: int) -> Array:
+        if name not in weights:
+            raise TrainingError(f"the weights lack '{name}'")
+        array = weights[name]
+        if array.shape != shape:
+            raise TrainingError(f"'{name}' is {array.shape}; this network has {shape}")
+        return array
+
+    n, name = layer.channels_out, layer.name
+    weight = take(f"{name}.weight", n, layer.channels_in, layer.size, layer.size)
+    if not layer.norm:
+        return weight, take(f"{name}.bias", n)
+    scale, shift, mean, variance = (
+        take(f"{name}.norm.{term}", n) for term in ("weight", "bias", "mean", "var")
+    )
+    return fold_batch_norm(weight, None, scale, shift, mean, variance, EPSILON)
+
+
+class _OnnxOperations:
+    """The graph's nodes; batch normalisations are folded into the convolutions before them."""
+
+    def __init__(self, graph: Graph, weights: Weights) -> None:
+        self._graph, self._weights = graph, weights
+
+    def conv(self, layer: Conv, x: str) -> str:
+        weight, bias = _folded(layer, self._weights)
+        return self._graph.conv(x, weight, bias, stride=layer.stride, padding=layer.size // 2)
+
+    def relu(self, x: str) -> str:
+        return self._graph.relu(x)
+
+    def add(self, first: str, second: str) -> str:
+        return self._graph.add(first, second)
+
+    def concat(self, first: str, second: str) -> str:
+        return self._graph.concat([first, second])
+
+    def half(self, x: str) -> str:
+        return self._graph.max_pool(x, 2)
+
+    def double(self, x: str) -> str:
+        return self._graph.resize_bilinear(x, 2)
+
+
+def export(shape: Shape, weights: Weights, path: str | Path, source: str) -> ModelInfo:
+    """Writes the model's file, atomically; raises `TrainingError` naming a weight that is wrong.
+
+    Weights by name: `LAYER.weight` (out, in, k, k), and either `LAYER.bias` or
+    `LAYER.norm.weight|bias|mean|var`, all (out,).
+    """
+    graph = Graph(shape.name)
+    image = graph.input("image", 1)
+    logits, descriptors = shape.build(_OnnxOperations(graph, weights), image)
+    graph.output(logits, "logits", LOGITS)
+    graph.output(descriptors, "descriptors", shape.dimension)
+    made = info(shape, source)
+    made = replace(made, distance_scale=scale.measured(graph.model(made), made))
+    graph.save(path, made)
+    return made

@@ -1,0 +1,300 @@
+"""Training from the corpus to the model's file, in steps that a kill can only delay."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from ground_station.features import model
+from ground_station.features.cells import CellFeatures
+from ground_station.features.extractor import Extractor
+from ground_station.features.inference import Network
+from ground_station.features.pixels import PixelFeatures
+from ground_station.features.rootsift import RootSift
+from ground_station.features.settings import LearnedSettings
+from ground_station.progress import Progress
+from ground_station.training import checkpoint, corpus, curve, teacher, validation
+from ground_station.training.batches import batches
+from ground_station.training.errors import TrainingError
+from ground_station.training.export import export, folded
+from ground_station.training.losses import Losses
+from ground_station.training.network import FeatureNetwork, write_weights
+from ground_station.training.pairs import Pair, PairSource
+from ground_station.training.recipe import Recipe, finite, is_due, pairs_seen
+from ground_station.training.trainer import Trainer
+
+_LOG_EVERY = 25
+_HELD_OUT_PAIRS = 48
+_MOST_POINTS = 300
+"""Key points a held-out view: 1,200 in a picture of 640x480."""
+_DIFFERENCE = 1e-4
+"""What onnxruntime's outputs may differ from torch's, of the largest."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What the run has, which changes nothing but the rounding of its results."""
+
+    device: str = "auto"
+    threads: int = 2
+    jobs: int = 2
+    precision: str = "auto"
+    """Of the network's arithmetic: bfloat16 on a GPU, else float32. Processors that have bfloat16,
+    too, train nearly twice as fast in it."""
+    checkpoint_every: int = 250
+    validate_every: int = 1000
+
+    def chosen(self) -> torch.device:
+        """The device; raises `TrainingError` where there is none."""
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise TrainingError(f"device is '{self.device:.40}'; allowed: auto, cpu, cuda")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise TrainingError("device is 'cuda', but torch finds no GPU here")
+        if self.device == "auto":
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.device)
+
+    def bfloat16(self) -> bool | None:
+        """What the precision says; None: as the device has it. Raises `TrainingError`."""
+        known = {"auto": None, "float32": False, "bfloat16": True}
+        if self.precision not in known:
+            raise TrainingError(f"precision is '{self.precision:.40}'; allowed: {', '.join(known)}")
+        return known[self.precision]
+
+
+def train(
+    recipe: Recipe,
+    *,
+    out: Path,
+    corpus_folder: Path,
+    teacher: str,
+    machine: Machine,
+    resume: bool = False,
+    decay_from: Path | None = None,
+) -> dict[str, Any]:
+    """Runs a recipe in a folder and returns the last figures.
+
+    The folder then holds `checkpoints/`, `log.jsonl`, `curve.png` and the model's file, of
+    SuperPoint's size also its weights in Magic Leap's layout. Raises `TrainingError` where it holds
+    a run already and `resume` is not set, or another recipe's.
+    """
+    device = machine.chosen()
+    torch.set_num_threads(machine.threads)
+    cv2.setNumThreads(1)
+    checkpoints = out / "checkpoints"
+    try:
+        checkpoints.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainingError(f"{checkpoints}: {error.strerror or error}") from None
+    start = checkpoint.newest(checkpoints)
+    if start is not None and not resume:
+        raise TrainingError(f"{out} holds a run at step {start.step}; go on with --resume")
+    fresh = start is None
+    if start is None and decay_from is not None:
+        start = checkpoint.read(decay_from)
+        recipe = recipe.decaying_from(start.step)
+    elif start is not None:
+        # A resumed run is as long as it was, whoever asks.
+        recipe = recipe.as_long_as(_recipe_of(start))
+    trainer = Trainer(recipe, device, machine.bfloat16())
+    step, before_s = 0, 0.0
+    if start is not None:
+        if other := recipe.differences(_recipe_of(start)):
+            raise TrainingError(f"the checkpoint is of another recipe: {', '.join(other)} differ")
+        trainer.restore(start)
+        step, before_s = start.step, float(start.state.get("seconds", 0))
+    corpus.make(corpus_folder, recipe.corpus, teacher, machine.jobs)
+    held_folder = corpus_folder / "held-out"
+    corpus.make(held_folder, recipe.held_out(), teacher, machine.jobs)
+    size = (recipe.rows, recipe.columns)
+    source = PairSource(
+        corpus.Corpus(corpus_folder, recipe.corpus), recipe.seed, size, recipe.points
+    )
+    held = PairSource(corpus.Corpus(held_folder, recipe.held_out()), 0, size, recipe.points)
+    run = _Run(recipe, trainer, out, machine, before_s, [
+        held.pair(0, k) for k in range(_HELD_OUT_PAIRS)
+    ], fresh)  # fmt: skip
+    run.begins(teacher, step)
+    if fresh:
+        run.baselines(teacher, step)
+    return run.go(source, step)
+
+
+def _recipe_of(start: checkpoint.Checkpoint) -> dict[str, Any]:
+    recipe = start.state.get("recipe")
+    if not isinstance(recipe, dict):
+        raise TrainingError(f"the checkpoint of step {start.step} names no recipe")
+    return recipe
+
+
+class _Run:
+    def __init__(
+        self, recipe: Recipe, trainer: Trainer, out: Path, machine: Machine, before_s: float,
+        held: list[Pair], fresh: bool,
+    ) -> None:  # fmt: skip
+        self._fresh = fresh
+        self.recipe, self.trainer, self.machine, self.held = recipe, trainer, machine, held
+        self.out, self.model = out, out / f"{trainer.shape.name}.onnx"
+        self.log: curve.Log | None = None
+        self._before_s, self._started_s = before_s, time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """That this run and those that it goes on from took."""
+        return self._before_s + time.monotonic() - self._started_s
+
+    def note(self, step: int) -> curve.Log:
+        if self.log is None:
+            self.log = curve.Log(self.out / "log.jsonl", -1 if self._fresh else step)
+        return self.log
+
+    def begins(self, teacher_name: str, step: int) -> None:
+        """Notes what goes on from here: a resumed run may have a larger corpus."""
+        teacher_sha256 = teacher.load(teacher_name).sha256
+        self.note(step).add(
+            "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256,
+            device=str(self.trainer.device), bfloat16=self.trainer.bfloat16,
+        )  # fmt: skip
+
+    def baselines(self, teacher_name: str, step: int) -> None:
+        """What others make of the same held-out pairs."""
+        found = teacher.load(teacher_name)
+        others: dict[str, Extractor] = {
+            "rootsift": RootSift(_MOST_POINTS),
+            found.info.name: PixelFeatures(
+                Network(found, threads=self.machine.threads), _MOST_POINTS, LearnedSettings()
+            ),
+        }
+        for name, extractor in others.items():
+            figures = validation.figures(extractor, self.held)
+            self.note(step).add("baseline", step=step, name=name, **asdict(figures))
+            _say(name, figures)
+
+    def go(self, source: PairSource, step: int) -> dict[str, Any]:
+        """The steps that are left; an interrupt ends them after a checkpoint."""
+        recipe, machine = self.recipe, self.machine
+        log = self.note(step)
+        names = [field.name for field in fields(Losses)]
+        sums = torch.zeros(len(names), device=self.trainer.device)
+        count, since_s, written = 0, time.monotonic(), step
+        stream = batches(
+            source, recipe.batch, step, recipe.steps, machine.jobs, self.trainer.device
+        )
+        # A log has lines enough of its own.
+        bar = Progress("steps", recipe.steps - step) if sys.stderr.isatty() else nullcontext()
+        with _stop_noted() as stopped, bar, closing(stream):
+            for batch in stream:
+                made = self.trainer.step(step, batch)
+                # Read only where it is logged: a GPU would wait for each number.
+                sums += torch.stack([getattr(made, name).detach() for name in names])
+                count, step = count + 1, step + 1
+                if isinstance(bar, Progress):
+                    bar.step()
+                if is_due(step, _LOG_EVERY, recipe.steps):
+                    means, now_s = (sums / count).tolist(), time.monotonic()
+                    values = {n: round(finite(v), 5) for n, v in zip(names, means, strict=True)}
+                    rate = 2 * recipe.batch * count / (now_s - since_s)
+                    log.add(
+                        "train", step=step, **values, rate=recipe.rate_at(step - 1),
+                        images_per_s=round(rate, 2), seconds=round(self.seconds, 1),
+                    )  # fmt: skip
+                    if is_due(step, 8 * _LOG_EVERY, recipe.steps):
+                        text = " ".join(f"{k} {v:.3f}" for k, v in values.items())
+                        print(f"step {step}: {text}, {rate:.1f} images/s", file=sys.stderr)
+                    sums, count, since_s = torch.zeros_like(sums), 0, now_s
+                if is_due(step, machine.checkpoint_every, recipe.steps) or stopped[0]:
+                    self.save(step)
+                    written = step
+                if stopped[0]:
+                    break
+                if step % machine.validate_every == 0 and step < recipe.steps:
+                    self.validate(step)
+                    since_s = time.monotonic()
+        if written != step:
+            self.save(step)
+        return self.validate(step)
+
+    def save(self, step: int) -> None:
+        """A checkpoint, unless training has run away: then the last one stays the last."""
+        finite(float(sum(p.detach().abs().sum() for p in self.trainer.network.parameters())))
+        state = {"recipe": self.recipe.as_dict(), "seconds": self.seconds}
+        checkpoint.write(
+            self.out / "checkpoints", self.trainer.checkpoint(step, state),
+            keep_every=20 * self.machine.checkpoint_every,
+        )  # fmt: skip
+
+    def validate(self, step: int) -> dict[str, Any]:
+        """Exports the weights' mean, holds the file to torch's outputs, and judges it."""
+        pairs = pairs_seen(self.recipe, step)
+        source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs; teacher ALIKE, BSD-3"
+        weights, shape = self.trainer.weights(), self.trainer.shape
+        export(shape, weights, self.model, source)
+        if shape.importable:
+            write_weights(self.model.with_suffix(".pth"), folded(shape, weights))
+        network = Network(model.read(self.model), threads=self.machine.threads)
+        self.compare(network)
+        extractor = CellFeatures(network, _MOST_POINTS, LearnedSettings())
+        figures = validation.figures(extractor, self.held)
+        _say(f"step {step}", figures)
+        values = asdict(figures)
+        log = self.note(step)
+        log.add("validation", step=step, **values, seconds=round(self.seconds, 1))
+        curve.plot(log.path, self.out / "curve.png")
+        return {"model": str(self.model), "step": step, "steps": self.recipe.steps, "pairs": pairs,
+                "seconds": round(self.seconds, 1), **values}  # fmt: skip
+
+    def compare(self, network: Network) -> None:
+        """Raises `TrainingError` where the file does not say what torch says."""
+        with torch.random.fork_rng(devices=[]):  # the first weights are drawn for nothing
+            mean = FeatureNetwork(self.trainer.shape)
+        mean.load_state_dict({k: v.cpu() for k, v in self.trainer.mean.items()})
+        mean.eval()
+        image = torch.from_numpy(self.held[0].images[:1, None].astype(np.float32) / 255)
+        with torch.no_grad():
+            wanted = mean(image)
+        said = network.run(image.numpy())
+        for name, ours in zip(("logits", "descriptors"), wanted, strict=True):
+            gap = float(np.abs(said[name] - ours.numpy()).max())
+            if not gap <= _DIFFERENCE * max(1.0, float(ours.abs().max())):
+                raise TrainingError(f"{self.model}: its {name} differ from torch's by {gap:.2g}")
+
+
+def _say(name: str, figures: validation.Figures) -> None:
+    print(
+        f"{name}: {100 * figures.accuracy:.1f} % of matches within 3 px ({figures.correct:.0f} a "
+        f"pair), repeatability {100 * figures.repeatability:.1f} %, {figures.error_px:.2f} px",
+        file=sys.stderr,
+    )
+
+
+@contextmanager
+def _stop_noted() -> Iterator[list[bool]]:
+    """Inside, Ctrl-C and SIGTERM only set the list's element; the second Ctrl-C is obeyed."""
+    noted = [False]
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if noted[0] and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        noted[0] = True
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

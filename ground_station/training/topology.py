@@ -1,0 +1,167 @@
+"""The networks' shapes, written once: torch trains them, ONNX carries them, a counter counts them.
+
+Each is a function over some `Operations`, which say what a convolution or a sum is to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from ground_station.training.errors import TrainingError
+
+CELL_PX = 8
+LOGITS = CELL_PX * CELL_PX + 1
+"""A cell's pixels and "none", as SuperPoint's detector has them."""
+
+
+@dataclass(frozen=True)
+class Conv:
+    """One convolution, with as many zeros around as keep the size at stride 1.
+
+    `norm`: a batch normalisation follows, which the exported network has inside its weights.
+    """
+
+    name: str
+    channels_in: int
+    channels_out: int
+    size: int = 3
+    stride: int = 1
+    norm: bool = True
+
+
+class Operations(Protocol):
+    """What a network is made of. Tensors are whatever the implementation takes for them."""
+
+    def conv(self, layer: Conv, x: Any) -> Any:
+        """A convolution, normalised if its layer says so."""
+
+    def relu(self, x: Any) -> Any:
+        """max(x, 0)."""
+
+    def add(self, first: Any, second: Any) -> Any:
+        """The sum."""
+
+    def concat(self, first: Any, second: Any) -> Any:
+        """Channels after channels."""
+
+    def half(self, x: Any) -> Any:
+        """The largest of each 2x2 pixels."""
+
+    def double(self, x: Any) -> Any:
+        """Twice the size, bilinear, pixel centres at half numbers."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A network: image (N, 1, H, W) to logits (N, 65, H/8, W/8) and descriptors (N, D, ...).
+
+    H and W must be multiples of `multiple`.
+    """
+
+    name: str
+    dimension: int
+    multiple: int
+    build: Callable[[Operations, Any], tuple[Any, Any]]
+    importable: bool = False
+    """Its weights, folded, are what `blimp models import` knows: Magic Leap's names and shapes."""
+
+
+def _wren(o: Operations, image: Any) -> tuple[Any, Any]:
+    """Strided stem to a quarter of the size, residual blocks at 1/8 and 1/16, two heads.
+
+    Context comes from 1/16; where a point is to a fraction of a pixel, the detector sees at 1/4.
+    """
+
+    def layer(name: str, x: Any, a: int, b: int, size: int = 3, stride: int = 1) -> Any:
+        return o.relu(o.conv(Conv(name, a, b, size, stride), x))
+
+    def residual(name: str, x: Any, width: int) -> Any:
+        y = layer(f"{name}.1", x, width, width)
+        return o.relu(o.add(x, o.conv(Conv(f"{name}.2", width, width), y)))
+
+    x = layer("stem.1", image, 1, 16, stride=2)
+    x = layer("stem.2", x, 16, 32, stride=2)
+    quarter = layer("quarter", x, 32, 32)
+    eighth = residual("eighth", layer("to_eighth", quarter, 32, 64, stride=2), 64)
+    x = layer("to_sixteenth", eighth, 64, 64, stride=2)
+    x = residual("sixteenth.b", residual("sixteenth.a", x, 64), 64)
+    x = layer("fuse", o.add(eighth, o.double(x)), 64, 64, size=1)
+    fine = layer("detector.fine", quarter, 32, 64, stride=2)
+    y = layer("detector.both", o.concat(fine, x), 128, 64, size=1)
+    logits = o.conv(Conv("detector.logits", 64, LOGITS, 1, norm=False), y)
+    y = layer("descriptor.wide", x, 64, 128, size=1)
+    return logits, o.conv(Conv("descriptor.out", 128, 64, 1, norm=False), y)
+
+
+def _superpoint(o: Operations, image: Any) -> tuple[Any, Any]:
+    """DeTone et al., "SuperPoint", CVPR-W 2018, section 3; normalised while it is trained."""
+    x, a = image, 1
+    for stage, b in enumerate((64, 64, 128, 128), 1):
+        for half in "ab":
+            x = o.relu(o.conv(Conv(f"conv{stage}{half}", a, b), x))
+            a = b
+        if stage < 4:
+            x = o.half(x)
+    y = o.relu(o.conv(Conv("convPa", 128, 256), x))
+    logits = o.conv(Conv("convPb", 256, LOGITS, 1, norm=False), y)
+    y = o.relu(o.conv(Conv("convDa", 128, 256), x))
+    return logits, o.conv(Conv("convDb", 256, 256, 1, norm=False), y)
+
+
+SHAPES = {
+    "wren": Shape("wren", 64, 16, _wren),
+    "superpoint": Shape("wren-superpoint", 256, 8, _superpoint, importable=True),
+}
+
+
+def shape_of(size: str) -> Shape:
+    """The network of that size; raises `TrainingError` naming those there are."""
+    if size not in SHAPES:
+        raise TrainingError(f"size is '{size:.40}'; there are: {', '.join(SHAPES)}")
+    return SHAPES[size]
+
+
+class _Counter:
+    """Operations on (rows, columns) that only remember the layers and count their products."""
+
+    def __init__(self) -> None:
+        self.layers: list[Conv] = []
+        self.macs = 0
+
+    def conv(self, layer: Conv, x: tuple[int, int]) -> tuple[int, int]:
+        self.layers.append(layer)
+        rows, columns = x[0] // layer.stride, x[1] // layer.stride
+        per_pixel = layer.channels_in * layer.channels_out * layer.size**2
+        self.macs += rows * columns * per_pixel
+        return rows, columns
+
+    def relu(self, x: tuple[int, int]) -> tuple[int, int]:
+        return x
+
+    def add(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
+        return first
+
+    def concat(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
+        return first
+
+    def half(self, x: tuple[int, int]) -> tuple[int, int]:
+        return x[0] // 2, x[1] // 2
+
+    def double(self, x: tuple[int, int]) -> tuple[int, int]:
+        return x[0] * 2, x[1] * 2
+
+
+def layers(shape: Shape) -> tuple[Conv, ...]:
+    """The convolutions in the order in which they run."""
+    counter = _Counter()
+    shape.build(counter, (0, 0))
+    return tuple(counter.layers)
+
+
+def multiply_adds(shape: Shape, rows: int, columns: int) -> int:
+    """Products of all convolutions for one picture, biases and sums not counted."""
+    counter = _Counter()
+    shape.build(counter, (rows, columns))
+    return counter.macs

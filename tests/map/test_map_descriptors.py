@@ -1,0 +1,77 @@
+"""Descriptors stay in their file, a byte a number, and come out as unit rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from ground_station.map import store
+from ground_station.map.descriptors import Descriptors, quantised
+
+
+@pytest.fixture
+def rows():
+    rows = np.random.default_rng(3).normal(size=(50, 16)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", ["descriptor_u8", "descriptor_i8"])
+def test_rows_are_unit_float32_within_a_degree_of_what_was_quantised(rows, name):
+    rows = np.abs(rows) if name == "descriptor_u8" else rows
+    arrays = quantised(rows)
+    assert list(arrays) == [name] and arrays[name].itemsize == 1
+    kept = Descriptors(arrays[name])
+    assert kept.shape == (50, 16) and len(kept) == 50
+    index = np.array([4, 4, 49, 0])
+    for some in (index, slice(10, 20), rows[:, 0] > 0.2):
+        assert kept[some].dtype == np.float32
+        assert np.allclose(np.linalg.norm(kept[some], axis=1), 1, atol=1e-6)
+        cosine = np.einsum("ij,ij->i", kept[some], rows[some])
+        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 1
+    assert np.array_equal(kept[7], kept[7:8][0])
+    assert np.array_equal(np.asarray(kept), kept[:]) and np.asarray(kept, float).dtype == float
+    assert kept[np.empty(0, int)].shape == (0, 16)
+    assert quantised(kept)[name] is arrays[name]
+
+
+def test_a_row_of_nothing_is_nothing_and_not_nan():
+    assert not Descriptors(np.zeros((2, 8), np.uint8))[:].any()
+
+
+def test_rows_that_were_not_quantised_are_made_unit(rows):
+    kept = Descriptors(3 * rows)
+    assert np.allclose(kept[:], rows, atol=1e-6)
+    again = Descriptors(quantised(kept)["descriptor_i8"])
+    assert np.abs(again[:] - rows).max() < 0.01
+
+
+def test_a_loaded_map_keeps_its_descriptors_in_the_file(built):
+    kept = store.load(built.folder).landmarks.descriptor
+    assert isinstance(kept, Descriptors)
+    assert isinstance(kept.values.base, np.memmap) or isinstance(kept.values, np.memmap)
+    assert kept.values.dtype == np.uint8 and not kept.values.flags.writeable
+
+
+def test_a_map_is_replaced_while_another_still_reads_it(built, tmp_path):
+    folder = tmp_path / "map"
+    shutil.copytree(built.folder, folder)
+    loaded = store.load(folder)
+    before = loaded.landmarks.descriptor[:].copy()
+    store.save_tables(folder, loaded)
+    assert np.array_equal(loaded.landmarks.descriptor[:], before)
+    assert np.array_equal(store.load(folder).landmarks.descriptor[:], before)
+
+
+def test_a_map_without_landmarks_has_no_descriptors(built, tmp_path):
+    fields = [field.name for field in dataclasses.fields(store.Landmarks)]
+    none = store.Landmarks(**{n: getattr(built.map.landmarks, n)[:0] for n in fields})
+    keyframes = store.Keyframes(
+        [], np.empty(0, np.int64), np.empty((0, 4, 4)), np.zeros(1, np.int64),
+        np.empty(0, np.int32), np.empty((0, 2), np.float32),
+    )  # fmt: skip
+    store.save_tables(tmp_path, store.Map(built.map.info, none, keyframes))
+    loaded = store.load(tmp_path).landmarks
+    assert len(loaded) == 0 and loaded.descriptor[:].shape == (0, built.map.info.dimension)

@@ -1,0 +1,139 @@
+"""The networks' shapes and the file that training leaves: what it costs, and that it runs."""
+
+import numpy as np
+import onnx
+import pytest
+import torch_files
+import training_models
+
+from ground_station.feature_models import images, importer
+from ground_station.features import model
+from ground_station.features.cells import CellFeatures
+from ground_station.features.inference import Network
+from ground_station.features.settings import LearnedSettings
+from ground_station.training import export
+from ground_station.training.errors import TrainingError
+from ground_station.training.topology import SHAPES, multiply_adds, shape_of
+
+
+def counted(path, rows: int, columns: int) -> int:
+    """Products of the file's convolutions, from its own shapes: another reckoning than ours."""
+    proto = onnx.load(str(path))
+    for axis, size in ((0, 1), (2, rows), (3, columns)):
+        proto.graph.input[0].type.tensor_type.shape.dim[axis].dim_value = size
+    del proto.graph.value_info[:]
+    for output in proto.graph.output:
+        output.type.tensor_type.ClearField("shape")
+    inferred = onnx.shape_inference.infer_shapes(proto, data_prop=True)
+    values = (*inferred.graph.value_info, *inferred.graph.output)
+    shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
+    weights = {w.name: list(w.dims) for w in inferred.graph.initializer}
+    total = 0
+    for node in inferred.graph.node:
+        if node.op_type == "Conv":
+            _, channels, h, w = shapes[node.output[0]]
+            assert channels and h and w
+            total += h * w * int(np.prod(weights[node.input[1]]))
+    return total
+
+
+@pytest.mark.parametrize("size", sorted(SHAPES))
+def test_the_file_costs_what_the_shape_says(tmp_path, size):
+    shape = SHAPES[size]
+    path = tmp_path / f"{size}.onnx"
+    export.export(shape, training_models.weights(shape), path, "a test")
+    macs = multiply_adds(shape, 480, 640)
+    assert counted(path, 480, 640) == macs
+    if size == "wren":  # what ships: the bounds of its issue
+        assert macs <= 1.5e9
+        assert path.stat().st_size <= 2_000_000
+        assert 64 <= shape.dimension <= 128
+    else:  # 26 GMAC, as SuperPoint
+        assert macs == pytest.approx(26e9, rel=0.01)
+
+
+def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
+    shape = SHAPES["wren"]
+    paths = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
+    for path in paths:
+        export.export(shape, training_models.weights(shape), path, "a test")
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    read = model.read(paths[0])
+    assert (read.info.name, read.info.layout, read.info.dimension) == ("wren", "cells", 64)
+    picture = images.procedural(1, 0, (120, 168))  # no multiple of 16: it is padded
+    found = CellFeatures(Network(read), 200, LearnedSettings()).extract(picture)
+    assert len(found) > 20
+    assert np.linalg.norm(found.descriptors, axis=1) == pytest.approx(1, abs=1e-5)
+    assert (found.keypoints_px >= 0).all()
+    assert (found.keypoints_px <= [167, 119]).all()
+
+
+def test_normalisation_is_folded_into_the_weights(tmp_path):
+    """The graph against the network reckoned layer by layer in numpy, on a small picture."""
+    shape = SHAPES["superpoint"]
+    weights = training_models.weights(shape, seed=2)
+    path = tmp_path / "sp.onnx"
+    export.export(shape, weights, path, "a test")
+    picture = np.random.default_rng(0).random((1, 1, 16, 24)).astype(np.float32)
+    said = Network(model.read(path)).run(picture)
+    logits, descriptors = shape.build(Reference(weights), picture[0].astype(np.float64))
+    assert said["logits"][0] == pytest.approx(logits, abs=1e-3)
+    assert said["descriptors"][0] == pytest.approx(descriptors, abs=1e-3)
+
+
+def test_superpoints_size_comes_in_again_as_magic_leaps_file(tmp_path, monkeypatch):
+    """Trained and folded, written as torch.save of 2018 did, imported: the network that it was."""
+    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
+    shape = SHAPES["superpoint"]
+    weights = training_models.weights(shape, seed=3)
+    assert [name for name, s in SHAPES.items() if s.importable] == ["superpoint"]
+    export.export(shape, weights, tmp_path / "own.onnx", "a test")
+    (tmp_path / "own.pth").write_bytes(torch_files.legacy_of(export.folded(shape, weights)))
+    brought = importer.import_weights(tmp_path / "own.pth", None)
+    assert brought.info.name == "superpoint"
+    picture = np.random.default_rng(1).random((1, 1, 64, 96)).astype(np.float32)
+    said, own = (Network(m).run(picture) for m in (brought, model.read(tmp_path / "own.onnx")))
+    for name in ("logits", "descriptors"):
+        assert said[name].shape[2:] == (8, 12)
+        assert said[name] == pytest.approx(own[name], abs=1e-5 * float(np.abs(own[name]).max()))
+
+
+class Reference:
+    """The operations that SuperPoint's shape needs, plainly, in float64."""
+
+    def __init__(self, weights):
+        self.weights = weights
+
+    def conv(self, layer, x):
+        pad = layer.size // 2
+        x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
+        windows = np.lib.stride_tricks.sliding_window_view(x, (layer.size,) * 2, axis=(1, 2))
+        y = np.einsum("chwij,ocij->ohw", windows, self.weights[f"{layer.name}.weight"])
+        if not layer.norm:
+            return y + self.weights[f"{layer.name}.bias"][:, None, None]
+        scale, shift, mean, var = (
+            self.weights[f"{layer.name}.norm.{t}"][:, None, None]
+            for t in ("weight", "bias", "mean", "var")
+        )
+        return (y - mean) / np.sqrt(var + 1e-5) * scale + shift
+
+    def relu(self, x):
+        return np.maximum(x, 0)
+
+    def half(self, x):
+        c, h, w = x.shape
+        return x.reshape(c, h // 2, 2, w // 2, 2).max(axis=(2, 4))
+
+
+def test_wrong_weights_and_sizes_are_refused_by_name(tmp_path):
+    shape = SHAPES["wren"]
+    weights = training_models.weights(shape)
+    missing = {k: v for k, v in weights.items() if k != "fuse.norm.var"}
+    with pytest.raises(TrainingError, match=r"lack 'fuse\.norm\.var'"):
+        export.export(shape, missing, tmp_path / "x.onnx", "a test")
+    weights["stem.1.weight"] = weights["stem.1.weight"][:, :, :2]
+    with pytest.raises(TrainingError, match=r"'stem\.1\.weight' is \(16, 1, 2, 3\)"):
+        export.export(shape, weights, tmp_path / "x.onnx", "a test")
+    assert not (tmp_path / "x.onnx").exists()
+    with pytest.raises(TrainingError, match="size is 'tiny'; there are: wren, superpoint"):
+        shape_of("tiny")

@@ -1,0 +1,341 @@
+"""The run itself: checkpoints, the command's refusals, and, with torch, that a killed run goes on
+as if nothing had been and that the file says what torch says."""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import training_models
+
+from ground_station.training import checkpoint, command, curve
+from ground_station.training.checkpoint import Checkpoint
+from ground_station.training.corpus import CorpusSettings
+from ground_station.training.errors import TrainingError
+from ground_station.training.recipe import Recipe
+
+CORPUS = CorpusSettings(
+    seed=3, pictures=4, rooms=0, warps=1, points=60, per_shard=2, rows=128, columns=160
+)
+TINY = Recipe(
+    corpus=CORPUS, rows=64, columns=96, batch=2, points=16, steps=6, warm_up=2, decay=2,
+    place_from=3,
+)  # fmt: skip
+
+
+def arguments(*given: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return parser.parse_args(given)
+
+
+def test_without_torch_one_line_says_how_to_get_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(TrainingError) as raised:
+        command.run(arguments("--out", str(tmp_path / "run")))
+    assert "pip install" in str(raised.value) and "\n" not in str(raised.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_rate_goes_up_stays_and_ends_at_nought_wherever_it_branches_off():
+    recipe = Recipe(steps=1000, warm_up=100, decay=200, rate=1e-3)
+    rates = np.array([recipe.rate_at(k) for k in range(1000)])
+    assert (np.diff(rates[:100]) > 0).all()
+    assert (rates[100:799] == 1e-3).all()
+    assert (np.diff(rates[801:]) < 0).all() and 0 < rates[-1] < 1e-5
+    branch = recipe.decaying_from(400)
+    assert branch.steps == 600
+    assert branch.rate_at(399) == 1e-3 and 0 < branch.rate_at(599) < 1e-5
+    assert not recipe.differences(branch.as_dict())
+    assert recipe.differences(replace(recipe, batch=9).as_dict()) == ["batch"]
+    assert recipe.differences({"size": "wren"})[-1] == "corpus"
+    assert recipe.as_long_as(branch.as_dict()).steps == 600
+    # A run of before there was a loss on places keeps the recipe's beginning of it.
+    older = {k: v for k, v in recipe.as_dict().items() if k != "place_from"}
+    assert not recipe.differences(older)
+    assert recipe.as_long_as(older).place_from == recipe.place_from
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"size": "huge"}, "size is 'huge'; there are: wren, superpoint"),
+        ({"rate": float("nan")}, "rate is nan; allowed: 1e-07 to 1"),
+        ({"batch": 0}, "batch is 0; allowed: 1 to 4096"),
+        ({"columns": 100}, "multiples of 16"),
+        ({"rows": 512}, "larger than the corpus' pictures"),
+    ],
+)
+def test_a_recipe_that_trains_nothing_is_refused(change, line):
+    with pytest.raises(TrainingError) as raised:
+        replace(Recipe(), **change)
+    assert line in str(raised.value) and "\n" not in str(raised.value)
+
+
+def some(step: int) -> Checkpoint:
+    arrays = {"a": np.arange(step, dtype=np.float32), "b": np.array(3.0, np.float32)}
+    return Checkpoint(step, arrays, {"step": step})
+
+
+def test_checkpoints_come_back_and_a_damaged_one_gives_way_to_the_one_before(tmp_path):
+    assert checkpoint.newest(tmp_path) is None
+    for step in (10, 20, 30, 40, 50):
+        path = checkpoint.write(tmp_path, some(step), keep_every=20)
+    # The last three, and those at whole multiples for branches.
+    assert [step for step, _ in checkpoint.steps(tmp_path)] == [20, 30, 40, 50]
+    newest = checkpoint.newest(tmp_path)
+    assert newest is not None and newest.step == 50 and newest.state == {"step": 50}
+    assert (newest.arrays["a"] == np.arange(50)).all() and newest.arrays["b"].shape == ()
+    damaged = bytearray(path.read_bytes())
+    damaged[-5] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(TrainingError, match="checksum"):
+        checkpoint.read(path)
+    before = checkpoint.newest(tmp_path)
+    assert before is not None and before.step == 40
+    (tmp_path / "step-0000060.safetensors").write_bytes(b"")  # cut
+    assert checkpoint.newest(tmp_path).step == 40  # type: ignore[union-attr]
+    with pytest.raises(TrainingError, match="is called step-"):
+        checkpoint.read(tmp_path / "elsewhere.safetensors")
+
+
+def test_a_resumed_log_forgets_what_will_be_done_again(tmp_path):
+    path = tmp_path / "log.jsonl"
+    log = curve.Log(path, 0)
+    for step in (1, 2, 3):
+        log.add("train", step=step)
+    with path.open("a") as file:
+        file.write('{"kind": "tra')  # killed in the middle of a line
+    curve.Log(path, 2).add("train", step=3, again=True)
+    assert [line["step"] for line in curve.read(path)] == [1, 2, 3]
+    assert curve.read(path)[-1]["again"] is True
+    assert json.loads(path.read_text().splitlines()[0])["step"] == 1
+
+
+# From here on torch is needed, which the project's own environment has not.
+
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch", reason="training's tests need torch, an optional extra")
+
+
+@pytest.fixture(scope="module")
+def made(torch, tmp_path_factory) -> tuple[str, Path]:
+    """A teacher and a corpus."""
+    folder = tmp_path_factory.mktemp("corpus")
+    teacher = training_models.teacher(folder / "made-up.onnx")
+    from ground_station.training import corpus
+
+    corpus.make(folder / "corpus", CORPUS, teacher, jobs=1)
+    corpus.make(folder / "corpus" / "held-out", TINY.held_out(), teacher, jobs=1)
+    return teacher, folder / "corpus"
+
+
+def train(
+    made: tuple[str, Path], out: Path, recipe: Recipe = TINY, precision: str = "auto", **options
+):
+    from ground_station.training.loop import Machine
+    from ground_station.training.loop import train as run
+
+    teacher, corpus = made
+    machine = Machine(
+        "cpu", threads=1, jobs=0, precision=precision, checkpoint_every=2, validate_every=4
+    )
+    return run(recipe, out=out, corpus_folder=corpus, teacher=teacher, machine=machine, **options)
+
+
+def last(out: Path) -> Checkpoint:
+    found = checkpoint.newest(out / "checkpoints")
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def straight(made, tmp_path_factory) -> Path:
+    """A run that nothing cut."""
+    out = tmp_path_factory.mktemp("straight")
+    result = train(made, out)
+    assert result["step"] == 6
+    return out
+
+
+def test_a_run_leaves_model_log_and_curve(straight):
+    lines = curve.read(straight / "log.jsonl")
+    kinds = [line["kind"] for line in lines]
+    assert kinds.count("baseline") == 2 and "validation" in kinds and "train" in kinds
+    assert (straight / "wren.onnx").stat().st_size > 500_000
+    assert (straight / "curve.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("at", [1, 3, 4])
+def test_a_killed_run_goes_on_to_the_same_weights(made, straight, tmp_path, monkeypatch, at):
+    from ground_station.training.trainer import Trainer
+
+    step = Trainer.step
+
+    class Killed(Exception):
+        """Nothing is done after it, as after SIGKILL."""
+
+    def dies(self, number, batch):
+        if number == at:
+            raise Killed
+        return step(self, number, batch)
+
+    monkeypatch.setattr(Trainer, "step", dies)
+    with pytest.raises(Killed):
+        train(made, tmp_path / "run")
+    monkeypatch.undo()
+    if at > 1:  # before the first checkpoint there is nothing to go on from
+        with pytest.raises(TrainingError, match="--resume"):
+            train(made, tmp_path / "run")
+    train(made, tmp_path / "run", resume=True)
+    ours, theirs = last(tmp_path / "run"), last(straight)
+    assert ours.arrays.keys() == theirs.arrays.keys()
+    for name, array in theirs.arrays.items():
+        assert array.tobytes() == ours.arrays[name].tobytes(), name
+    model = "wren.onnx"
+    assert (tmp_path / "run" / model).read_bytes() == (straight / model).read_bytes()
+
+
+def test_arithmetic_of_fewer_bits_trains_the_same_weights_but_for_their_last_digits(
+    made, straight, tmp_path
+):
+    train(made, tmp_path / "run", precision="bfloat16")
+    ours, theirs = last(tmp_path / "run"), last(straight)
+    names = [name for name in theirs.arrays if name.startswith("network.")]
+    assert all(ours.arrays[name].dtype == theirs.arrays[name].dtype for name in names)
+    weights = [name for name in names if theirs.arrays[name].ndim == 4]
+    off = [np.abs(ours.arrays[name] - theirs.arrays[name]).max() for name in weights]
+    assert 0 < max(off) < 2.5 * TINY.rate * TINY.steps  # as far as so many steps can go
+    log = curve.read(tmp_path / "run" / "log.jsonl")
+    assert [line["bfloat16"] for line in log if line["kind"] == "recipe"] == [True]
+    with pytest.raises(TrainingError, match="precision is 'half'; allowed: auto, float32"):
+        train(made, tmp_path / "other", precision="half")
+
+
+def test_key_points_places_count_from_their_step_on(made, straight, tmp_path):
+    def place(folder):
+        return curve.read(folder / "log.jsonl")[-2]["place"]
+
+    train(made, tmp_path / "late", replace(TINY, place_from=6))
+    assert place(tmp_path / "late") == 0 < place(straight)
+    ours, theirs = last(tmp_path / "late"), last(straight)
+    name = next(k for k in theirs.arrays if k.startswith("network.") and theirs.arrays[k].ndim == 4)
+    assert (ours.arrays[name] != theirs.arrays[name]).any()
+
+
+def test_another_recipe_does_not_go_on(made, straight):
+    with pytest.raises(TrainingError, match="another recipe: batch differ"):
+        train(made, straight, replace(TINY, batch=3), resume=True)
+
+
+def test_a_branch_ends_a_run_from_any_checkpoint(made, straight, tmp_path):
+    kept = checkpoint.steps(straight / "checkpoints")[0]
+    result = train(made, tmp_path / "end", decay_from=kept[1])
+    assert result["step"] == kept[0] + TINY.decay
+    log = [line for line in curve.read(tmp_path / "end" / "log.jsonl") if line["kind"] == "train"]
+    assert log[-1]["rate"] < TINY.rate / 2
+
+
+@pytest.mark.parametrize("size", ["wren", "superpoint"])
+def test_the_file_says_what_torch_says(torch, tmp_path, size):
+    from ground_station.features import model
+    from ground_station.features.inference import Network
+    from ground_station.training import export
+    from ground_station.training.network import FeatureNetwork, exported
+    from ground_station.training.topology import SHAPES
+
+    torch.manual_seed(1)
+    network = FeatureNetwork(SHAPES[size])
+    image = torch.rand(2, 1, 64, 96)
+    for _ in range(3):  # so that the normalisations have seen something
+        network(image)
+    network.eval()
+    path = tmp_path / "x.onnx"
+    export.export(SHAPES[size], exported(SHAPES[size], network.state_dict()), path, "a test")
+    said = Network(model.read(path)).run(image.numpy())
+    with torch.no_grad():
+        wanted = network(image)
+    for name, ours in zip(("logits", "descriptors"), wanted, strict=True):
+        scale = max(1.0, float(ours.abs().max()))
+        assert np.abs(said[name] - ours.numpy()).max() <= 1e-4 * scale
+
+
+def test_weights_of_superpoints_size_are_a_file_that_the_import_takes(
+    torch, made, tmp_path, monkeypatch
+):
+    """torch writes it, our own reader of torch's files brings it in, and it is the same network."""
+    from ground_station.feature_models import importer
+    from ground_station.features import model
+    from ground_station.features.inference import Network
+
+    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
+    run = tmp_path / "run"
+    train(made, run, replace(TINY, size="superpoint", steps=2, warm_up=0, decay=1))
+    own, brought = (
+        Network(m).run(np.full((1, 1, 32, 48), 0.5, np.float32))
+        for m in (
+            model.read(run / "wren-superpoint.onnx"),
+            importer.import_weights(run / "wren-superpoint.pth", None),
+        )
+    )
+    for name, value in own.items():
+        assert value == pytest.approx(brought[name], abs=1e-5 * float(np.abs(value).max()))
+
+
+def test_the_losses_are_least_where_they_should_be(torch):
+    from ground_station.training.losses import (
+        LossSettings,
+        descriptor_loss,
+        detector_loss,
+        distillation_loss,
+        sampled,
+    )
+
+    torch.manual_seed(0)
+    settings = LossSettings()
+    labels = torch.softmax(3 * torch.randn(2, 65, 3, 4), dim=1)
+    known = torch.ones(2, 3, 4)
+    least = detector_loss(labels.log(), labels, known)
+    for _ in range(5):
+        assert detector_loss(labels.log() + 0.3 * torch.randn_like(labels), labels, known) > least
+    known[:, 0] = 0  # what is not known counts nothing
+    wrong = labels.log().clone()
+    wrong[:, :, 0] += 5 * torch.randn(2, 65, 4)
+    assert detector_loss(wrong, labels, known) == pytest.approx(
+        detector_loss(labels.log(), labels, known)
+    )
+    one = torch.nn.functional.normalize(torch.randn(2, 20, 16), dim=2)
+    points = torch.rand(2, 2, 20, 2) * 300
+    used = torch.ones(2, 20, dtype=torch.bool)
+    loss, right = descriptor_loss(one, one, points, used, settings)
+    other, fewer = descriptor_loss(one, one[:, torch.randperm(20)], points, used, settings)
+    assert right == 1 and loss < 0.1 < other and fewer < 0.5
+    points[:, :, 1] = points[:, :, 0] + 1  # one place: none of the two is wrong
+    same = one.clone()
+    same[:, 1] = same[:, 0]
+    assert descriptor_loss(same, same, points, used, settings)[0] < 0.1
+    likeness = {"teacher_temperature": settings.temperature}
+    equal = distillation_loss(one, one, one, points, used, replace(settings, **likeness))
+    assert float(equal) == pytest.approx(0, abs=1e-5)
+    assert distillation_loss(one, one[:, torch.randperm(20)], one, points, used, settings) > 0.1
+    # Sampled where the extractor samples: the middle of cell (1, 2) is pixel (19.5, 11.5).
+    field = torch.randn(1, 8, 4, 5)
+    at = sampled(field, torch.tensor([[[19.5, 11.5]]]))
+    assert torch.allclose(at[0, 0], torch.nn.functional.normalize(field[0, :, 1, 2], dim=0))
+
+
+def test_descriptors_are_sampled_as_the_extractor_samples_them(torch):
+    from ground_station.features import sampling
+    from ground_station.training.losses import sampled
+
+    rng = np.random.default_rng(0)
+    field = rng.standard_normal((8, 6, 9)).astype(np.float32)
+    points = rng.uniform(0, (71, 47), (40, 2)).astype(np.float32)
+    ours = sampled(torch.from_numpy(field)[None], torch.from_numpy(points)[None])[0].numpy()
+    theirs, _ = sampling.unit(sampling.bicubic(field, (points - 3.5) / 8))
+    assert ours == pytest.approx(theirs, abs=1e-4)
