@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 EXAMPLE = """\
 examples:
   blimp simulate --plan loop --light cloudy --seed 7 --out out/loop.mcap
+  blimp simulate --light-steps 5:0.01,6:1 --duration-s 10 --out out/lights-off.mcap
   blimp simulate --scene hall --plan stills --lens-error 0.01 --out out/stills.mcap
   blimp simulate --scene rooms --plan headset --seed 3 --out out/headset.mcap"""
 
@@ -64,6 +65,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="deviation of the air's speed (default: 0.05)",
     )
     add("--build", metavar="NAME", help="the blimp, of hw/builds.toml (default: atrium)")
+    add(
+        "--exposure-steps",
+        default="",
+        metavar="T:EV[,T:EV...]",
+        help="from T seconds on, exposures off by EV from what auto exposure asks for:"
+        " 5:1,10:-1,15:0",
+    )
+    add(
+        "--light-steps",
+        default="",
+        metavar="T:SHARE[,T:SHARE...]",
+        help="from T seconds on, this share of the light: 5:0.01,6:1 is a second of lights off",
+    )
+    add(
+        "--flicker",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="light that swings by this share, 100 times a second: bands in exposures other than"
+        " whole hundredths of a second (default: 0)",
+    )
+    add(
+        "--longest-exposure-s",
+        type=float,
+        metavar="S",
+        help="no exposure is longer, gain does the rest (default: 1/60)",
+    )
     quality = parser.add_mutually_exclusive_group()
     quality.add_argument(
         "--crf", type=float, default=20.0, help="x264's quality, 0 (best) to 51 (default: 20)"
@@ -123,5 +151,7 @@ def settings_from(args: argparse.Namespace) -> SimulationSettings:
         duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
         bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points, build=args.build,
         draught_m_s=args.draught_m_s, lens_error=args.lens_error,
+        exposure_steps=args.exposure_steps, light_steps=args.light_steps, flicker=args.flicker,
+        longest_exposure_s=args.longest_exposure_s,
         camera=None if args.camera is None else load_camera(args.camera),
     )  # fmt: skip

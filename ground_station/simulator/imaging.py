@@ -210,6 +210,8 @@ class AutoExposure:
 
     def __init__(self, sensor: Sensor, first_radiance: Floats) -> None:
         self._sensor = sensor
+        self.off_ev = 0.0
+        """By how many doublings exposures are more than the light asks for."""
         self._log_product = math.log(1e-3)
         for _ in range(20):
             self._log_product += self._error(first_radiance, math.exp(self._log_product))
@@ -217,7 +219,7 @@ class AutoExposure:
     @property
     def settings(self) -> tuple[float, float]:
         """Exposure time, seconds, and gain."""
-        s, product = self._sensor, math.exp(self._log_product)
+        s, product = self._sensor, math.exp(self._log_product) * 2**self.off_ev
         exposure = min(max(product, s.exposure_limits_s[0]), s.exposure_limits_s[1])
         gain = min(max(product / exposure, s.gain_limits[0]), s.gain_limits[1])
         return exposure, gain

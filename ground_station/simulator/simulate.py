@@ -22,19 +22,28 @@ from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.simulator import dynamics, handheld, scenes
 from ground_station.simulator.encoding import H264Encoder
-from ground_station.simulator.imaging import AutoExposure, FrameMaker, Sensor, covering_pinhole
+from ground_station.simulator.imaging import (
+    AutoExposure,
+    FrameMaker,
+    Sensor,
+    covering_pinhole,
+    row_offsets_s,
+)
 from ground_station.simulator.known_points import choose_sights, write_pairs
 from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
+from ground_station.simulator.unsteady import unsteady
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 FIRST_FRAME_S = 1.0
 """Capture time of the first frame, seconds after the payload's (simulated) boot at 0."""
 
 _RUN_UP_S = 3.0  # a runner's way from rest to full speed
+
+_UNSTEADY = ("exposure_steps", "light_steps", "flicker", "longest_exposure_s")
 
 Progress = Callable[[int, int], None]
 
@@ -48,6 +57,9 @@ class SimulationSettings:
 
     `build` is one of `hw/builds.toml`; None: the one that `simulated` there names. `draught_m_s` is
     the deviation of the air's speed along each axis; None: that of a quiet hall.
+
+    `exposure_steps`, `light_steps` and `flicker` are as `unsteady` reads them; with a
+    `longest_exposure_s` gain does what time may not, as against motion blur.
     """
 
     out: Path
@@ -68,6 +80,10 @@ class SimulationSettings:
     lens_error: float = 0.0
     build: str | None = None
     draught_m_s: float | None = None
+    exposure_steps: str = ""
+    light_steps: str = ""
+    flicker: float = 0.0
+    longest_exposure_s: float | None = None
 
     def __post_init__(self) -> None:
         limits = {
@@ -77,6 +93,7 @@ class SimulationSettings:
             "supersampling": (0.25, 3.0),
             "renders": (1, 8),
             "lens_error": (-0.2, 0.2),
+            "longest_exposure_s": (2e-4, 1 / 60),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)
@@ -88,6 +105,7 @@ class SimulationSettings:
             raise SimulatorError(f"draught_m_s is {self.draught_m_s:g}; allowed: 0 to 2 m/s")
         if self.bitrate_kbps is not None and not 10 <= self.bitrate_kbps <= 100_000:
             raise SimulatorError(f"bitrate_kbps is {self.bitrate_kbps}; allowed: 10 to 100000")
+        unsteady(self.exposure_steps, self.light_steps, self.flicker)
 
 
 @dataclass(frozen=True)
@@ -217,7 +235,7 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     started = time.monotonic()
     light_named(settings.light)  # refused before anything costly
     flight = prepare_flight(settings)
-    camera, sensor = flight.camera, Sensor()
+    camera, sensor = flight.camera, _sensor(settings)
     _, lit = lit_scene(settings.scene, settings.texels_per_m, settings.light)
     pinhole = covering_pinhole(camera, settings.supersampling)
     buffer = (pinhole.width_px, pinhole.height_px)
@@ -250,6 +268,14 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     )  # fmt: skip
 
 
+def _sensor(settings: SimulationSettings) -> Sensor:
+    sensor = Sensor()
+    if settings.longest_exposure_s is None:
+        return sensor
+    shortest_s = sensor.exposure_limits_s[0]
+    return replace(sensor, exposure_limits_s=(shortest_s, settings.longest_exposure_s))
+
+
 def _record(
     settings: SimulationSettings, flight: Flight, maker: FrameMaker, progress: Progress | None
 ) -> tuple[int, bool]:
@@ -260,15 +286,26 @@ def _record(
         camera.width_px, camera.height_px, flight.rate_hz,
         crf=settings.crf, bitrate_kbps=settings.bitrate_kbps,
     )  # fmt: skip
+    changes = unsteady(settings.exposure_steps, settings.light_steps, settings.flicker)
+    rows_s = row_offsets_s(camera)
+
+    def seen(t: float, exposure_s: float) -> npt.NDArray[np.float32]:
+        radiance = maker.radiance(motion, t, exposure_s)
+        if not changes.lit_evenly:
+            light = changes.row_light(t + rows_s, exposure_s)
+            radiance *= light.astype(np.float32)[:, None, None]
+        return radiance
+
     taken = 0
     with _recording(settings.out) as writer, _interrupt_noted() as interrupted:
         _write_head(writer, settings, flight, stamps[0])
-        exposure = AutoExposure(maker.sensor, maker.radiance(motion, float(times[0]), 0.0))
+        exposure = AutoExposure(maker.sensor, seen(float(times[0]), 0.0))
         for k, t in enumerate(times.tolist()):
             if flight.plan.stands:  # held until the exposure has settled
-                exposure = AutoExposure(maker.sensor, maker.radiance(motion, t, 0.0))
+                exposure = AutoExposure(maker.sensor, seen(t, 0.0))
+            exposure.off_ev = float(changes.exposure_ev.at(t))
             exposure_s, gain = exposure.settings
-            radiance = maker.radiance(motion, t, exposure_s)
+            radiance = seen(t, exposure_s)
             picture = maker.expose(radiance, exposure_s, gain, flight.noise)
             exposure.update(radiance, 1 / flight.rate_hz)
             pose = motion.wTc([t])[0]
@@ -315,6 +352,7 @@ def _write_head(
                 else {}
             ),
             **({"lens_error": f"{settings.lens_error:g}"} if settings.lens_error else {}),
+            **{name: str(value) for name in _UNSTEADY if (value := getattr(settings, name))},
         },
     )
     if settings.lens_error:
