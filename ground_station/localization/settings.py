@@ -191,8 +191,8 @@ class TrackingSettings:
         unit="px", low=0.05, high=10,
     )  # fmt: skip
     max_difference: float = config.key(
-        30.0, "a point whose surroundings differ by more grey levels in the mean is another",
-        low=0, high=255,
+        0.5, "a point whose surroundings differ by more of their contrast in the mean is another",
+        low=0, high=8,
     )  # fmt: skip
     sigma_px: float = config.key(
         3.0,

@@ -16,7 +16,7 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import TrackingSettings, load_preset
-from ground_station.localization.tracking import Keyframe, spread_out, track
+from ground_station.localization.tracking import Keyframe, evenly_lit, spread_out, track
 from ground_station.localization.worker import BESIDE_NICE, Worker
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
@@ -155,6 +155,50 @@ def test_points_of_what_is_no_longer_there_are_dropped(wall):
     assert tracks.sought == len(keyframe) and len(tracks.point) < 0.2 * tracks.sought
 
 
+def relit(picture: np.ndarray, light: float | np.ndarray, seed: int = 2) -> np.ndarray:
+    """A picture (H, W) in that many times the light, a number or (H, 1), with a sensor's noise."""
+    level = np.clip(light * (picture / 255.0) ** 2.2, 0, 1)
+    noise = np.random.default_rng(seed).normal(0, 1, picture.shape)
+    return np.clip(np.rint(255 * level ** (1 / 2.2) + noise), 0, 255).astype(np.uint8)
+
+
+def bands(share: float) -> np.ndarray:
+    """The light (H, 1) of a lamp of 100 Hz in rows read out within 20 ms."""
+    return 1 + share * np.sin(2 * np.pi * 2 * np.arange(480)[:, None] / 480)
+
+
+@pytest.mark.parametrize(
+    "light",
+    [2.0, 0.5, 0.25, 0.03, bands(0.4), bands(0.6)],
+    ids=["+1 EV", "-1 EV", "-2 EV", "lights off", "flicker", "strong flicker"],
+)
+def test_points_are_followed_into_another_light(wall, light):
+    keyframe = wall.keyframe(np.eye(4))
+    wTc = poses.exp([0.02, -0.03, 0.04, 0.1, -0.05, 0.1])
+    predicted = wTc @ poses.exp([0.004, 0.004, 0.0, 0.01, 0.0, 0.0])
+    picture = relit(wall.picture(wTc), light)
+    tracks = track(keyframe, picture, predicted, wall.camera, TrackingSettings())
+    truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
+    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
+    assert len(tracks.point) > 0.9 * tracks.sought > 100
+    assert np.median(off) < 0.15 and np.percentile(off, 95) < 0.6
+
+
+def test_gain_and_offset_leave_an_evenly_lit_picture_as_it_is(wall):
+    picture = wall.picture(np.eye(4))
+    even, changed = evenly_lit(picture), evenly_lit((0.5 * picture + 60).astype(np.uint8))
+    assert even.shape == picture.shape and even.dtype == np.uint8
+    assert 120 < even.mean() < 136 and 24 < even.std() < 36
+    assert np.abs(even.astype(int) - changed).mean() < 4
+
+
+def test_noise_is_no_contrast():
+    noise = np.random.default_rng(4).normal(0, 1, (480, 640))
+    even = evenly_lit(np.clip(np.rint(90 + noise), 0, 255).astype(np.uint8))
+    assert 126 < even.mean() < 130 and even.std() < 8
+    assert (evenly_lit(np.full((3, 2), 7, np.uint8)) == 128).all()
+
+
 def test_points_out_of_view_are_not_sought(wall):
     keyframe = wall.keyframe(np.eye(4))
     away = poses.exp([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])
@@ -191,6 +235,20 @@ def test_the_same_frames_give_the_same_poses_again(wall):
     first, second = (run(wall)[0] for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert np.array_equal(a.wTc, b.wTc) and np.array_equal(a.covariance, b.covariance)
+
+
+def test_neither_exposure_nor_light_nor_flicker_is_a_reason_to_lose_a_frame(wall):
+    localizer, _ = make(wall)
+    times, truth = path(40)
+    localizer.set_initial_pose(truth[0], times[0])
+    light = [2.0, 0.5, 1.0, 0.02, 1.0]  # of eight frames each
+    for k, (time_ns, wTc) in enumerate(zip(times, truth, strict=True)):
+        flicker = np.roll(bands(0.4), 160 * k, axis=0)
+        picture = relit(wall.picture(wTc), light[k // 8] * flicker, seed=k)
+        estimate = localizer.process(time_ns, picture, k)
+        assert estimate.state is State.TRACKING, (k, estimate.reason)
+        apart = poses.log(poses.inverse(wTc) @ estimate.wTc)
+        assert np.linalg.norm(apart[3:]) < 0.01 and np.linalg.norm(apart[:3]) < 0.003
 
 
 def a_hand() -> np.ndarray:
