@@ -3,7 +3,7 @@
 BLIMP := .venv/bin/blimp
 
 .PHONY: help setup demo serve test check bench experiments budget hil soak soak-service limits faults fuzz \
-  install-service uninstall-service image flash update hil-image lock sample virtual-camera
+  soak-stream install-service uninstall-service image flash update hil-image lock sample virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -107,6 +107,10 @@ virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, f
 soak-service: setup  ## The same for the whole service, HOURS=1, with a payload that comes and goes
 	@mkdir -p out
 	@.venv/bin/python tests/service/soak.py --hours "$(or $(HOURS),1)" --out out/soak-service.json
+
+soak-stream: setup  ## One unbroken stream of HOURS=1 through the live localizer, as fast as it takes it
+	@mkdir -p out
+	@.venv/bin/python tests/service/soak_stream.py --hours "$(or $(HOURS),1)" --out out/soak-stream.json
 
 lock:  ## Resolve requirements.lock anew from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv

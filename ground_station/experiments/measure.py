@@ -44,7 +44,8 @@ def measure(
     features = replace(settings.features, extractor=OF_THE_MAP)
     settings = replace(settings, features=features)
     camera = scaled_camera(flight.camera, alteration.scale)
-    localizer = Localizer(map_, camera, extractor_for(map_.info, features), settings)
+    extractor = extractor_for(map_.info, features)
+    localizer = Localizer(map_, camera, extractor, settings, smoothing=True)
     lossy = alteration.packet_loss > 0 and flight.recording is not None
     arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
     start_ns = next(iter(flight.frames)).time_ns

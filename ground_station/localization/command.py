@@ -121,7 +121,8 @@ def run(args: argparse.Namespace) -> int:
         camera, said = for_pictures(camera, first.size_px, first.display_deg, str(args.input))
         if said:
             _say(said)
-    localizer = Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
+    extractor = extractor_for(map_.info, settings.features)
+    localizer = Localizer(map_, camera, extractor, settings, smoothing=bool(args.smoothed))
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     start_s = monotonic()

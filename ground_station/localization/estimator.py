@@ -100,9 +100,11 @@ _UNKNOWN = np.full((12, 12), np.nan)
 class FilterEstimator:
     """Pose and velocity from prediction and sights together, rows at their own times."""
 
-    def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
+    def __init__(
+        self, camera: Camera, settings: LocalizerSettings, smoothing: bool = False
+    ) -> None:
         self._camera, self._settings = camera, settings
-        self._smoother = FixedLagSmoother(settings.motion)
+        self._smoother = FixedLagSmoother(settings.motion, keep=smoothing)
 
     def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
         start = self._settings.start
@@ -138,7 +140,10 @@ class FilterEstimator:
         return self._smoother.flush()
 
 
-def make_estimator(camera: Camera, settings: LocalizerSettings) -> Estimator:
-    """The one that `pose.solver` names."""
-    kind = FilterEstimator if settings.pose.solver == "rolling" else PoseEstimator
-    return kind(camera, settings)
+def make_estimator(
+    camera: Camera, settings: LocalizerSettings, smoothing: bool = False
+) -> Estimator:
+    """The one that `pose.solver` names; with `smoothing` it keeps smoothed states to give."""
+    if settings.pose.solver == "rolling":
+        return FilterEstimator(camera, settings, smoothing)
+    return PoseEstimator(camera, settings)

@@ -53,13 +53,24 @@ class Localizer:
     """Frames in, poses out, against one map."""
 
     def __init__(
-        self, map_: Map, camera: Camera, extractor: Extractor, settings: LocalizerSettings
+        self,
+        map_: Map,
+        camera: Camera,
+        extractor: Extractor,
+        settings: LocalizerSettings,
+        *,
+        smoothing: bool = False,
     ) -> None:
-        """Raises `MapError` when the map has other features, or says no numbers of its accuracy."""
+        """With `smoothing` the smoothed poses are kept for `smoothed` to give out: whoever asks for
+        them here is to call it, or they fill the memory of a stream that lasts.
+
+        Raises `MapError` when the map has other features, or says no numbers of its accuracy.
+        """
         check_features(map_.info, extractor.name, extractor.sha256)
         self._accuracy = accuracy(map_.info)
         if not map_.info.registered and np.isfinite(map_.depth_m):
             settings = in_units(settings, map_.depth_m / _USUAL_DEPTH_M)
+        self._smoothing = smoothing
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
@@ -106,8 +117,8 @@ class Localizer:
     def smoothed(self) -> list[Kinematics]:
         """Poses that later frames helped to estimate, each once, some frames after its own.
 
-        Never mixed with the causal ones that `process` returns; empty without a smoother. Those of
-        the last frames are not final before `finish`.
+        Never mixed with the causal ones that `process` returns; empty without `smoothing`, or
+        without a smoother. Those of the last frames are not final before `finish`.
         """
         final, self._smoothed = self._smoothed + self._estimator.smoothed(), []
         return final
@@ -174,7 +185,7 @@ class Localizer:
         return Conditions(exposure_s, sharp, self._seen)
 
     def _fresh(self) -> Estimator:
-        return make_estimator(self.camera, self.settings)
+        return make_estimator(self.camera, self.settings, self._smoothing)
 
     def _replace(self, estimator: Estimator) -> None:
         self._smoothed += self._estimator.flush()

@@ -48,11 +48,13 @@ class FixedLagSmoother:
     Each state is one 12-vector of GTSAM: its step from the solution it came with. Factors are
     linear at that solution, a frame's sights as a Hessian, the process as a Jacobian, so that ISAM2
     never calls back into Python. `failures` counts the updates that could not be used and restarted
-    the graph; `failure` says why the last one could not.
+    the graph; `failure` says why the last one could not. States that leave the lag are kept until
+    `smoothed` is called; without `keep` they are forgotten, and what is held never grows.
     """
 
-    def __init__(self, settings: MotionSettings) -> None:
+    def __init__(self, settings: MotionSettings, keep: bool = True) -> None:
         self.settings = settings
+        self._keep = keep
         self.failures = 0
         self.failure = ""
         self._latest: Kinematics | None = None
@@ -242,6 +244,8 @@ class FixedLagSmoother:
         self._nodes.clear()
 
     def _take(self, node: _Node) -> None:
+        if not self._keep:
+            return
         with contextlib.suppress(RuntimeError, _Refused, ValueError):
             self._left.append(self._estimate(node))
 
