@@ -73,13 +73,15 @@ def gradient_energy(image: npt.NDArray[np.uint8]) -> float:
     if min(height, width) < 2 * _REDUCTION:
         return 0.0
     size = (width // _REDUCTION, height // _REDUCTION)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    variance = float(small.var())
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    variance = float(cv2.meanStdDev(small)[1].item()) ** 2
     if variance < _LEAST_CONTRAST:
         return 0.0
-    x = (small[:-1, 1:] - small[:-1, :-1]).ravel()
-    y = (small[1:, :-1] - small[:-1, :-1]).ravel()
-    return float(x @ x + y @ y) / (len(x) * variance)
+    here = small[:-1, :-1]
+    squares = sum(
+        cv2.norm(there, here, cv2.NORM_L2SQR) for there in (small[:-1, 1:], small[1:, :-1])
+    )
+    return squares / (here.size * variance)
 
 
 def sharpness(energy: float, recent: Sequence[float]) -> float:

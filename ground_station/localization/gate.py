@@ -11,10 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.localization.settings import GateSettings
+from pi_firmware.wire.entropy import of_counts
 
 Image = npt.NDArray[np.uint8]
 
 _BLOCK_PX = 8
+
+
+def entropy_bits(image: Image) -> float:
+    """Shannon's entropy of a picture (H, W), as the payload measures it, in less time."""
+    return of_counts(cv2.calcHist([image], [0], None, [256], [0, 256]).ravel().astype(np.int64))
 
 
 def contrast(image: Image) -> float:

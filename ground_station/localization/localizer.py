@@ -33,7 +33,6 @@ from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
 from ground_station.map.accuracy import accuracy
 from ground_station.map.store import Map, check_features
-from pi_firmware.wire.entropy import entropy_bits
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -146,7 +145,7 @@ class Localizer:
         attempt = Attempt(time_ns, index)
         if (refused := self._refuse(attempt)) is not None:
             return refused
-        attempt.entropy = entropy_bits(image)
+        attempt.entropy = gate.entropy_bits(image)
         attempt.watch.lap("entropy")
         self._last_frame_ns = time_ns
         state, motion = self.settings.state, self.settings.motion

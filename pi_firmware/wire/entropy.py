@@ -11,6 +11,10 @@ def entropy_bits(luma: NDArray[np.uint8]) -> float:
 
     -sum(p log2 p); Shannon, Bell System Technical Journal 27, 1948.
     """
-    counts = np.bincount(luma.ravel(), minlength=256)
-    p = counts[counts > 0] / luma.size
+    return of_counts(np.bincount(luma.ravel(), minlength=256))
+
+
+def of_counts(counts: NDArray[np.int64]) -> float:
+    """The same of a histogram (256,), however it was counted."""
+    p = counts[counts > 0] / counts.sum()
     return max(0.0, -float(p.dot(np.log2(p))))

@@ -11,6 +11,7 @@ from ground_station.localization import gate
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import GateSettings, load_preset
+from pi_firmware.wire.entropy import entropy_bits
 
 SIZE = (480, 640)
 RATE_HZ = 30.0
@@ -34,6 +35,11 @@ class Standing:
     def extract(self, image):
         self.asked += 1
         return self.room.features(self.wTc)
+
+
+def test_entropy_is_the_payloads_of_any_picture():
+    for image in (noise(90.0, 40.0), noise(3.0, 1.0)[:101, :33], np.full(SIZE, 9, np.uint8)):
+        assert gate.entropy_bits(image) == pytest.approx(entropy_bits(image), abs=1e-12)
 
 
 @pytest.mark.parametrize("mean", [3.0, 40.0, 250.0])
