@@ -173,6 +173,13 @@ class Matcher:
         sigma = np.sqrt(np.diag(expected.covariance)[:6])
         return not self.reach_px(_REACH * sigma) > self.radius_px
 
+    def doubt_px(self, points_m: Array, expected: Kinematics) -> float:
+        """How far off nine in ten of landmarks (N, 3) may be from where they are expected."""
+        if not len(points_m):
+            return 0.0
+        variance = _variance_px2(points_m, expected, self.camera)
+        return float(_REACH * np.sqrt(np.quantile(variance, 0.9)))
+
     def significance(self, seen: Described, wTc: Array) -> float:
         """By how many standard deviations a pose (4, 4) explains more landmarks than chance does.
 
@@ -234,12 +241,17 @@ class Matcher:
         The limits, as a pixel's noise, are of the picture, whose pixels the lens stretches.
         """
         settings, stretch = self.settings, self.camera.stretch(pinhole_px)
-        J = pixel_jacobian(points_m, expected.wTc, self.camera)
-        variance = np.einsum("nij,jk,nik->ni", J, expected.covariance[:6, :6], J).sum(axis=1)
+        variance = _variance_px2(points_m, expected, self.camera)
         radius = _REACH * np.sqrt(variance + 2 * (settings.pose.sigma_px * stretch) ** 2)
         least = min(settings.association.refine_radius_px or np.inf, self.radius_px)
         most = self.radius_px * stretch
         return np.clip(np.nan_to_num(radius, nan=np.inf), least * stretch, most)
+
+
+def _variance_px2(points_m: Array, expected: Kinematics, camera: Camera) -> Array:
+    """The variance (N,) of where points (N, 3) are seen, by the pose's covariance, both axes'."""
+    J = pixel_jacobian(points_m, expected.wTc, camera)
+    return np.asarray(np.einsum("nij,nij->n", J @ expected.covariance[:6, :6], J))
 
 
 def pixel_jacobian(points_m: Array, wTc: Array, camera: Camera) -> Array:

@@ -8,7 +8,7 @@ brightness, which exposure, gain, lamps and their flicker change: it gets evenly
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -28,6 +28,12 @@ _EPSILON_PX = 0.02
 """A step shorter than this ends KLT's iteration: well below its noise."""
 
 _MOST_STEPS = 20
+
+_BASIN = 0.12
+"""Of the window's side: so far off a guess may be for one level to bring it home, and twice as far
+for each level more. Of corners of the sample's flight, guessed aside at random and with a sensor's
+noise, one level finds 99.8 % at 2.5 px with a window of 21 px, 98 % at 3.5 and 87 % at 5; two find
+all but 0.04 % at 5 px, and three all at 10 px."""
 
 _CELL_PX = 32
 """Side of the cells over which points are spread."""
@@ -125,12 +131,19 @@ def spread_out(pixel_px: npt.ArrayLike, most: int) -> Indices:
 
 
 def track(
-    keyframe: Keyframe, image: Image, predicted: Array, camera: Camera, settings: TrackingSettings
+    keyframe: Keyframe,
+    image: Image,
+    predicted: Array,
+    camera: Camera,
+    settings: TrackingSettings,
+    doubt_px: float = np.inf,
 ) -> Tracks:
     """The keyframe's points in an image (H, W) taken near the pose `predicted` (4, 4).
 
     Each is first looked for where the predicted pose puts it, moved by what it was off in the
     keyframe. Those that do not come back to where they started when followed back are dropped.
+    `doubt_px` is how far off the prediction may put them: they are looked for with no more levels
+    of the pyramid than that needs, as each costs as much as the finest.
     """
     expected, was = (
         camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
@@ -145,16 +158,25 @@ def track(
         return Tracks(point, np.empty((0, 2), np.float32), 0)
     start = keyframe.pixel_px[point]
     even = evenly_lit(image)
-    found, ok = _follow(keyframe.even, even, start, guess[point], settings)
+    found, ok = _follow(keyframe.even, even, start, guess[point], _levels(settings, doubt_px))
     size = [camera.width_px - 1, camera.height_px - 1]
     ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found)
     kept = np.flatnonzero(ok)
     # Followed back from a guess that is off, or it would only confirm what it was given.
     back_guess = start[kept] + np.float32(settings.max_return_px)
+    # With all levels: of 200 points of another scene 5 (mean of three) come back so, 32 with one.
     back, returned = _follow(even, keyframe.even, found[kept], back_guess, settings)
     off = np.linalg.norm(back - start[kept], axis=1)
     kept = kept[returned & (off <= settings.max_return_px)]
     return Tracks(point[kept], found[kept], len(point))
+
+
+def _levels(settings: TrackingSettings, doubt_px: float) -> TrackingSettings:
+    """With as many levels as a guess that may be so far off needs, up to those set."""
+    levels, reach_px = 1, _BASIN * settings.window_px
+    while levels < settings.levels and not doubt_px <= reach_px:  # also when it is not a number
+        levels, reach_px = levels + 1, 2 * reach_px
+    return replace(settings, levels=levels)
 
 
 def _follow(

@@ -13,8 +13,11 @@ import pytest
 from ground_station.features.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization import tracking
 from ground_station.localization.estimate import State
+from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.localizer import Localizer
+from ground_station.localization.matching import Matcher
 from ground_station.localization.settings import TrackingSettings, load_preset
 from ground_station.localization.tracking import Keyframe, evenly_lit, spread_out, track
 from ground_station.localization.worker import BESIDE_NICE, Worker
@@ -135,6 +138,37 @@ def run(wall, count=24, **changes):
         for k, (time_ns, wTc) in enumerate(zip(times, truth, strict=True))
     ]
     return estimates, truth, extractor
+
+
+@pytest.mark.parametrize(
+    ("doubt_px", "levels"), [(0.0, 1), (2.5, 1), (2.6, 2), (5.1, 3), (50.0, 3), (np.nan, 3)]
+)
+def test_the_pyramid_is_as_high_as_the_predictions_doubt(doubt_px, levels, monkeypatch):
+    wall, used = Wall(), []
+    follow = tracking._follow
+
+    def noting(before, after, start, guess, settings):
+        used.append(settings.levels)
+        return follow(before, after, start, guess, settings)
+
+    monkeypatch.setattr(tracking, "_follow", noting)
+    keyframe = wall.keyframe(np.eye(4))
+    image = wall.picture(poses.pose(np.eye(3), [0.02, 0.0, 0.0]))  # 2.5 px
+    found = track(keyframe, image, np.eye(4), wall.camera, TrackingSettings(), doubt_px)
+    assert used == [levels, 3]
+    assert len(found.point) > 0.95 * found.sought
+
+
+def test_a_predictions_doubt_is_of_the_keyframes_own_points():
+    wall = Wall()
+    matcher = Matcher(wall.map(), wall.camera, load_preset("default"))
+    covariance = np.diag(np.r_[np.full(3, 1e-12), np.full(3, 0.01**2), np.full(6, 1.0)])
+    expected = Kinematics(0, np.eye(4), np.zeros(6), covariance)
+    points = wall.keyframe(np.eye(4)).points_m
+    # 1 cm on each axis at 4 m, three deviations, along both axes of the picture.
+    assert matcher.doubt_px(points, expected) == pytest.approx(3 * np.sqrt(2) * 1.26, rel=0.1)
+    assert matcher.doubt_px(points * [1, 1, 0.25], expected) > 15
+    assert matcher.doubt_px(points[:0], expected) == 0.0
 
 
 def test_points_are_found_where_the_wall_says_they_are(wall):
