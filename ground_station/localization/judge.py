@@ -20,8 +20,8 @@ class Evidence:
     `inliers` of `observations`; `spread` of the inliers (RMS over the image's diagonal);
     `residual_px` the inliers' RMS; `covariance` (6, 6) of the pose in the map;
     `innovation` the squared Mahalanobis distance from the prediction, NaN without one; `support_ns`
-    the time of the features it rests on: its keyframe's, or its own; `sharpness` against the frames
-    before, 0 to 1.
+    the time of the features it rests on: its keyframe's, or its own; `denied` how many frames since
+    then were described and did not confirm it; `sharpness` against the frames before, 0 to 1.
     """
 
     inliers: int
@@ -31,6 +31,7 @@ class Evidence:
     covariance: Array
     innovation: float = float("nan")
     support_ns: int = 0
+    denied: int = 0
     sharpness: float = 1.0
 
 
@@ -107,8 +108,9 @@ class Judge:
         if seen.innovation > s.max_innovation:
             return f"jump: {np.sqrt(seen.innovation):.1f} sigma from the prediction"
         age_s = (time_ns - seen.support_ns) / 1e9
-        if age_s > s.max_support_s:
-            return f"stale keyframe: {age_s:.1f} s old"
+        # Age alone is no evidence: features that nobody had the time to look at deny nothing.
+        if seen.denied and age_s > s.max_support_s:
+            return f"stale keyframe: {age_s:.1f} s old, not confirmed by {seen.denied} since"
         if seen.sharpness < s.good_sharpness:
             return f"blur: {seen.sharpness:.2f} of the usual sharpness"
         return ""

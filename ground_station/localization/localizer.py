@@ -70,6 +70,9 @@ class Localizer:
         if not map_.info.registered and np.isfinite(map_.depth_m):
             settings = in_units(settings, map_.depth_m / _USUAL_DEPTH_M)
         self._smoothing = smoothing
+        self.overloaded = False
+        """Set by who must skip frames for lack of processor: keyframes are then renewed only where
+        they run out, or where a pose waits for one to be confirmed."""
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
@@ -83,6 +86,7 @@ class Localizer:
         self._estimator: Estimator = self._fresh()
         self._smoothed: list[Kinematics] = []
         self._keyframe: Keyframe | None = None
+        self._denied = 0
         self._followed: Followed | None = None
         self._located: Located | None = None
         self._recent: deque[tuple[int, Image]] = deque(maxlen=following.REMEMBERED)
@@ -97,6 +101,11 @@ class Localizer:
     def state(self) -> State:
         """The state after the last frame."""
         return self._judge.state
+
+    @property
+    def keyframe_late_s(self) -> float:
+        """How long a frame's features have been under way, by the frames' time; 0: none are."""
+        return 0.0 if self._last_frame_ns is None else self._worker.waiting_s(self._last_frame_ns)
 
     def set_initial_pose(self, wTc: npt.ArrayLike, time_ns: int) -> None:
         """A first pose (4, 4) from elsewhere: a prediction, so the frame is still solved itself.
@@ -226,6 +235,7 @@ class Localizer:
             self._keyframe = self._acquirer.keyframe(
                 attempt.time_ns, image, estimate.wTc, self._located
             )
+            self._denied = 0
         return estimate
 
     def _locate(self, attempt: Attempt, seen: Described) -> PoseEstimate:
@@ -282,14 +292,18 @@ class Localizer:
         return self._unsolved(attempt, reason)
 
     def _renew(self, attempt: Attempt, image: Image, followed: Followed) -> None:
-        """Asks for the next keyframe when this one is old, far or half out of view."""
+        """Asks for the next keyframe when this one is old, far or half out of view.
+
+        Under overload only the last counts, or a doubt: an old one costs some accuracy and no pose.
+        """
         settings, keyframe = self.settings.tracking, self._keyframe
         assert keyframe is not None and followed.solution.state is not None
         age_s = (attempt.time_ns - keyframe.time_ns) / 1e9
+        due = age_s >= settings.keyframe_interval_s
+        due |= followed.moved_px >= settings.keyframe_parallax_px
         if not self._worker.busy and (
-            age_s >= settings.keyframe_interval_s
+            (due and not self.overloaded)
             or self._judge.doubtful
-            or followed.moved_px >= settings.keyframe_parallax_px
             or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
@@ -324,11 +338,13 @@ class Localizer:
         attempt.watch.stage_ms["background"] = landed.background_ms
         landed.found.teach(self._matcher.thresholds)
         if landed.keyframe is None:
+            self._denied += not landed.searched
             return False
         solved_ns = self._judge.last_solved_ns
         back = solved_ns is not None and solved_ns > landed.time_ns
         if not landed.searched or (back and not landed.relocalized):
             self._keyframe = following.better(landed.keyframe, self._keyframe, self._followed)
+            self._denied = 0
             return False
         if back:
             return False  # tracking came back by itself while the whole map was searched
@@ -340,7 +356,7 @@ class Localizer:
         assert landed.state is not None
         sure = landed.found.significance if self._within_speed(landed.state, attempt) else 0.0
         self._replace(estimator)
-        self._keyframe = landed.keyframe
+        self._keyframe, self._denied = landed.keyframe, 0
         self._judge.found_again(landed.time_ns, sure)
         return landed.relocalized
 
@@ -384,7 +400,9 @@ class Localizer:
         settings = self.settings.covariance
         in_map = covariance_in_map(state.covariance, solution.information, settings)
         support_ns = followed.support_ns if followed else attempt.time_ns
-        evidence = evidence_of(attempt, solution, in_map, self.camera, support_ns)
+        evidence = evidence_of(
+            attempt, solution, in_map, self.camera, support_ns, self._denied if followed else 0
+        )
         verdict, reason = self._judge.solved(attempt.time_ns, evidence)
         covariance = covariance_in_world(in_map, self._accuracy, state.wTc, settings.map)
         return publish(

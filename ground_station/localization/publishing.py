@@ -48,6 +48,7 @@ def evidence_of(
     covariance: Array,
     camera: Camera,
     support_ns: int,
+    denied: int,
 ) -> Evidence:
     """What speaks for a solved frame, whose observations the attempt holds.
 
@@ -63,6 +64,7 @@ def evidence_of(
         covariance=covariance,
         innovation=solution.innovation,
         support_ns=support_ns,
+        denied=denied,
         sharpness=attempt.taken.sharpness,
     )
 

@@ -337,7 +337,11 @@ class StateSettings:
         "DEGRADED", low=0, high=1e9,
     )  # fmt: skip
     max_support_s: float = config.key(
-        1000.0, "a keyframe older than this: DEGRADED", unit="s", low=0, high=1000
+        1000.0,
+        "a keyframe older than this that frames since did not confirm: DEGRADED",
+        unit="s",
+        low=0,
+        high=1000,
     )
 
 

@@ -27,12 +27,16 @@ class Worker(Generic[Result]):
         self.lag_s = lag_s
         self._executor: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
-        self._due_ns = 0
+        self._given_ns = self._due_ns = 0
 
     @property
     def busy(self) -> bool:
         """Whether a job was given whose result has not landed."""
         return self._job is not None
+
+    def waiting_s(self, time_ns: int) -> float:
+        """How long before a frame's time the job was given whose result has not landed; else 0."""
+        return (time_ns - self._given_ns) / 1e9 if self.busy else 0.0
 
     def submit(self, job: Callable[[], Result], time_ns: int, lag_s: float | None = None) -> None:
         """Starts a frame's job; one that has not landed is forgotten. It may have its own lag.
@@ -45,7 +49,7 @@ class Worker(Generic[Result]):
             )
         self.drop()
         lag_s = self.lag_s if lag_s is None else min(lag_s, self.lag_s)
-        self._due_ns = time_ns + int(1e9 * lag_s)
+        self._given_ns, self._due_ns = time_ns, time_ns + int(1e9 * lag_s)
         self._job = self._executor.submit(job)
 
     def collect(self, time_ns: int) -> Result | None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ground_station.localization.estimate import PoseEstimate
 from ground_station.localization.localizer import Localizer
+from ground_station.service.overload import Overload
 from ground_station.service.pose_feed import PoseFeed
 from ground_station.stream.counters import Counters
 from ground_station.stream.feedback import Feedback
@@ -137,7 +138,7 @@ def run(
     `start_timeout_s`.
     """
     result = LiveResult()
-    feed = PoseFeed(telemetry.session)
+    feed, overload = PoseFeed(telemetry.session), Overload()
     with Feedback(telemetry, {payload_id: receiver}.get):
         for frame in _frames(receiver, telemetry, payload_id, check, running, start_timeout_s):
             if frame is None:
@@ -156,6 +157,9 @@ def run(
                 time.time_ns(),
                 estimate,
                 telemetry.clock(payload_id),
+            )
+            overload.watch(
+                localizer, time.monotonic(), len(result.frames) + 1, receiver.counters.dropped
             )
             feed.publish(payload_id, estimate, capture_ns=frame.clock_ns, sequence=frame.sequence)
             result.frames.append(live)

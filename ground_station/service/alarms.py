@@ -121,6 +121,8 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
         reason = str(estimate.get("reason") or "")
         text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
         yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
+    if estimates_come and (overload := str(estimate.get("overload") or "")):
+        yield Alarm(f"overload/{payload_id}", WARNING, payload_id, overload)
     if frames_come and estimate_s is not None and min(estimate_s, alive_s) > NO_POSES_S:
         text = f"frames come, but none was localized for {estimate_s:.0f} s"
         yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)

@@ -67,6 +67,7 @@ class EstimateNote(Note):
     tangent in the camera's axes, rotation before translation; `position_sigma_m` (9) is the
     position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns.
     `processed`, `localized` and `skipped` count this payload's frames since the localizer's start.
+    `overload` says in words that the processor is too slow for them; "" while it is not.
     """
 
     sequence: int
@@ -94,6 +95,7 @@ class EstimateNote(Note):
     processed: int = 0
     localized: int = 0
     skipped: int = 0
+    overload: str = ""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,10 @@ def test_a_good_frame_is_tracking_and_gives_no_reason(judge):
         ({"covariance": np.diag([1e-2] * 3 + [1e-4] * 3)}, "uncertain direction: 9.9 deg"),
         ({"covariance": np.full((6, 6), np.nan)}, "uncertain position: nan m"),
         ({"innovation": 400.0}, "jump: 20.0 sigma from the prediction"),
-        ({"support_ns": -2_000_000_000}, "stale keyframe: 2.0 s old"),
+        (
+            {"support_ns": -2_000_000_000, "denied": 3},
+            "stale keyframe: 2.0 s old, not confirmed by 3 since",
+        ),
         ({"sharpness": 0.2}, "blur: 0.20 of the usual sharpness"),
     ],
 )
@@ -57,6 +60,13 @@ def test_each_fault_degrades_at_once_and_is_named(judge, changes, why):
     frame(judge, 0)
     state, reason = frame(judge, 1, **({"support_ns": STEP_NS} | changes))
     assert (state, reason.replace("2.03", "2.0")) == (State.DEGRADED, why)
+
+
+def test_an_old_keyframe_that_nobody_had_the_time_to_look_at_again_refuses_no_pose(judge):
+    """Under overload: what the frame itself shows is as good as ever."""
+    frame(judge, 0)
+    assert frame(judge, 1, support_ns=-5_000_000_000) == (State.TRACKING, "")
+    assert frame(judge, 2, support_ns=STEP_NS, denied=1) == (State.TRACKING, "")
 
 
 def test_tracking_comes_back_only_after_several_good_frames(judge):

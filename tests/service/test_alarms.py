@@ -73,6 +73,13 @@ def test_a_critical_battery_tells_its_figures(told):
     assert item.alarm.text == "battery critical: 3.30 V, 4 %, 2 min left"
 
 
+def test_too_little_processor_is_said_for_itself_however_good_the_poses(told):
+    text = "overload: 14 of 60 frames skipped in 2 s; keyframes are rare"
+    told[0].estimate(P, station.estimate(state="TRACKING", overload=text))
+    (item,) = alarms.judge(told[0].document(), 0, {}).values()
+    assert (item.alarm.id, item.alarm.level, item.alarm.text) == (f"overload/{P}", "warning", text)
+
+
 @pytest.mark.parametrize(("after_s", "found"), [(1.5, False), (2.5, True)])
 def test_lost_for_more_than_two_seconds(told, after_s, found):
     snapshot, clock = told

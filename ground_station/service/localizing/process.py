@@ -22,6 +22,7 @@ from ground_station.service.localizing.frames import Taken
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
 from ground_station.service.localizing.seldom import Seldom
 from ground_station.service.notes import EventNote, FrameNote
+from ground_station.service.overload import Overload
 from ground_station.service.pictures import PictureReader
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire.errors import BlimpError
@@ -53,7 +54,7 @@ class Localizing:
         self._forget = threading.Event()
         self._stream: tuple[int, int] | None = None  # ssrc and time of the last frame
         self._failed = 0
-        self._own = Accounts()
+        self._own, self._overload = Accounts(), Overload()
         self._told_s = 0.0
         self._complain = Seldom(lambda name, text: self._event(notes.WARNING, name, text))
         self._newest = bus.newest(notes.FRAME, FrameNote, payload_id)
@@ -128,7 +129,11 @@ class Localizing:
             fresh = localizer.state is State.INITIALIZING
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
-        self._bus.say(notes.ESTIMATE, self._payload_id, told)
+        accounts = self.accounts
+        said = self._overload.watch(
+            localizer, time.monotonic(), accounts.processed, accounts.skipped
+        )
+        self._bus.say(notes.ESTIMATE, self._payload_id, replace(told, overload=said))
 
     def _fail(self, localizer: Localizer, reason: str) -> None:
         self._failed += 1
