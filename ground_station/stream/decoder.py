@@ -6,6 +6,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_station.recording.h264 import grey
 from ground_station.stream.counters import Counters
 from ground_station.stream.rtp import AccessUnit
 from pi_firmware.wire import annexb
@@ -24,7 +25,7 @@ class Decoder:
     def __init__(self, counters: Counters, *, color: bool = False) -> None:
         self.saw_parameter_sets = False
         self._counters = counters
-        self._format = "bgr24" if color else "gray"
+        self._color = color
         self._trusted = False
         self._codec = _open()
 
@@ -43,7 +44,9 @@ class Decoder:
             return None
         try:
             (frame,) = self._codec.decode(av.Packet(unit.data))
-            return frame.to_ndarray(format=self._format).astype(np.uint8, copy=False)
+            if self._color:
+                return frame.to_ndarray(format="bgr24").astype(np.uint8, copy=False)
+            return grey(frame)
         except (av.FFmpegError, ValueError):  # ValueError: not exactly one picture
             self._counters.failed += 1
             self._trusted = False
