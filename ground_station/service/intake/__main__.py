@@ -47,6 +47,9 @@ def main() -> int:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2
     stop = ending(None)  # a recording ends in its own time
+    import cv2
+
+    cv2.setNumThreads(1)  # a table over one picture is not worth a second thread
     try:
         serve(Path(sys.argv[1]), stop)
     except BlimpError as error:
