@@ -44,9 +44,9 @@ _REDUCTION = 4
 _AROUND_PX = 84
 """Side of what a pixel's contrast is measured in: KLT's window (21 px) at its pyramid's top (4:1).
 
-What is smaller takes away what the top goes by: with 21 px a guess may be off by 10 px, with 84 by
-20 to 30 as in the picture itself. Of a lamp's 100 Hz a picture that is read out within 1/30 s shows
-3.3 periods, so that the light is nearly a slope across.
+What is smaller takes away what the top goes by: with 20 px a guess may be off by 10 px, with 84 by
+20 to 30 as in the picture itself; with 44 a flight of 4 m/s was lost at 15 Hz. Of a lamp's 100 Hz a
+picture that is read out within 1/30 s shows 3.3 periods: the light is nearly a slope across.
 """
 
 _NOISE = 4.0
