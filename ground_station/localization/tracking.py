@@ -164,8 +164,8 @@ def track(
     kept = np.flatnonzero(ok)
     # Followed back from a guess that is off, or it would only confirm what it was given.
     back_guess = start[kept] + np.float32(settings.max_return_px)
-    # With all levels: of 200 points of another scene 5 (mean of three) come back so, 32 with one.
-    back, returned = _follow(even, keyframe.even, found[kept], back_guess, settings)
+    aside = _levels(settings, float(np.hypot(settings.max_return_px, settings.max_return_px)))
+    back, returned = _follow(even, keyframe.even, found[kept], back_guess, aside)
     off = np.linalg.norm(back - start[kept], axis=1)
     kept = kept[returned & (off <= settings.max_return_px)]
     return Tracks(point[kept], found[kept], len(point))

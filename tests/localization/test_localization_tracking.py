@@ -155,7 +155,7 @@ def test_the_pyramid_is_as_high_as_the_predictions_doubt(doubt_px, levels, monke
     keyframe = wall.keyframe(np.eye(4))
     image = wall.picture(poses.pose(np.eye(3), [0.02, 0.0, 0.0]))  # 2.5 px
     found = track(keyframe, image, np.eye(4), wall.camera, TrackingSettings(), doubt_px)
-    assert used == [levels, 3]
+    assert used == [levels, 1]  # back from where it was found, 0.7 px are guessed aside
     assert len(found.point) > 0.95 * found.sought
 
 
