@@ -47,13 +47,11 @@ def test_the_preset_names_the_estimator(room):
     assert isinstance(make_estimator(room.camera, load_preset("thesis")), PoseEstimator)
 
 
-def test_live_nothing_is_waited_for_and_keyframes_come_no_more_often():
+def test_live_nothing_is_waited_for_and_nothing_else_changes():
     settings = load_preset("default")
     live = for_live(settings)
     assert settings.tracking.features_lag_s > 0 == live.tracking.features_lag_s
-    lag_s, interval_s = settings.tracking.features_lag_s, settings.tracking.keyframe_interval_s
-    assert live.tracking.keyframe_interval_s == max(lag_s, interval_s)
-    again = dataclasses.replace(live.tracking, features_lag_s=lag_s, keyframe_interval_s=interval_s)
+    again = dataclasses.replace(live.tracking, features_lag_s=settings.tracking.features_lag_s)
     assert dataclasses.replace(live, tracking=again) == settings
 
 
