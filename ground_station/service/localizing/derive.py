@@ -69,7 +69,8 @@ def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float
     pixels = observations.pixel_px[observations.inlier]
     if len(pixels) > most:
         pixels = pixels[np.arange(most) * len(pixels) // most]
-    return [round(value, 1) for value in pixels.astype(np.float64).ravel().tolist()]
+    rounded: list[float] = np.round(pixels.astype(np.float64), 1).ravel().tolist()
+    return rounded
 
 
 def estimate_note(
