@@ -57,10 +57,11 @@ test: setup  ## Run the tests of every room
 	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
 	exit $$failed
 
-check: setup  ## Lint, formatting and types
+check: setup  ## Lint, formatting, types, and which room may import which
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
+	@.venv/bin/lint-imports --no-cache
 
 hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="loss outage"
 	@if [ "$(PAYLOAD)" = image ]; then \

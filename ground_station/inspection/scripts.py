@@ -10,10 +10,10 @@ import hashlib
 import re
 from pathlib import Path
 
-import ground_station
+from ground_station import presentation
 
 _OWN = Path(__file__).parent / "web"
-_SHARED = Path(ground_station.__file__).parent / "service" / "web" / "static" / "js"
+_SHARED = Path(presentation.__file__).parent / "web" / "js"
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:class|const|function) (\w+))", re.MULTILINE)
 

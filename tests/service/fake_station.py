@@ -28,13 +28,12 @@ import cv2
 import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.staticfiles import StaticFiles
 
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.recording.flight import FlightRecording, trajectory_of
+from ground_station.service.web.app import STATIC, static_files
 
 ROOT = Path(__file__).parents[2]
-STATIC = ROOT / "ground_station" / "service" / "web" / "static"
 SAMPLE = ROOT / "maps" / "atrium"
 POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; connect-src 'self'; frame-ancestors 'none'; "
@@ -417,7 +416,7 @@ def make_app(station: FakeStation) -> FastAPI:
             await _Viewer(station, socket_, payload).serve()
         station.sockets -= 1
 
-    app.mount("/static", StaticFiles(directory=STATIC))
+    app.mount("/static", static_files(STATIC))
     return app
 
 

@@ -6,14 +6,19 @@ import base64
 import re
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from fake_station import FRAMES, STATIC, FakeStation, Payload, Served, sample_flight, sample_station
+from fake_station import FRAMES, FakeStation, Payload, Served, sample_flight, sample_station
 
+from ground_station import presentation
 from ground_station.geometry.camera import Camera
+from ground_station.service.web.app import STATIC, static_files
+
+SHARED = Path(presentation.__file__).parent / "web"
 
 LIMIT_MS = 20_000
 SIZES = {"desk": (1440, 900), "landscape": (1024, 768), "portrait": (768, 1024)}
@@ -471,7 +476,7 @@ def test_a_station_that_was_gone_is_taken_up_again_without_a_reload(
 
 
 def test_the_files_load_nothing_from_elsewhere_and_need_no_markup_in_data() -> None:
-    for path in STATIC.rglob("*.*"):
+    for path in (*STATIC.rglob("*.*"), *SHARED.rglob("*.*")):
         text = path.read_text()
         urls = set(re.findall(r"https?://[^\s\"'`)]+", text)) - {"http://www.w3.org/2000/svg"}
         assert not urls, path
@@ -491,6 +496,13 @@ def test_the_files_load_nothing_from_elsewhere_and_need_no_markup_in_data() -> N
     assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*src=)", page)
     ids = re.findall(r'\sid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
+
+
+def test_each_script_that_a_script_imports_is_served() -> None:
+    served = static_files(STATIC)
+    for path in (*STATIC.rglob("*.js"), *SHARED.rglob("*.js")):
+        for name in re.findall(r"""(?:from|import\() ?"\./(\w+\.js)\"""", path.read_text()):
+            assert served.lookup_path(f"js/{name}")[1] is not None, f"{path}: {name}"
 
 
 def test_text_stands_out_from_its_ground() -> None:

@@ -138,8 +138,13 @@ def _active_file(snapshot: Snapshot) -> str:
     return os.path.basename(str(note.file)) if note is not None and note.active else ""  # noqa: PTH119
 
 
+def static_files(static: Path) -> StaticFiles:
+    """The files of the folder `static`, and the scripts that other pages share with it."""
+    return StaticFiles(directory=static, packages=[("ground_station.presentation", "web")])
+
+
 def _serve_dashboard(app: FastAPI, static: Path) -> None:
-    """The page and what it loads, all from one folder."""
+    """The page and what it loads: its own folder, and the scripts that other pages share."""
     for ending, kind in _TYPES.items():
         mimetypes.add_type(kind, ending)
 
@@ -151,4 +156,4 @@ def _serve_dashboard(app: FastAPI, static: Path) -> None:
         return FileResponse(page, media_type="text/html")
 
     if static.is_dir():
-        app.mount("/static", StaticFiles(directory=static), name="static")
+        app.mount("/static", static_files(static), name="static")

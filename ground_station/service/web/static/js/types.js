@@ -114,12 +114,7 @@
  * @property {{min: number[], max: number[]}|null} [bounds] metres
  * @property {Camera|null} [camera] the payloads'
  *
- * @typedef {object} Camera
- * @property {number} width_px
- * @property {number} height_px
- * @property {number[][]} K 3x3, pixels
- * @property {number[]} distortion k1, k2, p1, p2, k3, or k1 to k4 of a fisheye
- * @property {string} model opencv5 or fisheye
+ * @typedef {import("./view_rays.js").Camera} Camera
  *
  * @typedef {object} Answer of a command
  * @property {boolean} done

@@ -9,9 +9,18 @@ const WIDEST = (65 * Math.PI) / 180; // of a fisheye: farther from its axis noth
 const HALVINGS = 40;
 
 /**
+ * @typedef {object} Camera
+ * @property {number} width_px
+ * @property {number} height_px
+ * @property {number[][]} K 3x3, pixels
+ * @property {number[]} distortion k1, k2, p1, p2, k3, or k1 to k4 of a fisheye
+ * @property {string} model opencv5 or fisheye
+ */
+
+/**
  * The picture's border, clockwise from its upper left corner, as points x, y on the plane z = 1 of
  * the camera; corner k is at k · PER_SIDE.
- * @param {import("./types.js").Camera|null|undefined} camera
+ * @param {Camera|null|undefined} camera
  * @returns {number[][]}
  */
 export function viewRays(camera) {
@@ -29,7 +38,7 @@ export function viewRays(camera) {
 
 /**
  * A pixel on the plane z = 1, by fixed-point iteration as in OpenCV's undistortPoints.
- * @param {import("./types.js").Camera} camera @param {number} u @param {number} v
+ * @param {Camera} camera @param {number} u @param {number} v
  */
 export function undistorted(camera, u, v) {
   const [[fx, , cx], [, fy, cy]] = camera.K;
