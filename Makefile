@@ -68,12 +68,11 @@ hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="l
 	  sh deploy/packages.sh deploy/image/apt-packages.txt && sh deploy/emulator/tools.sh; fi
 	@.venv/bin/python tests/hil/suite.py $(CASES) --payload "$(or $(PAYLOAD),process)" $(OPTIONS)
 
-bench: setup  ## Measure localizer, payload, features and maps: costs in ratios of one run, and errors
+bench: setup  ## Measure localizer, payload and features: costs in ratios of one run, and errors
 	@mkdir -p out
 	@$(BLIMP) bench localize --json out/bench.json
 	@$(BLIMP) bench payload --json out/bench-payload.json
 	@$(BLIMP) bench features --json out/bench-features.json
-	@$(BLIMP) bench map --json out/bench-map.json --plot out/bench-map.png
 
 experiments: setup  ## The thesis's experiments and more: NAMES="motion fast", OPTIONS=--quick
 	@$(BLIMP) experiments $(NAMES) --out out/experiments $(OPTIONS)

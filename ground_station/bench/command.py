@@ -28,9 +28,8 @@ _COMMANDS = (
     (
         "map",
         "ground_station.bench.maps.command",
-        "size against accuracy: fewer landmarks, shorter descriptors; many images",
-        "Measures what a map loses when 'blimp map compress' makes it smaller, or, with --campus, "
-        "what builds of many images cost.",
+        "builds against COLMAP's own on the same images; many images",
+        "Measures which builds are true beside COLMAP's own, or what builds of many images cost.",
     ),
 )
 

@@ -7,7 +7,6 @@ import argparse
 from ground_station.inspection import command as info
 from ground_station.inspection import export_command as export
 from ground_station.inspection import view_command as view
-from ground_station.map_update.compression import command as compress
 from ground_station.map_update.extension import command as extend
 from ground_station.mapping.construction import command as build
 from ground_station.mapping.importing import command as importing
@@ -20,7 +19,6 @@ _COMMANDS = {
     "register": register,
     "refine": refine,
     "extend": extend,
-    "compress": compress,
     "info": info,
     "view": view,
     "export": export,

@@ -15,8 +15,8 @@ ROOMS = {
             "geometry", "recording"),
     "run": ("experiments/measure.py", "experiments/alter.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
-            "map/accuracy.py", "map/uncertainty.py", "map_update/compression", "features",
-            "geometry", "recording"),
+            "map/accuracy.py", "map/uncertainty.py", "experiments/thinning.py",
+            "experiments/viewpoints.py", "features", "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""
 

@@ -70,8 +70,7 @@ def _run(job: RunJob, store: Store, data: Path) -> None:
     flight = flown(job.flight, recording, data)
     map_ = maps.load(store.map(job.map_key))
     if job.alter.landmarks < 1:
-        from ground_station.map_update.compression.choice import choose
-        from ground_station.map_update.compression.compress import subset
+        from ground_station.experiments.thinning import choose, subset
 
         map_ = subset(map_, choose(map_, round(job.alter.landmarks * len(map_.landmarks))))
     store.write(job.key, measure(map_, flight, job.alter, job.settings, job.seed))

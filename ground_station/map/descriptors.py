@@ -20,12 +20,8 @@ NAMES: dict[str, np.dtype[Any]] = {
 }
 """Arrays of `landmarks.safetensors` that may hold the descriptors, and their types."""
 
-CODES, CODEBOOK = "descriptor_codes", "descriptor_codebook"
-"""Two arrays that hold them in a compressed map instead: bytes, and what they stand for."""
-
 _SAFETENSORS_TYPES: dict[str, np.dtype[Any]] = {
     "F32": np.dtype("<f4"),
-    "F16": np.dtype("<f2"),
     "U8": np.dtype("u1"),
     "I8": np.dtype("i1"),
 }
@@ -80,52 +76,6 @@ class Descriptors:
         }
 
 
-class CodedDescriptors(Descriptors):
-    """M descriptors as S codes each, of the nearest of C words in each of S stretches of numbers.
-
-    `codes` (M, S) uint8, in memory or mapped from a file; `codebook` (S, C, D / S) the words.
-    Product quantisation: Jégou, Douze and Schmid, TPAMI 2011.
-    """
-
-    def __init__(self, codes: npt.NDArray[np.uint8], codebook: npt.NDArray[Any]) -> None:
-        super().__init__(codes)
-        self.codebook = codebook
-        stretches, words, numbers = codebook.shape
-        self._words = np.asarray(codebook, np.float32).reshape(stretches * words, numbers)
-        self._first = words * np.arange(stretches)
-
-    @property
-    def codes(self) -> npt.NDArray[np.uint8]:
-        """The codes (M, S)."""
-        return self._kept
-
-    @property
-    def values(self) -> npt.NDArray[Any]:
-        """All of them with a byte a number, in a new array (M, D)."""
-        signed = bool((self._words < 0).any())
-        values = np.empty(self.shape, np.int8 if signed else np.uint8)
-        step = max(1, _BLOCK // max(self.shape[1], 1))
-        for start in range(0, len(values), step):
-            values[start : start + step] = _bytes(self[start : start + step], signed)
-        return values
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return len(self._kept), len(self._first) * self._words.shape[1]
-
-    def __getitem__(self, index: Any) -> F32:
-        words = self._words.take(self._plain[index] + self._first, axis=0)
-        return _unit(words.reshape(*words.shape[:-2], self.shape[1]))
-
-    def rows(self, index: Any) -> CodedDescriptors:
-        """Those of an index, a slice or a mask on the first axis, with the same words."""
-        return CodedDescriptors(self._plain[index], self.codebook)
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Codes and words."""
-        return {CODES: np.asarray(self._kept), CODEBOOK: np.asarray(self.codebook, np.float16)}
-
-
 def joined(first: F32 | Descriptors, second: F32 | Descriptors) -> F32 | Descriptors:
     """The rows of both, one after the other; where the first are bytes, they stay as they are."""
     if not len(second):
@@ -137,17 +87,15 @@ def joined(first: F32 | Descriptors, second: F32 | Descriptors) -> F32 | Descrip
     return np.concatenate([first[:], second[:]])
 
 
-def quantised(
-    descriptors: F32 | Descriptors, *, coded: bool = False
-) -> dict[str, npt.NDArray[Any]]:
+def quantised(descriptors: F32 | Descriptors) -> dict[str, npt.NDArray[Any]]:
     """Rows (M, D) with a byte a number, by the name of their array in a map's file.
 
     Each row is scaled to its own maximum: rows are unit vectors, so the scale is found again by
-    normalising. What is quantised already stays as it is; codes only where they may stay `coded`.
+    normalising. What is quantised already stays as it is.
     """
     if isinstance(descriptors, Descriptors):
         kept = descriptors.arrays()
-        if kept and (coded or CODES not in kept):
+        if kept:
             return kept
         descriptors = descriptors[:]
     signed = bool((descriptors < 0).any())
@@ -169,24 +117,17 @@ def _unit(rows: F32) -> F32:
 def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -> Descriptors:
     """Maps the descriptors (count, dimension) of a map's file into memory without reading them.
 
-    The prefix stands before their arrays' names; without words of their own they have those
-    without it. The rest of the file has been checked by
-    safetensors' own reader. Raises `MapError` when they are missing, of another size or type, not
-    finite, or codes of no word. The file may be replaced by renaming while it is mapped, but not be
-    written to.
+    The prefix stands before their array's name. The rest of the file has been checked by
+    safetensors' own reader. Raises `MapError` when they are missing, of another size or type, or
+    not finite. The file may be replaced by renaming while it is mapped, but not be written to.
     """
     try:
         with path.open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
             header = json.loads(file.read(length))
-            found = next((name for name in (*NAMES, CODES) if prefix + name in header), None)
+            found = next((name for name in NAMES if prefix + name in header), None)
             if found is None:
                 raise MapError(f"{path}: it holds no {prefix}descriptors")
-            if found == CODES:
-                codes = _mapped(file, path, header, length, prefix + CODES, "U8")
-                words = prefix + CODEBOOK if prefix + CODEBOOK in header else CODEBOOK
-                codebook = _mapped(file, path, header, length, words, "F16")
-                return _coded(path, codes, codebook, (count, dimension))
             name = prefix + found
             shape = tuple(header[name]["shape"])
             if shape != (count, dimension):
@@ -221,25 +162,3 @@ def _mapped(
     if begin == end:  # nothing cannot be mapped
         return np.empty(shape, dtype)
     return np.memmap(file, dtype, "r", 8 + length + begin, shape)
-
-
-def _coded(
-    path: Path, codes: npt.NDArray[Any], codebook: npt.NDArray[Any], shape: tuple[int, int]
-) -> CodedDescriptors:
-    """Codes and words that fit each other and the map; the words are read, the codes are not."""
-    count, dimension = shape
-    words = np.array(codebook)
-    fits = words.ndim == 3 and words.shape[0] * words.shape[2] == dimension
-    if not fits or not 0 < words.shape[1] <= 256 or codes.shape != (count, len(words)):
-        raise MapError(
-            f"{path}: codes {codes.shape} of words {words.shape} are no descriptors "
-            f"({count}, {dimension})"
-        )
-    if not np.isfinite(words).all():
-        raise MapError(f"{path}: '{CODEBOOK}' holds a value that is not finite")
-    # A byte is always one of 256; of fewer words it must be looked at.
-    rows = max(1, _BLOCK // max(len(words), 1))
-    for start in range(0, count if words.shape[1] < 256 else 0, rows):
-        if (codes[start : start + rows] >= words.shape[1]).any():
-            raise MapError(f"{path}: '{CODES}' holds a code of none of the {words.shape[1]} words")
-    return CodedDescriptors(codes, words)

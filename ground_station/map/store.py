@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +15,7 @@ from safetensors.numpy import save
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.map import compact
-from ground_station.map.descriptors import CODEBOOK, Descriptors, open_descriptors, quantised
+from ground_station.map.descriptors import Descriptors, open_descriptors, quantised
 from ground_station.map.modes import MOST, Modes
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
@@ -25,8 +23,8 @@ from pi_firmware.wire.errors import ConfigError
 FORMAT = 1
 """Raised when a reader of the older layout would misread a newer map."""
 
-COMPACT = 2
-"""The format of a compressed map: its tables are `compact`'s, and stay so when it is written."""
+_COMPRESSED = 2
+"""The format of maps that earlier versions compressed; it is not read any more."""
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -98,8 +96,6 @@ class MapInfo:
     refined: dict[str, Any] = field(default_factory=dict)
     extended: dict[str, Any] = field(default_factory=dict)
     """What `blimp map extend` added; empty for a map that never was."""
-    compressed: dict[str, Any] = field(default_factory=dict)
-    """What `blimp map compress` did; empty for a map that is whole."""
 
     @property
     def registered(self) -> bool:
@@ -127,8 +123,10 @@ class Map:
         return float(np.median(seen_m)) if len(seen_m) else float("nan")
 
 
-_Arrays = compact.Arrays
-_LANDMARKS: compact.Layout = {
+_Arrays = dict[str, npt.NDArray[Any]]
+_Layout = dict[str, tuple[str, tuple[int, ...]]]
+"""Of each array its type, and its shape after the first axis."""
+_LANDMARKS: _Layout = {
     "id": ("int64", ()),
     "position_m": ("float64", (3,)),
     "covariance_m2": ("float32", (3, 3)),
@@ -138,10 +136,10 @@ _LANDMARKS: compact.Layout = {
     "distance_m": ("float32", (2,)),
     "observations": ("int32", ()),
 }
-_MODES: compact.Layout = {"mode_landmark": ("int32", ())}
+_MODES: _Layout = {"mode_landmark": ("int32", ())}
 _OF_MODES = "mode_"
 """Stands before the names of the modes' descriptors, which are called as the landmarks' own."""
-_KEYFRAMES: compact.Layout = {
+_KEYFRAMES: _Layout = {
     "time_ns": ("int64", ()),
     "wTc": ("float64", (4, 4)),
     "offset": ("int64", ()),
@@ -158,19 +156,14 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     lm, kf, info = map_.landmarks, map_.keyframes, map_.info
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
     sights: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}
-    if info.format == COMPACT:
-        arrays = compact.pack_landmarks(arrays) | quantised(lm.descriptor, coded=True)
-        sights = compact.pack_keyframes(sights)
-    elif quantise:
+    if quantise:
         arrays |= quantised(lm.descriptor)
     else:
         arrays["descriptor"] = np.asarray(lm.descriptor, np.float32)
     if map_.modes is not None and len(map_.modes):
         rows = {"descriptor": np.asarray(map_.modes.descriptor, np.float32)}
-        if quantise or info.format == COMPACT:
-            rows = quantised(map_.modes.descriptor, coded=info.format == COMPACT)
-        if CODEBOOK in rows and np.array_equal(rows[CODEBOOK], arrays.get(CODEBOOK, ())):
-            del rows[CODEBOOK]  # one copy does for both
+        if quantise:
+            rows = quantised(map_.modes.descriptor)
         arrays["mode_landmark"] = map_.modes.landmark
         arrays |= {_OF_MODES + name: array for name, array in rows.items()}
     form = str(info.format)
@@ -199,8 +192,6 @@ def save_info(folder: Path, info: MapInfo) -> None:
     }
     if info.extended:
         document["extended"] = info.extended
-    if info.compressed:
-        document["compressed"] = info.compressed
     path = folder / "map.toml"
     part = folder / "map.toml.part"
     part.write_bytes(tomli_w.dumps(document).encode())
@@ -224,11 +215,13 @@ def load_info(folder: str | Path) -> MapInfo:
         features, camera = document.get("features"), document.get("camera")
         if not isinstance(features, dict) or not isinstance(camera, dict):
             raise MapError(f"{path}: the tables 'features' and 'camera' are needed")
-        if document.get("format") not in (FORMAT, COMPACT):
+        if document.get("format") == _COMPRESSED:
             raise MapError(
-                f"{path}: format {document.get('format')}; "
-                f"this program reads {FORMAT} and {COMPACT}"
+                f"{path}: a compressed map, as earlier versions made them; "
+                "take the map that it was made of, or build it again"
             )
+        if document.get("format") != FORMAT:
+            raise MapError(f"{path}: format {document.get('format')}; this program reads {FORMAT}")
         return MapInfo(
             features=str(features.get("name")),
             features_sha256=str(features.get("sha256")),
@@ -241,7 +234,6 @@ def load_info(folder: str | Path) -> MapInfo:
             registration=dict(document.get("registration", {})),
             refined=dict(document.get("refined", {})),
             extended=dict(document.get("extended", {})),
-            compressed=dict(document.get("compressed", {})),
             format=int(document["format"]),
         )
     except ConfigError as error:
@@ -255,13 +247,13 @@ def load(folder: str | Path) -> Map:
     folder = Path(folder)
     info = load_info(folder)
     path = folder / "landmarks.safetensors"
-    arrays = _landmarks(path, info.format)
+    arrays = _landmarks(path)
     m = len(arrays["id"])
     descriptor = open_descriptors(path, m, info.dimension)
     modes = _modes(path, m, info.dimension)
     landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
     path = folder / "keyframes.safetensors"
-    arrays, metadata = _keyframes(path, info.format)
+    arrays, metadata = _read(path, _KEYFRAMES)
     names = metadata.get("names", "").split("\n") if metadata.get("names") else []
     keyframes = Keyframes(names=names, **{name: arrays[name] for name in _KEYFRAMES})
     k, o = len(names), len(keyframes.landmark)
@@ -297,37 +289,20 @@ def _modes(path: Path, count: int, dimension: int) -> Modes | None:
 def load_positions(folder: str | Path) -> F64:
     """The landmarks' positions (M, 3) and nothing else of a map; raises as `load`."""
     path, name = Path(folder) / "landmarks.safetensors", "position_m"
-    if load_info(folder).format == COMPACT:
-        return _landmarks(path, COMPACT)[name]
+    load_info(folder)
     return _read(path, {name: _LANDMARKS[name]})[0][name]
 
 
-def _landmarks(path: Path, form: int) -> _Arrays:
+def _landmarks(path: Path) -> _Arrays:
     """The arrays of `_LANDMARKS`, of as many rows each."""
-    layout = compact.LANDMARKS if form == COMPACT else _LANDMARKS
-    arrays, _ = _read(path, layout | (compact.LANDMARK_UNITS if form == COMPACT else {}))
-    if len({len(arrays[name]) for name in layout}) > 1:
+    arrays, _ = _read(path, _LANDMARKS)
+    if len({len(array) for array in arrays.values()}) > 1:
         raise MapError(f"{path}: its arrays differ in length")
-    return _unpacked(path, compact.unpack_landmarks, arrays) if form == COMPACT else arrays
-
-
-def _keyframes(path: Path, form: int) -> tuple[_Arrays, dict[str, str]]:
-    """The arrays of `_KEYFRAMES`, and the file's metadata."""
-    if form != COMPACT:
-        return _read(path, _KEYFRAMES)
-    arrays, metadata = _read(path, compact.KEYFRAMES | compact.KEYFRAME_UNITS)
-    return _unpacked(path, compact.unpack_keyframes, arrays), metadata
-
-
-def _unpacked(path: Path, unpack: Callable[[_Arrays], _Arrays], arrays: _Arrays) -> _Arrays:
-    try:
-        return unpack(arrays)
-    except ValueError as error:
-        raise MapError(f"{path}: {error}") from None
+    return arrays
 
 
 def _read(
-    path: Path, wanted: compact.Layout, optional: compact.Layout | None = None
+    path: Path, wanted: _Layout, optional: _Layout | None = None
 ) -> tuple[_Arrays, dict[str, str]]:
     every = wanted | (optional or {})
     try:
@@ -344,11 +319,10 @@ def _read(
                 continue
             raise MapError(f"{path}: the array '{name}' is missing")
         array = arrays[name]
-        if str(array.dtype) not in dtype.split("|") or array.ndim == 0 or array.shape[1:] != shape:
+        if array.dtype != dtype or array.ndim == 0 or array.shape[1:] != shape:
             rows = ", ".join(["N", *map(str, shape)])
             raise MapError(
-                f"{path}: '{name}' must be {dtype.replace('|', ' or ')} ({rows}), "
-                f"not {array.dtype} {array.shape}"
+                f"{path}: '{name}' must be {dtype} ({rows}), not {array.dtype} {array.shape}"
             )
         if not np.isfinite(array).all():
             raise MapError(f"{path}: '{name}' holds a value that is not finite")

@@ -57,7 +57,6 @@ def describe(map_: Map) -> dict[str, Any]:
         "refined": [f"{flight['name']} ({flight['frames']} frames)" for flight in flights],
         "seed": built.get("settings", {}).get("seed"),
         "stage_s": built.get("stage_s", {}),
-        "compressed": info.compressed,
         "bytes": held,
         "size_mb": round(held["total"] / 1e6, 2),
     }

@@ -1,1 +1,1 @@
-"""Maps that change after they were built: flights extend them, compression makes them smaller."""
+"""Maps that change after they were built: flights extend them."""

@@ -25,7 +25,7 @@ def _run(*words: object) -> int:
 
 @pytest.mark.parametrize(
     "sub",
-    ["build", "import", "register", "refine", "extend", "compress", "info", "view", "export"],
+    ["build", "import", "register", "refine", "extend", "info", "view", "export"],
 )
 def test_help_shows_an_example_and_loads_nothing_heavy(sub):
     script = (

@@ -137,6 +137,8 @@ def _huge(array):
         ("map.toml", lambda p: p.write_text(p.read_text().replace("fx_px", "fxx")), "'fxx'"),
         ("map.toml", lambda p: p.write_text(p.read_text().replace("format = 1", "format = 99")),
          "format 99; this program reads 1"),
+        ("map.toml", lambda p: p.write_text(p.read_text().replace("format = 1", "format = 2")),
+         "a compressed map, .*; take the map that it was made of, or build it again"),
     ],
 )  # fmt: skip
 def test_a_damaged_map_is_refused_in_one_line(copy, file, damage, words):

@@ -178,10 +178,6 @@ def _finish(
 
 
 def _check_map(map_: store.Map) -> None:
-    if map_.info.format == store.COMPACT:
-        raise MapError(
-            f"{map_.folder}: is compressed; extend the map it was made of, and compress that again"
-        )
     if not len(map_.landmarks) or not len(map_.keyframes):
         raise MapError(f"{map_.folder}: it holds no keyframes in which a flight could be found")
     if len(np.unique(map_.landmarks.id)) != len(map_.landmarks):

@@ -29,20 +29,6 @@ _KEYFRAMES = {
     "pixel_px": array("F32", (1, 2), 5),
 }  # fmt: skip
 _MODES = {"mode_landmark": array("I32", (1,)), "mode_descriptor_u8": array("U8", (1, 4), 7)}
-_COMPACT_LANDMARKS = {
-    "id": array("U32", (2,)), "position_offset_m": array("F32", (2, 3), 1),
-    "covariance_root": array("F16", (2, 6), 1), "spread": array("F16", (2,)),
-    "view_direction": array("F16", (2, 3)), "view_cos": array("F16", (2,)),
-    "distance_m": array("F16", (2, 2)), "observations": array("U16", (2,), 2),
-    "position_origin_m": array("F64", (1, 3), 7), "covariance_unit_m": array("F64", (1,), 1),
-    "descriptor_codes": array("U8", (2, 2), 2), "descriptor_codebook": array("F16", (2, 3, 2), 1),
-}  # fmt: skip
-_COMPACT_KEYFRAMES = {
-    "time_ns": array("I64", (1,)), "wTc": array("F64", (1, 4, 4)),
-    "offset": ("I64", (2,), struct.pack("<qq", 0, 1)), "landmark": array("U16", (1,)),
-    "pixel_steps": array("U16", (1, 2), 5),
-    "pixel_origin_px": array("F64", (1, 2)), "pixel_step_px": array("F64", (1,), 1),
-}  # fmt: skip
 _DOCUMENT = {
     "format": store.FORMAT,
     "name": "hall",
@@ -51,23 +37,20 @@ _DOCUMENT = {
     "built": {"seed": 1},
 }
 INFO = tomli_w.dumps(_DOCUMENT).encode()
-COMPACT = tomli_w.dumps(_DOCUMENT | {"format": store.COMPACT}).encode()
 
 
 def fuzz(data: bytes) -> None:
     """A map that is taken fits together: every index is inside, every number finite."""
     picker = Picker(data)
     kind = picker.number(1)
-    whole, compact = (INFO, False) if not kind & 2 else (COMPACT, True)
-    (_FOLDER / "map.toml").write_bytes(picker.block() if kind % 2 else whole)
+    (_FOLDER / "map.toml").write_bytes(picker.block() if kind % 2 else INFO)
     if picker.number(1) % 8 == 7:
         landmarks = picker.rest()
     else:
-        layout = _COMPACT_LANDMARKS if compact else _LANDMARKS | (_MODES if kind & 4 else {})
+        layout = _LANDMARKS | (_MODES if kind & 4 else {})
         landmarks = safetensors_file.build(picker, layout, {"format": "1"})
     (_FOLDER / "landmarks.safetensors").write_bytes(landmarks)
-    layout = _COMPACT_KEYFRAMES if compact else _KEYFRAMES
-    keyframes = safetensors_file.build(picker, layout, {"format": "1", "names": "a"})
+    keyframes = safetensors_file.build(picker, _KEYFRAMES, {"format": "1", "names": "a"})
     (_FOLDER / "keyframes.safetensors").write_bytes(keyframes)
     with refusing(MapError):
         store.load_info(_FOLDER)
@@ -87,11 +70,11 @@ def fuzz(data: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """Whole maps of every layout, a map.toml as text, and tables that are too much."""
+    """Whole maps without and with modes, a map.toml as text, and tables that are too much."""
     head = b"\1" + blocks(INFO)
     big = b"\1" + blocks(INFO.replace(b"dimension = 4", b"dimension = 0x" + b"f" * 20))
     endless = b"\1" + blocks(INFO.replace(b"dimension = 4", b"dimension = inf"))
     short = b"\0\7" + b"\xff" * 8 + b"{}"
-    small, modes = b"\2\0", b"\4\0"
+    modes = b"\4\0"
     long = stretch((1, b"\1\xff\xff"), (30_000, b"a."))
-    return [b"\0\0", small, modes, head, big, endless, short, long]
+    return [b"\0\0", modes, head, big, endless, short, long]

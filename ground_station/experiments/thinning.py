@@ -1,4 +1,4 @@
-"""Which landmarks a smaller map keeps.
+"""A map with fewer landmarks, and which ones it keeps.
 
 The greedy cover of Li, Snavely and Huttenlocher (ECCV 2010), which wants every view to see enough
 of them, made soft, as by Lynen et al. (IJRR 2020): a landmark's gain falls with what the views that
@@ -7,18 +7,18 @@ see it have already, and with what the same part of their picture has.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.map.store import Landmarks, Map
-from ground_station.map_update.compression.viewpoints import ExpectedSights, expected_sights
+from ground_station.experiments.viewpoints import ExpectedSights, expected_sights
+from ground_station.map.descriptors import Descriptors
+from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.progress import Progress
 
 F64 = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
-
-METHODS = ("coverage", "observations", "random")
-"""How landmarks are chosen: the others are there to be compared with."""
 
 _ROUNDS = 200
 """Those that gain most are taken together in so many rounds, whatever the map's size; one by one
@@ -32,23 +32,14 @@ _SPREAD = 0.35
 counts less."""
 
 
-def choose(map_: Map, count: int, method: str = "coverage", seed: int = 0) -> Indices:
-    """The landmarks (count,) that are kept, in order; all when there are no more.
-
-    `observations` are those seen most often, `random` any, by the seed.
-    """
+def choose(map_: Map, count: int) -> Indices:
+    """The landmarks (count,) that are kept, in order; all when there are no more."""
     total = len(map_.landmarks)
     if count >= total:
         return np.arange(total)
-    if method == "random":
-        kept = np.random.default_rng(seed).permutation(total)[:count]
-    elif method == "observations":
-        kept = np.argsort(-map_.landmarks.observations, kind="stable")[:count]
-    else:
-        with Progress("viewpoints, keyframes", len(map_.keyframes)) as progress:
-            sights = expected_sights(map_, progress.step)
-        kept = cover(sights, quality(map_.landmarks, map_.info.camera.fx_px), count)
-    return np.sort(kept)
+    with Progress("viewpoints, keyframes", len(map_.keyframes)) as progress:
+        sights = expected_sights(map_, progress.step)
+    return np.sort(cover(sights, quality(map_.landmarks, map_.info.camera.fx_px), count))
 
 
 def quality(landmarks: Landmarks, focal_px: float) -> F64:
@@ -99,3 +90,27 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
         in_view = np.sqrt(1 + filled).reshape(len(covered), -1) - 1
         covered = in_view.sum(axis=1)
     return np.concatenate([*kept, np.empty(0, np.intp)]).astype(np.intp)
+
+
+def subset(map_: Map, kept: Indices) -> Map:
+    """The map with some of its landmarks (N,), in order, their modes, and all of its keyframes."""
+    lm, kf = map_.landmarks, map_.keyframes
+    names = [field.name for field in dataclasses.fields(Landmarks)]
+    rows = {name: getattr(lm, name)[kept] for name in names if name != "descriptor"}
+    descriptor = lm.descriptor
+    rows["descriptor"] = (
+        descriptor.rows(kept) if isinstance(descriptor, Descriptors) else descriptor[kept]
+    )
+    place = np.full(len(lm), -1, np.int64)
+    place[kept] = np.arange(len(kept))
+    landmark = place[kf.landmark]
+    left = landmark >= 0
+    keyframes = dataclasses.replace(
+        kf,
+        offset=np.concatenate([[0], np.cumsum(left)])[kf.offset],
+        landmark=landmark[left].astype(np.int32),
+        pixel_px=kf.pixel_px[left],
+    )
+    modes = map_.modes.among(place >= 0) if map_.modes is not None else None
+    info = MapInfo(**vars(map_.info))
+    return Map(info, Landmarks(**rows), keyframes, map_.folder, modes)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rooms_map import looking, made_of, wall
 
+from ground_station.experiments import thinning
+from ground_station.experiments.viewpoints import CELLS, ExpectedSights, expected_sights
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.inspection.sightings import View
-from ground_station.map_update.compression import choice
-from ground_station.map_update.compression.viewpoints import CELLS, ExpectedSights, expected_sights
 
 
 def _random_sights(seed: int, views=10, landmarks=60) -> tuple[ExpectedSights, np.ndarray]:
@@ -52,7 +52,7 @@ def _greedy(sights: ExpectedSights, quality: np.ndarray, count: int) -> list[int
 
 def test_rounds_cover_as_well_as_one_by_one():
     sights, quality = _random_sights(3)
-    ours = choice.cover(sights, quality, 15, rounds=5)
+    ours = thinning.cover(sights, quality, 15, rounds=5)
     assert len(set(ours.tolist())) == 15
     best = _utility(sights, quality, np.array(_greedy(sights, quality, 15)))
     rng = np.random.default_rng(0)
@@ -66,7 +66,7 @@ def test_a_part_of_the_picture_is_not_filled_before_others_have_something():
     """Ten landmarks in one cell, one in each of three others, all as good."""
     cell = np.array([0] * 10 + [1, 2, 3])
     sights = ExpectedSights(np.zeros(13, int), cell, np.arange(13), np.ones(13), np.ones(1))
-    kept = choice.cover(sights, np.ones(13), 4)
+    kept = thinning.cover(sights, np.ones(13), 4)
     assert set(cell[kept]) == {0, 1, 2, 3}
 
 
@@ -75,8 +75,8 @@ def test_what_nobody_sees_comes_last():
         np.zeros(3, int), np.zeros(3, int), np.arange(3), np.ones(3), np.ones(1)
     )
     quality = np.array([0.1, 0.1, 0.1, 1.0, 0.9])
-    assert set(choice.cover(sights, quality, 3)) == {0, 1, 2}
-    assert set(choice.cover(sights, quality, 4)) == {0, 1, 2, 3}
+    assert set(thinning.cover(sights, quality, 3)) == {0, 1, 2}
+    assert set(thinning.cover(sights, quality, 4)) == {0, 1, 2, 3}
 
 
 def test_a_view_that_sees_little_keeps_more_of_it():
@@ -91,16 +91,14 @@ def test_a_view_that_sees_little_keeps_more_of_it():
     map_ = made_of(position, np.array(wTc), seen)
     weight = expected_sights(map_).weight[: len(wTc)]
     assert weight[-1] == 1 and weight[:-1].sum() == pytest.approx(1, abs=0.1)
-    kept = choice.choose(map_, 30)
+    kept = thinning.choose(map_, 30)
     share = [np.isin(s, kept).mean() for s in seen]
     assert share[-1] > 1.5 * max(share[:-1])
-    often = choice.choose(map_, 30, "observations")
-    assert not np.isin(seen[-1], often).any()  # what a count of sights would have done
 
 
 def test_quality_is_less_where_a_landmark_is_known_worse_or_varied_more(rooms):
     lm = rooms.landmarks
-    before = choice.quality(lm, 500.0)
+    before = thinning.quality(lm, 500.0)
     assert (before > 0).all()
     distance = np.sqrt(lm.distance_m.prod(axis=1))
     assert np.corrcoef(1 / distance, before)[0, 1] > 0.99  # all else is the same
@@ -111,18 +109,35 @@ def test_quality_is_less_where_a_landmark_is_known_worse_or_varied_more(rooms):
     lm.covariance_m2[9] += (0.05**2 * np.outer(lm.view_direction[9], lm.view_direction[9])).astype(
         np.float32
     )
-    after = choice.quality(lm, 500.0)
+    after = thinning.quality(lm, 500.0)
     assert after[3] < 0.8 * before[3] and after[7] < 0.5 * before[7]
     assert after[9] == pytest.approx(before[9], rel=0.02)  # along the ray it hardly matters
     assert np.array_equal(np.delete(after, [3, 7, 9]), np.delete(before, [3, 7, 9]))
 
 
-@pytest.mark.parametrize("method", choice.METHODS)
-def test_every_method_gives_as_many_as_asked_for_in_order(rooms, method):
-    kept = choice.choose(rooms, 100, method, seed=3)
+def test_a_subset_of_all_is_all(rooms):
+    same = thinning.subset(rooms, np.arange(len(rooms.landmarks)))
+    for name in ("id", "position_m", "spread", "descriptor"):
+        assert np.array_equal(getattr(same.landmarks, name), getattr(rooms.landmarks, name))
+    for name in ("offset", "landmark", "pixel_px"):
+        assert np.array_equal(getattr(same.keyframes, name), getattr(rooms.keyframes, name))
+
+
+def test_a_subset_keeps_the_observations_of_its_landmarks(rooms):
+    kept = thinning.choose(rooms, 100)
+    some, kf = thinning.subset(rooms, kept), rooms.keyframes
+    assert np.array_equal(some.landmarks.id, rooms.landmarks.id[kept])
+    for k in range(len(kf)):
+        seen = kf.landmark[kf.offset[k] : kf.offset[k + 1]]
+        row = slice(some.keyframes.offset[k], some.keyframes.offset[k + 1])
+        assert np.array_equal(kept[some.keyframes.landmark[row]], seen[np.isin(seen, kept)])
+
+
+def test_as_many_are_chosen_as_asked_for_in_order(rooms):
+    kept = thinning.choose(rooms, 100)
     assert len(kept) == 100 and (np.diff(kept) > 0).all()
-    assert np.array_equal(kept, choice.choose(rooms, 100, method, seed=3))
-    assert np.array_equal(choice.choose(rooms, 10**6, method), np.arange(len(rooms.landmarks)))
+    assert np.array_equal(kept, thinning.choose(rooms, 100))
+    assert np.array_equal(thinning.choose(rooms, 10**6), np.arange(len(rooms.landmarks)))
 
 
 def test_keyframes_and_views_beside_them_show_what_they_and_their_neighbours_saw(rooms):

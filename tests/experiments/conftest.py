@@ -10,7 +10,7 @@ import pytest
 
 from ground_station.map.store import Map
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "inspection"))  # for rooms_map
+sys.path.insert(0, str(Path(__file__).parents[1] / "inspection"))  # for rooms_map
 
 
 @pytest.fixture

@@ -1,1 +1,0 @@
-"""A smaller map that localizes nearly as well."""
