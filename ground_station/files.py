@@ -1,4 +1,4 @@
-"""Writing files so that a killed program leaves the old one whole: beside, then renamed."""
+"""Writing files so that a killed program or a power cut leaves the old one whole."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import GroundStationError
+from pi_firmware.wire import files
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
     path = Path(path)
-    part = path.with_name(path.name + ".part")
     try:
-        part.write_bytes(data)
-        part.replace(path)
+        files.write(path, data)
     except OSError as error:
         raise GroundStationError(f"{path}: {error.strerror or error}") from None
 
@@ -28,12 +27,13 @@ def write_text(path: str | Path, text: str) -> None:
 
 def write_json(path: str | Path, document: Any) -> None:
     """Writes a document as JSON; a number that is not finite becomes null, which JSON can say."""
-    write_text(path, json.dumps(_finite(document), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(finite(document), indent=2, allow_nan=False) + "\n")
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Plain values with null in place of numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

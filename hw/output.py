@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hw.errors import HardwareError
+from pi_firmware.wire import files
 
 
 def make_folder(path: Path) -> None:
@@ -24,7 +25,7 @@ def write(path: Path, produce: Callable[[Path], object]) -> None:
     make_folder(path.parent)
     try:
         produce(part)
-        part.replace(path)
+        files.replace(part, path)
     except OSError as error:
         raise HardwareError(f"{path}: {error.strerror or error}") from None
     finally:

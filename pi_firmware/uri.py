@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import parse_qsl
 
 from pi_firmware.wire.errors import SourceError
+from pi_firmware.wire.text import shown
 
 
 @dataclass(frozen=True)
@@ -21,14 +22,14 @@ class Uri:
 
     def fail(self, reason: str) -> SourceError:
         """The error to raise about this URI."""
-        return SourceError(f"{self.what} {_shown(self.text)}: {reason}")
+        return SourceError(f"{self.what} {shown(self.text, 200)}: {reason}")
 
     def only(self, *names: str) -> None:
         """Raises `SourceError` for an option that the device does not have."""
         for name in self.options:
             if name not in names:
                 known = ", ".join(names) or "none"
-                raise self.fail(f"unknown option {_shown(name)} (known: {known})")
+                raise self.fail(f"unknown option {shown(name, 200)} (known: {known})")
 
     def number(self, name: str, default: float, low: float, high: float) -> float:
         """A numeric option within its range."""
@@ -40,14 +41,14 @@ class Uri:
         except ValueError:
             value = math.nan
         if not low <= value <= high:
-            raise self.fail(f"{name} is {_shown(text)}; allowed: {low:g} to {high:g}")
+            raise self.fail(f"{name} is {shown(text, 200)}; allowed: {low:g} to {high:g}")
         return value
 
     def choice(self, name: str, default: str, allowed: tuple[str, ...]) -> str:
         """An option with a fixed set of values."""
         value = self.options.get(name, default)
         if value not in allowed:
-            raise self.fail(f"{name} is {_shown(value)}; allowed: {', '.join(allowed)}")
+            raise self.fail(f"{name} is {shown(value, 200)}; allowed: {', '.join(allowed)}")
         return value
 
 
@@ -55,20 +56,17 @@ def parse(text: str, what: str) -> Uri:
     """Splits a device URI; raises `SourceError` with one line."""
     scheme, colon, rest = text.partition(":")
     if not colon or not scheme:
-        raise SourceError(f"{what} {_shown(text)}: expected scheme:path?option=value")
+        raise SourceError(f"{what} {shown(text, 200)}: expected scheme:path?option=value")
     path, _, query = rest.partition("?")
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
     except ValueError:
-        raise SourceError(f"{what} {_shown(text)}: the options are not name=value&…") from None
+        raise SourceError(f"{what} {shown(text, 200)}: the options are not name=value&…") from None
     options: dict[str, str] = {}
     for name, value in pairs:
         if name in options:
-            raise SourceError(f"{what} {_shown(text)}: option {_shown(name)} is given twice")
+            raise SourceError(
+                f"{what} {shown(text, 200)}: option {shown(name, 200)} is given twice"
+            )
         options[name] = value
     return Uri(text, what, scheme, path, options)
-
-
-def _shown(text: str) -> str:
-    """A text as one short line."""
-    return repr(text if len(text) <= 200 else text[:197] + "...")

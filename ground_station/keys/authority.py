@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from typing import Any
 from ground_station.errors import KeysError
 from ground_station.keys import certificates
 from ground_station.keys.certificates import Pair
-from pi_firmware.wire import credentials, keys
+from pi_firmware.wire import credentials, files, keys
 from pi_firmware.wire.credentials import GROUND, PAYLOAD
 
 SCHEMA = "blimp.authority/1"
@@ -267,17 +266,10 @@ def write_private(path: Path, data: bytes, *, replace: bool = False) -> None:
 
     Raises `KeysError` with one line when it exists and `replace` is not set.
     """
-    part = path.with_name(path.name + ".part")
     try:
         if path.exists() and not replace:
             raise KeysError(f"{path}: exists already, and keys are never overwritten")
-        part.unlink(missing_ok=True)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-        with os.fdopen(os.open(part, flags, 0o600), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        files.write(path, data, 0o600)
     except OSError as error:
         raise KeysError(f"{path}: {error.strerror or error}") from None
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ground_station.errors import MapError
+from pi_firmware.wire import files
 
 _OURS = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", "sparse")
 PICTURE = "map.png"
@@ -67,6 +68,9 @@ def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         yield part
+        for path in part.rglob("*"):
+            files.sync(path)
+        files.sync(part)
         if folder.exists():
             for entry in folder.iterdir():
                 if entry.name not in (*_OURS, PICTURE) and not (part / entry.name).exists():
@@ -78,6 +82,7 @@ def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
                 shutil.rmtree(old, ignore_errors=True)
         else:
             part.rename(folder)
+        files.sync(folder.parent)
     except OSError as error:
         raise MapError(f"{error.filename or folder}: {error.strerror or error}") from None
     finally:

@@ -17,7 +17,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.descriptors import Descriptors, open_descriptors, quantised
 from ground_station.map.modes import MOST, Modes
-from pi_firmware.wire import config
+from pi_firmware.wire import config, files
 from pi_firmware.wire.errors import ConfigError
 
 FORMAT = 1
@@ -192,16 +192,11 @@ def save_info(folder: Path, info: MapInfo) -> None:
     }
     if info.extended:
         document["extended"] = info.extended
-    path = folder / "map.toml"
-    part = folder / "map.toml.part"
-    part.write_bytes(tomli_w.dumps(document).encode())
-    part.replace(path)
+    files.write(folder / "map.toml", tomli_w.dumps(document).encode())
 
 
 def _save(path: Path, arrays: dict[str, npt.NDArray[Any]], metadata: dict[str, str]) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata))
-    part.replace(path)
+    files.write(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata))
 
 
 def load_info(folder: str | Path) -> MapInfo:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.geometry.trajectory import tum_line
+from pi_firmware.wire import files
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, PoseSample, RecordingReader, RecordingWriter
 
 HEADER = "# timestamp tx ty tz qx qy qz qw\n"
@@ -82,19 +83,15 @@ def tum(poses: Poses) -> Iterator[str]:
 def write_mcap(path: str | Path, poses: Poses, source: str) -> None:
     """Writes the poses alone as a recording, beside and renamed; `source` names where from."""
     path = Path(path)
-    part = path.with_name(path.name + ".part")
     try:
-        with RecordingWriter(part) as writer:
+        with files.replacing(path) as part, RecordingWriter(part) as writer:
             writer.write_metadata("export", {"source": source, "topic": poses.topic})
             for sample in poses.samples:
                 writer.write_pose(
                     sample.time_ns, sample.position_m, sample.quaternion_xyzw, topic=poses.topic
                 )
-        part.replace(path)
     except OSError as error:
         raise ExportError(f"{path}: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _only_topic(path: str | Path, topics: Iterable[str]) -> str:

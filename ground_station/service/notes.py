@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from ground_station.errors import GroundStationError
+from ground_station.files import finite
 
 FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
 EVENT, RECORDING, PROCESS = "event", "recording", "process"
@@ -167,7 +167,7 @@ def encode(note: Note) -> bytes:
     try:
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     except ValueError:
-        return json.dumps(_finite(document), separators=(",", ":"), allow_nan=False).encode()
+        return json.dumps(finite(document), separators=(",", ":"), allow_nan=False).encode()
 
 
 def decode(kind: type[N], data: bytes) -> N:
@@ -195,15 +195,5 @@ def _depth(value: Any) -> int:
 def as_document(note: Note) -> dict[str, Any]:
     """A note as plain JSON values."""
     document = {item.name: getattr(note, item.name) for item in dataclasses.fields(note)}
-    finite: dict[str, Any] = _finite(document)
-    return finite
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
+    told: dict[str, Any] = finite(document)
+    return told

@@ -36,6 +36,7 @@ from ground_station.simulator.plans import Plan, Reference, plan_named
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.unsteady import unsteady
+from pi_firmware.wire import files
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 FIRST_FRAME_S = 1.0
@@ -212,18 +213,12 @@ def _interrupt_noted() -> Iterator[list[bool]]:
 @contextmanager
 def _recording(path: Path) -> Iterator[RecordingWriter]:
     """A recording written beside and renamed when it is closed properly."""
-    part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SimulatorError(f"{path.parent}: {error.strerror or error}") from None
-    try:
-        with RecordingWriter(part) as writer:
-            yield writer
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with files.replacing(path) as part, RecordingWriter(part) as writer:
+        yield writer
 
 
 def simulate(settings: SimulationSettings, progress: Progress | None = None) -> SimulationResult:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ground_station.training.errors import TrainingError
+from pi_firmware.wire import files
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 _NAME = re.compile(r"step-(\d{7})\.safetensors")
@@ -47,15 +47,10 @@ def _digest(arrays: Arrays) -> str:
 def write(folder: Path, checkpoint: Checkpoint, keep_every: int) -> Path:
     """Writes one and removes old ones, but for those at whole multiples of `keep_every` steps."""
     path = folder / f"step-{checkpoint.step:07d}.safetensors"
-    part = path.with_name(path.name + ".part")
     note = {"state": json.dumps(checkpoint.state), "sha256": _digest(checkpoint.arrays)}
     data = save({k: np.array(v, order="C") for k, v in checkpoint.arrays.items()}, note)
     try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        files.write(path, data)
         for step, old in steps(folder)[:-_KEPT]:
             if step % keep_every:
                 old.unlink()

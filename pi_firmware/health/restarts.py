@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import threading
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pi_firmware.health import small_files
+from pi_firmware.wire import files
 
 _SCHEMA = "blimp.restarts/1"
 _MOST_REBOOTS = 3
@@ -130,7 +130,7 @@ class Restarts:
         self._counts = counts
         document = {"schema": _SCHEMA, **dataclasses.asdict(counts)}
         try:
-            _write_synced(self._path, json.dumps(document).encode() + b"\n")
+            files.write(self._path, json.dumps(document).encode() + b"\n")
         except (OSError, ValueError) as error:
             if not self._complained:
                 self._complained = True
@@ -155,18 +155,3 @@ def _is_good(value: Any, like: Any) -> bool:
     if type(value) is not type(like):
         return False
     return not isinstance(value, int) or 0 <= value <= _HIGHEST
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    """Writes beside and renames, both synced: after a power cut it is the old file or the new."""
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pi_firmware.wire.errors import ConfigError
+from pi_firmware.wire.text import shown
 
 T = TypeVar("T")
 
@@ -53,12 +54,12 @@ def apply_override(document: dict[str, Any], override: str, cls: type | None = N
     """
     name, equals, text = override.partition("=")
     if not equals:
-        raise ConfigError(f"--set {_shown(override)}: expected key=value, as in the file")
+        raise ConfigError(f"--set {shown(override)}: expected key=value, as in the file")
     *tables, last = name.strip().split(".")
     for part in tables:
         document = document.setdefault(part, {})
         if not isinstance(document, dict):
-            raise ConfigError(f"--set {_shown(override)}: {_shown(part)} is not a table")
+            raise ConfigError(f"--set {shown(override)}: {shown(part)} is not a table")
     if cls is None:
         document[last] = _value_or_text(text)
     else:
@@ -76,7 +77,7 @@ def _toml_value(text: str, override: str) -> Any:
     try:
         return parse(f"value = {text}")["value"]
     except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
-        raise ConfigError(f"--set {_shown(override)}: {_shown(text)} is not a TOML value") from None
+        raise ConfigError(f"--set {shown(override)}: {shown(text)} is not a TOML value") from None
 
 
 def _value_or_text(text: str) -> Any:
@@ -138,7 +139,7 @@ def _build(document: Mapping[str, Any], cls: type[T], where: str, prefix: str) -
     unknown = sorted(set(document) - set(fields))
     if unknown:
         known = ", ".join(sorted(fields))
-        name = _shown(prefix + unknown[0])
+        name = shown(prefix + unknown[0])
         raise ConfigError(f"{where}: unknown key {name} (known here: {known})")
     values: dict[str, Any] = {}
     for name, field in fields.items():
@@ -171,31 +172,31 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
         origin = typing.get_origin(kind)
     if origin is list or kind is list:
         if not isinstance(value, list):
-            raise ConfigError(f"{what} must be a list, not {_shown(value)}")
+            raise ConfigError(f"{what} must be a list, not {shown(value)}")
         (item,) = typing.get_args(kind) or (Any,)
         return [_check(v, item, meta, f"{what}[{i}]") for i, v in enumerate(value)]
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         try:
             value = float(value)
         except OverflowError:
-            raise ConfigError(f"{what} must be a finite number, not {_shown(value)}") from None
+            raise ConfigError(f"{what} must be a finite number, not {shown(value)}") from None
     if kind is not Any and (
         not isinstance(value, kind) or (kind is int and isinstance(value, bool))
     ):
-        raise ConfigError(f"{what} must be {_kind_name(kind)}, not {_shown(value)}")
+        raise ConfigError(f"{what} must be {_kind_name(kind)}, not {shown(value)}")
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{what} must be a finite number, not {value!r}")
     choices = meta.get("choices")
     if choices is not None and value not in choices:
         allowed = ", ".join(map(repr, choices))
-        raise ConfigError(f"{what} is {_shown(value)}; allowed: {allowed}")
+        raise ConfigError(f"{what} is {shown(value)}; allowed: {allowed}")
     low, high, unit = meta.get("low"), meta.get("high"), meta.get("unit", "")
     if isinstance(value, int | float) and not isinstance(value, bool):
         too_low, too_high = low is not None and value < low, high is not None and value > high
         if too_low or too_high:
             span = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
             raise ConfigError(
-                f"{what} is {_shown(value)}; allowed: {span}{' ' + unit if unit else ''}"
+                f"{what} is {shown(value)}; allowed: {span}{' ' + unit if unit else ''}"
             )
     return value
 
@@ -203,17 +204,6 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
 def _kind_name(kind: Any) -> str:
     names = {float: "a number", int: "a whole number", str: "a string", bool: "true or false"}
     return names.get(kind, str(kind))
-
-
-def _shown(value: Any) -> str:
-    """A value as one short line."""
-    if isinstance(value, int) and value.bit_length() > 128:  # Python refuses to print huge ones
-        return f"a number of {value.bit_length()} bits"
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # such a number inside a list, or tables without end
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def differences(path: str | Path, cls: type) -> list[str]:
@@ -234,9 +224,9 @@ def _differences(document: Mapping[str, Any], loaded: Any, cls: type, prefix: st
             default = field.default_factory()
         if field.name not in document:
             if default is not None:
-                lines.append(f"'{full}' is not in the file (default: {_shown(default)})")
+                lines.append(f"'{full}' is not in the file (default: {shown(default)})")
         elif dataclasses.is_dataclass(value):
             lines += _differences(document[field.name], value, type(value), full + ".")
         elif default is not dataclasses.MISSING and value != default:
-            lines.append(f"'{full}' is {_shown(value)} in the file; default: {_shown(default)}")
+            lines.append(f"'{full}' is {shown(value)} in the file; default: {shown(default)}")
     return lines

@@ -12,6 +12,7 @@ from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import FrameRange
+from pi_firmware.wire import files
 from pi_firmware.wire.recording import TRUTH_TOPIC
 
 PLAN, LIGHT, SEED = "loop", "sunset", 41
@@ -47,7 +48,7 @@ def flight(folder: Path, duration_s: float) -> Path:
     if made.interrupted:
         part.unlink(missing_ok=True)
         raise KeyboardInterrupt
-    part.replace(path)
+    files.replace(part, path)
     return path
 
 

@@ -12,6 +12,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.colmap import pycolmap
 from ground_station.mapping.construction.matching import TwoView
+from pi_firmware.wire import files
 
 F64 = npt.NDArray[np.float64]
 
@@ -61,4 +62,4 @@ def write_database(
                 geometry.H = shift @ view.homography @ np.linalg.inv(shift)
             database.write_matches(i + 1, j + 1, view.matches.astype(np.uint32))
             database.write_two_view_geometry(i + 1, j + 1, geometry)
-    part.replace(path)
+    files.replace(part, path)

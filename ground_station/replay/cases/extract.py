@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -12,6 +11,7 @@ from google.protobuf.message import DecodeError
 
 from ground_station.errors import InputError
 from ground_station.recording.frames import CAMERA_TABLE
+from pi_firmware.wire import files
 from pi_firmware.wire.recording import (
     CALIBRATION_TOPIC,
     ESTIMATE_TOPIC,
@@ -34,28 +34,24 @@ def extract(source: str | Path, prefix: str, path: str | Path) -> int:
     Raises `InputError` when there are none.
     """
     source, path = Path(source), Path(path)
-    part = path.with_name(path.name + ".part")
     reader = RecordingReader(source)
     wanted = {prefix + topic: topic for topic in _TOPICS}
     frames = 0
     try:
-        with RecordingWriter(part) as writer:
-            for channel, record in reader.messages(set(wanted)):
-                _copy(writer, wanted[channel.topic], record.log_time, record.data)
-                frames += wanted[channel.topic] == VIDEO_TOPIC
-            for name in _TABLES:
-                if reader.metadata.get(name):
-                    writer.write_metadata(name, reader.metadata[name])
-        if not frames:
-            raise InputError(f"{source}: no video on {prefix}{VIDEO_TOPIC}")
-        part.replace(path)
+        with files.replacing(path) as part:
+            with RecordingWriter(part) as writer:
+                for channel, record in reader.messages(set(wanted)):
+                    _copy(writer, wanted[channel.topic], record.log_time, record.data)
+                    frames += wanted[channel.topic] == VIDEO_TOPIC
+                for name in _TABLES:
+                    if reader.metadata.get(name):
+                        writer.write_metadata(name, reader.metadata[name])
+            if not frames:
+                raise InputError(f"{source}: no video on {prefix}{VIDEO_TOPIC}")
     except (DecodeError, IndexError):
         raise InputError(f"{source}: a message is not what its topic says") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
     return frames
 
 

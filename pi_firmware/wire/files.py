@@ -1,0 +1,60 @@
+"""Files written beside and renamed, both synced: after a power cut there is the old one or the new.
+
+Without the sync of the file a name may survive that holds nothing, without that of the folder the
+old name may (Pillai et al., "All File Systems Are Not Created Equal", OSDI 2014).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+PART = ".part"
+"""What a file is called, after its name, until it is whole."""
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Gives a name beside `path`; what is written there takes its place when the block ends well.
+
+    Otherwise nothing of it is left. Raises `OSError`.
+    """
+    part = path.with_name(path.name + PART)
+    try:
+        yield part
+        replace(part, path)
+    except BaseException:  # and only then: with its name it is another's, who writes next
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+
+
+def write(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Writes a whole file, new with the permissions `mode` less the umask; raises `OSError`."""
+    with replacing(path) as part:
+        part.unlink(missing_ok=True)
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+        with open(descriptor, "wb") as file:
+            file.write(data)
+
+
+def replace(part: Path, path: Path) -> None:
+    """Gives a file that is written its name, or a folder whose files are; raises `OSError`."""
+    sync(part)
+    part.replace(path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Brings a file's bytes or a folder's names to the disk; raises `OSError`."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system that does not sync such a thing
+            raise
+    finally:
+        os.close(descriptor)
