@@ -11,7 +11,6 @@ from ground_station.experiments.material import flown
 from ground_station.map import store
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.cache import Cache
-from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.settings import MappingSettings
 
@@ -43,7 +42,6 @@ def build(
             total=len(chosen),
             cache=kept if settings.cache_gb else None,
         )
-    straighten(folder, settings)
     return register_map(folder, trajectory=material.truth, source="truth")[0]
 
 

@@ -14,7 +14,6 @@ from ground_station.localization.settings import load_preset
 from ground_station.map.store import Map
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import open_inputs
-from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import load_settings
@@ -87,7 +86,6 @@ def build(mapping: Path, sample: Path, folder: Path) -> Map:
     settings = load_settings(sample / "mapping.toml")
     inputs = open_inputs([str(mapping)], settings)
     build_map(inputs, inputs.camera, settings, folder, total=inputs.total, built=inputs.built)
-    straighten(folder, settings)
     registered, found = register_map(
         folder, sights=read_pairs(sample / "PAIRS.csv"), source="PAIRS.csv"
     )

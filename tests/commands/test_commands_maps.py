@@ -141,15 +141,17 @@ def test_a_build_ends_with_a_verdict_a_picture_and_the_next_command(
     import shutil
 
     from ground_station.mapping.construction import build
-    from ground_station.mapping.refinement import refine
 
     _images(tmp_path / "two", 2)
     shutil.copytree(built.folder, tmp_path / "map")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(build, "build_map", lambda *_, **__: None)
-    monkeypatch.setattr(refine, "straighten", lambda *_: built.map)
+    monkeypatch.setattr(build, "build_map", lambda *_, **__: built.map)
     assert _run("build", "two", "--out", "map", "--json", "b.json") == 0
-    lines = capsys.readouterr().out.splitlines()[1:]  # after the guessed lens
+    _, cached, *lines = capsys.readouterr().out.splitlines()  # after the guessed lens
+    assert "features of 0 of 0 images" in cached
+    notes = built.map.info.built["notes"]
+    assert lines[: len(notes)] == notes
+    lines = lines[len(notes) :]
     assert lines[0] == "WHOLE: all 16 images stand in this map, in one piece"
     assert lines[-2:] == [
         "picture: map/map.png",

@@ -21,7 +21,6 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
 from ground_station.mapping.construction.build import build_map
-from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
@@ -41,7 +40,6 @@ def registered_map(
 ) -> Map:
     """A map of all frames of the source, registered by their true poses, as `blimp map` does it."""
     build_map(source, camera, settings, folder, total=source.count())
-    straighten(folder, settings)
     return register_map(folder, trajectory=trajectory, source="truth")[0]
 
 

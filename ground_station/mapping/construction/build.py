@@ -31,6 +31,7 @@ from ground_station.mapping.construction.structure import Structure, adjust_and_
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
+from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
@@ -46,19 +47,18 @@ def build_map(
     built: dict[str, Any] | None = None,
     cache: Cache | None = None,
     workers: Workers | None = None,
-    held: ExitStack | None = None,
 ) -> store.Map:
     """Builds a map from frames in the folder `out`; a killed build leaves the old map there.
 
     `prior` says how well the camera is known; None: it is calibrated. A lens that nobody calibrated
     is found by the images, and so is one that misfits, where the images decide; the map holds it
     then. `total` is the number of frames if known, `built` what map.toml shall say of the inputs.
-    With a `cache`, what an earlier build has made is not made again, one that was killed included.
-    `held` keeps the work of structure from motion until the caller has done with the map, too.
-    `workers` extract and match, by default threads of this process. Raises `InputError` when there
-    are fewer than two frames, `MapError` when sizes differ from the camera's, images do not
-    overlap, structure from motion fails, or nobody calibrated the lens and the images leave it
-    open.
+    The rolling shutter of the camera is taken out of the finished map. What is worth a note stands
+    in its `info.built["notes"]`. With a `cache`, what an earlier build has made is not made again,
+    one that was killed included. `workers` extract and match, by default threads of this process.
+    Raises `InputError` when there are fewer than two frames, `MapError` when sizes differ from the
+    camera's, images do not overlap, structure from motion fails, or nobody calibrated the lens and
+    the images leave it open.
     """
     out = Path(out)
     threads = settings.threads or os.cpu_count() or 1
@@ -89,8 +89,7 @@ def build_map(
             work = None
             if cache:
                 key = structure_key(images, pairs, camera, limits)
-                keeper = own if held is None else held
-                work = keeper.enter_context(lasting(cache.folder / "work", key))
+                work = own.enter_context(lasting(cache.folder / "work", key))
             if work is None:
                 work = folder / "work" / str(lens.rounds)
                 work.mkdir(parents=True)
@@ -100,11 +99,7 @@ def build_map(
                 model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
             with _timed(stage_s, "lens"):
                 going = lens.go_on(model, images)
-        if cache:
-            print(f"{cache.figures} (cache {cache.folder})", flush=True)
         notes = _notes(len(images.names), len(model.names), structure)
-        for note in notes:
-            print(note, flush=True)
         map_ = assemble(model, images, camera, settings, out.name)
         map_.info.built = {
             **(built or {}),
@@ -131,12 +126,30 @@ def build_map(
             "stage_s": {name: round(value, 3) for name, value in stage_s.items()},
             "settings": asdict(settings),
         }
-        colmap.write(colmap.compact(structure.reconstruction), folder / "sparse")
+        map_, sparse = _straightened(map_, structure.reconstruction, settings)
+        colmap.write(sparse, folder / "sparse")
         colmap_files.check(folder / "sparse")  # COLMAP does not say when the disk is full
         store.save_tables(folder, map_, quantise=settings.quantise)
         shutil.rmtree(folder / "work", ignore_errors=True)
     map_.folder = out
     return map_
+
+
+def _straightened(
+    map_: store.Map, reconstruction: colmap.Reconstruction, settings: MappingSettings
+) -> tuple[store.Map, colmap.Reconstruction]:
+    """The map without its camera's rolling shutter, and the COLMAP model that goes with it.
+
+    One that cannot be adjusted stays as it is, and a note says so.
+    """
+    try:
+        found = straighten(map_, settings)
+    except MapError as error:
+        map_.info.built["notes"].append(f"the rolling shutter stays in the map: {error}")
+        found = None
+    if found is None:
+        return map_, colmap.compact(reconstruction)
+    return found[0], colmap.from_arrays(found[1], map_.info.camera)
 
 
 @contextmanager

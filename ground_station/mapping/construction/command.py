@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,7 +79,6 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.mapping.construction.inputs import open_inputs
     from ground_station.mapping.construction.verdict import next_step, verdict
     from ground_station.mapping.construction.workers import open_workers
-    from ground_station.mapping.refinement.refine import straighten
     from ground_station.mapping.settings import load_settings, with_changes
     from ground_station.presentation.dress import LIGHT, write_png
 
@@ -96,19 +95,21 @@ def run(args: argparse.Namespace) -> int:
     with (
         open_workers(args.dask, threads, settings) as workers,
         _cache(args, settings) as cache,
-        ExitStack() as held,
     ):
         inputs = open_inputs(
             args.inputs, settings, camera=args.camera, rate_hz=args.rate_hz, frames=args.range
         )
         for line in inputs.said:
             print(line, flush=True)
-        build_map(
+        map_ = build_map(
             inputs, inputs.camera, settings, args.out,
             prior=inputs.prior, total=inputs.total, built=inputs.built, cache=cache,
-            workers=workers, held=held,
+            workers=workers,
         )  # fmt: skip
-        map_ = straighten(args.out, settings)
+        if cache:
+            print(f"{cache.figures} (cache {cache.folder})")
+        for line in map_.info.built["notes"]:
+            print(line)
     for note in inputs.notes:
         print(f"note: {note}", file=sys.stderr)
     found = verdict(map_)

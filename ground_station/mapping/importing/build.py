@@ -79,8 +79,6 @@ def import_model(
         )
         found = _settle(reconstruction, settings.sfm, threads)
         notes = _notes(model.names, images.names, found.names)
-        for note in notes:
-            print(note, flush=True)
         map_ = assemble(found, images, camera, settings, out.name)
         map_.info.built = {
             **(built or {}),

@@ -69,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
         "rate_hz": args.rate_hz,
     }
     map_ = import_model(model, pictures, camera, settings, args.out, built=built)
+    for note in map_.info.built["notes"]:
+        print(note)
     for note in pictures.notes:
         print(f"note: {note}", file=sys.stderr)
     print_table(describe(map_))

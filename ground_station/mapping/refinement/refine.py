@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from ground_station.errors import MapError
 from ground_station.map import colmap, landmarks, store
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.folder import carry_floorplan, kept_name, replacing
+from ground_station.map.model import Model
 from ground_station.map.observations import FlightObservations, landmarks_sha256
 from ground_station.map.refined import FRAME_TIME, Refined
 from ground_station.mapping.refinement import graph as graphs
@@ -61,52 +61,57 @@ def refine_map(
     target = folder if out is None else Path(out)
     kept = kept_name(folder.absolute()) if out is None else None
     with replacing(target, kept) as part:
-        with Progress("adjustment, rounds", None) as progress:
-            pixel_px, shutter = _keyframe_sights(map_, past, settings, progress.step)
-            groups = past.groups(len(map_.keyframes))
-            start = graphs.build_graph(map_, pixel_px, groups, chosen)
-            graph = adjust(start, map_, settings, progress.step)
-        _check_added(graph, past, chosen)
-        refined = _assemble(map_, graph)
-        report = {
-            "images": len(refined.keyframes),
-            "landmarks": len(refined.landmarks),
-            "sights": len(refined.keyframes.landmark),
-            "sights_dropped": len(start.model.point) - len(graph.model.point),
-            "frames_dropped": len(start.group) - len(graph.group),
-            "landmarks_dropped": len(map_.landmarks) - len(refined.landmarks),
-            "rolling_shutter": shutter,
-            "keyframes": _keyframe_report(map_, past, graph),
-            "flights": [
-                _flight_report(flight, start, graph, len(past.flights) + 1 + k)
-                for k, flight in enumerate(chosen)
-            ],
-        }
-        refined.info.refined = _table(map_, past, graph, report)
+        refined, model, report = _refined(map_, past, chosen, settings)
         if out is not None:
             refined.info.name = target.absolute().name
             carry_floorplan(folder, part)
-        colmap.write(colmap.from_arrays(graph.model, map_.info.camera), part / "sparse")
+        colmap.write(colmap.from_arrays(model, map_.info.camera), part / "sparse")
         quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
         store.save_tables(part, refined, quantise=quantise)
     refined.folder = target
     return refined, Refinement(report, kept)
 
 
-def straighten(folder: str | Path, settings: MappingSettings) -> store.Map:
-    """Takes the rolling shutter out of a map that was just built, in its place.
+def straighten(map_: store.Map, settings: MappingSettings) -> tuple[store.Map, Model] | None:
+    """A map that was just built, without the rolling shutter of its camera, and its model.
 
-    Structure from motion takes each picture for a moment's. Nothing is done where the camera has no
-    readout time or the settings say so; a map that cannot be adjusted stays as it was.
+    Structure from motion takes each picture for a moment's. None where the camera has no readout
+    time or the settings say so; raises `MapError` when the map cannot be adjusted.
     """
-    map_ = store.load(folder)
     if map_.info.camera.readout_s <= 0 or not settings.sfm.rolling_shutter:
-        return map_
-    try:
-        return refine_map(folder, (), settings, out=folder)[0]
-    except MapError as error:
-        print(f"note: the rolling shutter stays in the map: {error}", file=sys.stderr)
-        return map_
+        return None
+    _check_map(map_)
+    straight, model, _ = _refined(map_, Refined.of(map_), [], settings)
+    return straight, model
+
+
+def _refined(
+    map_: store.Map, past: Refined, chosen: Sequence[Chosen], settings: MappingSettings
+) -> tuple[store.Map, Model, dict[str, Any]]:
+    """The map adjusted together with the chosen frames, its model, and what is told of it."""
+    with Progress("adjustment, rounds", None) as progress:
+        pixel_px, shutter = _keyframe_sights(map_, past, settings, progress.step)
+        groups = past.groups(len(map_.keyframes))
+        start = graphs.build_graph(map_, pixel_px, groups, chosen)
+        graph = adjust(start, map_, settings, progress.step)
+    _check_added(graph, past, chosen)
+    refined = _assemble(map_, graph)
+    report = {
+        "images": len(refined.keyframes),
+        "landmarks": len(refined.landmarks),
+        "sights": len(refined.keyframes.landmark),
+        "sights_dropped": len(start.model.point) - len(graph.model.point),
+        "frames_dropped": len(start.group) - len(graph.group),
+        "landmarks_dropped": len(map_.landmarks) - len(refined.landmarks),
+        "rolling_shutter": shutter,
+        "keyframes": _keyframe_report(map_, past, graph),
+        "flights": [
+            _flight_report(flight, start, graph, len(past.flights) + 1 + k)
+            for k, flight in enumerate(chosen)
+        ],
+    }
+    refined.info.refined = _table(map_, past, graph, report)
+    return refined, graph.model, report
 
 
 def _check_map(map_: store.Map) -> None:

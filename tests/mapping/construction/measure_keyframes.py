@@ -28,7 +28,6 @@ from ground_station.geometry.alignment import align
 from ground_station.mapping.construction import keyframes
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import ChosenFrames
-from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings, load_settings
 from ground_station.presentation.text import columns
 from ground_station.recording.flight import FlightRecording, trajectory_of
@@ -65,8 +64,7 @@ def build(
     began_s = time.monotonic()
     try:
         assert source.camera is not None
-        build_map(source, source.camera, settings, folder / "map", total=len(indices))
-        map_ = straighten(folder / "map", settings)
+        map_ = build_map(source, source.camera, settings, folder / "map", total=len(indices))
     finally:
         shutil.rmtree(folder)
     kf = map_.keyframes

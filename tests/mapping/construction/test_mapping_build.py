@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import signal
 import subprocess
@@ -16,7 +17,10 @@ from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, store
+from ground_station.map.refined import Refined
 from ground_station.mapping.construction import build
+from ground_station.mapping.construction.cache import Cache
+from ground_station.mapping.refinement.refine import refine_map
 from ground_station.recording.frames import Frame
 
 pycolmap = colmap.pycolmap
@@ -202,3 +206,41 @@ def test_a_killed_build_leaves_the_old_map_whole(built, tmp_path, how):
     loaded = store.load(target)
     assert np.array_equal(loaded.landmarks.position_m, built.map.landmarks.position_m)
     assert pycolmap.Reconstruction(target / "sparse").num_points3D() == len(loaded.landmarks)
+
+
+def test_the_rolling_shutter_is_taken_out_as_the_last_step(built, use_scene, tmp_path):
+    """As adjusting the finished map would do it."""
+    use_scene(built.scene)
+    camera = dataclasses.replace(built.scene.camera, readout_s=0.02)
+    sfm = dataclasses.replace(built.settings.sfm, rolling_shutter=False)
+    left = dataclasses.replace(built.settings, sfm=sfm)
+    with Cache(tmp_path / "cache") as cache:
+        before = build.build_map(built.scene.frames(), camera, left, tmp_path / "left", cache=cache)
+        straight = build.build_map(
+            built.scene.frames(), camera, built.settings, tmp_path / "straight", cache=cache
+        )
+    assert not Refined.of(before).runs and Refined.of(straight).runs == 1
+    after, _ = refine_map(tmp_path / "left", (), built.settings, out=tmp_path / "after")
+    read = store.load(tmp_path / "straight")
+    assert np.allclose(read.landmarks.position_m, after.landmarks.position_m, atol=1e-6)
+    assert np.allclose(read.keyframes.wTc, after.keyframes.wTc, atol=1e-6)
+    assert np.array_equal(read.landmarks.descriptor[:], after.landmarks.descriptor[:])
+    model = colmap.to_arrays(colmap.read(tmp_path / "straight" / "sparse"))
+    assert np.allclose(model.wTc, read.keyframes.wTc, atol=1e-6)
+
+
+def test_a_map_that_cannot_be_adjusted_stays_and_says_so(
+    built, use_scene, tmp_path, monkeypatch, capsys
+):
+    def refuse(*_):
+        raise MapError("too few")
+
+    use_scene(built.scene)
+    monkeypatch.setattr(build, "straighten", refuse)
+    map_ = build.build_map(
+        built.scene.frames(), built.scene.camera, built.settings, tmp_path / "map"
+    )
+    note = "the rolling shutter stays in the map: too few"
+    assert map_.info.built["notes"][-1] == note
+    assert store.load_info(tmp_path / "map").built["notes"][-1] == note
+    assert not capsys.readouterr().out
