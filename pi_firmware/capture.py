@@ -27,7 +27,7 @@ _STARTED_ANEW = {
 }
 
 
-class Hopeless(StreamError):
+class UnrecoverableError(StreamError):
     """Starting anew inside the process has not helped: the process must be."""
 
     restart = True
@@ -114,7 +114,8 @@ class Capture:
     def step(self) -> bool:
         """Waits 50 ms at most for what happens and acts on it; False at the stream's end.
 
-        Raises `BlimpError` for a fault that a restart does not mend, `Hopeless` after too many.
+        Raises `BlimpError` for a fault that a restart does not mend, `UnrecoverableError` after too
+        many.
         """
         self._serve()
         if self._due_s is not None:
@@ -206,7 +207,7 @@ class Capture:
             return
         try:
             self._use(camera)
-        except Hopeless as error:
+        except UnrecoverableError as error:
             done.set_exception(error)
             raise
         except BlimpError as error:
@@ -270,7 +271,7 @@ class Capture:
             self._before += media.encoded
             self._bitrate_kbps = media.bitrate_kbps
         if not stopped:
-            raise Hopeless("the video pipeline hangs and cannot be stopped")
+            raise UnrecoverableError("the video pipeline hangs and cannot be stopped")
         if source is not None:
             source.close()
 
@@ -293,13 +294,15 @@ class Capture:
             self._fail(_CAMERA, StreamError(f"the camera gave no frame for {limit_s:g} s"))
 
     def _fail(self, what: str, error: BlimpError) -> None:
-        """Closes both; they are opened anew after a pause, or `Hopeless` is raised."""
+        """Closes both; they are opened anew after a pause, or `UnrecoverableError` is raised."""
         if not self.live or self._ending:
             raise error
         self._shut()
         limit = self._settings.supervision.restarts
         if self._in_a_row >= limit:
-            raise Hopeless(f"{error}; {limit} restarts of camera and encoder did not help")
+            raise UnrecoverableError(
+                f"{error}; {limit} restarts of camera and encoder did not help"
+            )
         self._in_a_row += 1
         setattr(self.restarts, what, getattr(self.restarts, what) + 1)
         pause_s = 0.0 if self._in_a_row == 1 else min(0.25 * 2**self._in_a_row, _LONGEST_PAUSE_S)

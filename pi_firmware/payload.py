@@ -12,7 +12,7 @@ from pi_firmware import encoder, link, orders
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.battery.gauges import Gauge
-from pi_firmware.capture import Capture, Hopeless
+from pi_firmware.capture import Capture, UnrecoverableError
 from pi_firmware.commands import Commands
 from pi_firmware.ground import Ground
 from pi_firmware.media import Counters, Unit
@@ -69,7 +69,7 @@ class Payload:
         if self._supervision.begin():
             announce(messages.EVENT_FAILED, "no frames from several processes: rebooting the board")
             _run_last(settings.supervision.reboot_command)
-            raise Hopeless("no frames from several processes in a row")
+            raise UnrecoverableError("no frames from several processes in a row")
         self._capture = Capture(settings, self._reporter.gate, self._leave, announce)
         self._reporter.counters = self._capture.counters
         self._ground = Ground(
@@ -115,7 +115,7 @@ class Payload:
             self._fly(stop)
         except BlimpError as error:
             announce(messages.EVENT_FAILED, str(error))
-            if isinstance(error, Hopeless) and self._supervision.give_up():
+            if isinstance(error, UnrecoverableError) and self._supervision.give_up():
                 self._afterwards = self.settings.supervision.reboot_command
             raise
         if self.cut_reason:
@@ -143,7 +143,7 @@ class Payload:
         """Stops everything and releases it; then runs what was asked for after the end."""
         self._supervision.stop()
         self._recorder.close()  # before all that might hang: what is recorded is on the card
-        with contextlib.suppress(Hopeless):  # what hangs ends with the process
+        with contextlib.suppress(UnrecoverableError):  # what hangs ends with the process
             self._capture.close()
         self._commands.close()
         self._autopilot.stop()
@@ -176,7 +176,7 @@ class Payload:
             return
         self._looks_s = now_s + _LOOK_S
         if self._telemetry.outdated and self._ground.seen is None:
-            raise Hopeless("telemetry.discover: the interface has another address by now")
+            raise UnrecoverableError("telemetry.discover: the interface has another address by now")
 
     def _leave(self, unit: Unit) -> bool:
         """On the encoder's thread: a finished frame's way out."""

@@ -17,10 +17,10 @@ from deploy.board import faults, journal, network, provision, status
 from deploy.board.card import Card, read_json
 from deploy.board.disk import Disk
 from deploy.board.faults import Fault
-from deploy.board.lamp import Lamp
 from deploy.board.network import Link
 from deploy.board.releases.service import UNIT, Seen, Service
 from deploy.board.status import Status
+from deploy.board.status_led import StatusLed
 from deploy.errors import DeployError
 
 LOOK_S, CALM_S = 5.0, 20.0
@@ -189,7 +189,7 @@ def main() -> int:
     """Runs until it is ended."""
     card, service = Card(), Service()
     now_s = time.monotonic()
-    lamp, judge, teller = Lamp(card.root), Judge(now_s), Teller(card, Disk(), now_s)
+    led, judge, teller = StatusLed(card.root), Judge(now_s), Teller(card, Disk(), now_s)
     while True:
         begun_s = time.monotonic()
         view = look(card, service)
@@ -197,10 +197,10 @@ def main() -> int:
         fault, streams = judge.fault(view, begun_s)
         teller.tell(fault, streams, partial(text_of, card, fault, view), begun_s)
         if fault is None:
-            (lamp.heartbeat if streams else lamp.steady)()
+            (led.heartbeat if streams else led.steady)()
         until_s = begun_s + (CALM_S if teller.told else LOOK_S)
         while fault is not None and time.monotonic() < until_s:
-            lamp.blink(fault.blinks)
+            led.blink(fault.blinks)
         time.sleep(max(0.0, until_s - time.monotonic()))
 
 

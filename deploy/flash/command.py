@@ -16,7 +16,7 @@ from deploy.flash.customise import Content
 from deploy.flash.disks import Disk, Machine
 from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
-from deploy.flash.wishes import WifiWish
+from deploy.flash.wishes import WifiOptions
 from deploy.provisioning import Provisioning, Wifi
 
 _INTERRUPTED = 130  # as a shell says it: 128 and SIGINT's number
@@ -175,7 +175,7 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
 
 def _wifi(options: argparse.Namespace) -> Wifi | None:
     return wishes.read_wifi(
-        WifiWish(
+        WifiOptions(
             options.wifi_ssid, options.wifi, options.wifi_password_file, options.country,
             options.wifi_security, options.wifi_hidden, options.no_wifi,
         )

@@ -21,7 +21,7 @@ MAX_FILE_BYTES = 64 * 1024
 
 
 @dataclass(frozen=True)
-class WifiWish:
+class WifiOptions:
     """Wi-Fi as the options name it; None: not named, so it stays as it is."""
 
     ssid: str | None = None
@@ -33,36 +33,36 @@ class WifiWish:
     none: bool = False
 
 
-def read_wifi(wish: WifiWish, ask: Callable[[str], str] | None = None) -> Wifi | None:
+def read_wifi(options: WifiOptions, ask: Callable[[str], str] | None = None) -> Wifi | None:
     """The network asked for; None without one. Raises `DeployError` with one line.
 
     The password is asked for on the terminal where no file holds it: on a command line every user
     of the machine could read it.
     """
-    if [wish.ssid is not None, wish.file is not None, wish.none].count(True) > 1:
+    if [options.ssid is not None, options.file is not None, options.none].count(True) > 1:
         raise DeployError("expected one of --wifi-ssid, --wifi and --no-wifi")
-    if wish.ssid is None and (wish.security is not None or wish.hidden):
+    if options.ssid is None and (options.security is not None or options.hidden):
         raise DeployError("--wifi-security and --wifi-hidden go with --wifi-ssid")
-    if wish.file is not None:
-        named = parse_wifi(read_file(wish.file), wish.file.name, wish.country)
-        if wish.password_file is None:
+    if options.file is not None:
+        named = parse_wifi(read_file(options.file), options.file.name, options.country)
+        if options.password_file is None:
             return named
-        return dataclasses.replace(named, password=_password_in(wish.password_file))
-    if wish.ssid is None:
-        if wish.password_file is not None:
+        return dataclasses.replace(named, password=_password_in(options.password_file))
+    if options.ssid is None:
+        if options.password_file is not None:
             raise DeployError("--wifi-password-file is given without --wifi-ssid")
         return None
-    if wish.country is None:
+    if options.country is None:
         raise DeployError("--country is missing: two capital letters, as DE")
-    security = wish.security or WPA2
+    security = options.security or WPA2
     # Checked first without the password, so that nobody types it for nothing.
-    network = Wifi(os.fsencode(wish.ssid), wish.country, "", security, wish.hidden)
-    if wish.password_file is not None:
-        password = _password_in(wish.password_file)
+    network = Wifi(os.fsencode(options.ssid), options.country, "", security, options.hidden)
+    if options.password_file is not None:
+        password = _password_in(options.password_file)
     elif security == OPEN:
         password = ""
     else:
-        password = (ask or _ask)(wish.ssid)
+        password = (ask or _ask)(options.ssid)
     return dataclasses.replace(network, password=password)
 
 

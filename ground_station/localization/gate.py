@@ -34,14 +34,14 @@ def contrast(image: Image) -> float:
     return float(np.ptp(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
 
 
-def dull(entropy: float, settings: GateSettings) -> str:
+def low_entropy(entropy: float, settings: GateSettings) -> str:
     """Why a picture of that entropy, bits, is skipped; empty when it is not."""
     if entropy >= settings.min_entropy_bits:
         return ""
     return f"entropy {entropy:.2f} below {settings.min_entropy_bits:g} bits"
 
 
-def blind(image: Image, settings: GateSettings) -> str:
+def low_contrast(image: Image, settings: GateSettings) -> str:
     """Why nothing can be seen in a grey picture (H, W); empty when something can."""
     if settings.min_contrast <= 0 or (shown := contrast(image)) >= settings.min_contrast:
         return ""

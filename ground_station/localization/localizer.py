@@ -158,10 +158,10 @@ class Localizer:
         attempt.watch.lap("entropy")
         self._last_frame_ns = time_ns
         state, motion = self.settings.state, self.settings.motion
-        if reason := gate.dull(attempt.entropy, self.settings.gate):
+        if reason := gate.low_entropy(attempt.entropy, self.settings.gate):
             # Skipped is not failed: until the prediction is no more than a held pose.
             return self._gated(attempt, reason, max(state.lost_after_s, motion.coast_s))
-        if reason := gate.blind(image, self.settings.gate):
+        if reason := gate.low_contrast(image, self.settings.gate):
             return self._gated(attempt, reason, state.lost_after_s)
         attempt.watch.lap("gate")
         attempt.taken = self._conditions(image, exposure_s)

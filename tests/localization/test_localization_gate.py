@@ -44,7 +44,9 @@ def test_entropy_is_the_payloads_of_any_picture():
 
 @pytest.mark.parametrize("mean", [3.0, 40.0, 250.0])
 def test_a_sensors_noise_is_nothing_however_dark_or_bright(mean):
-    assert gate.blind(noise(mean, 3.0), GateSettings(min_contrast=LEAST)).startswith("contrast")
+    assert gate.low_contrast(noise(mean, 3.0), GateSettings(min_contrast=LEAST)).startswith(
+        "contrast"
+    )
 
 
 def test_one_small_thing_on_a_wall_is_something():
@@ -52,15 +54,21 @@ def test_one_small_thing_on_a_wall_is_something():
     assert gate.contrast(wall) == 0.0
     wall[101:115, 303:317] = 60  # of 14 px: a whole block lies in it wherever it is
     assert gate.contrast(wall) == 180.0
-    assert gate.blind(wall, GateSettings(min_contrast=LEAST)) == ""
+    assert gate.low_contrast(wall, GateSettings(min_contrast=LEAST)) == ""
     slope = np.tile(np.linspace(100, 100 + 3 * LEAST, SIZE[1]), (SIZE[0], 1)).astype(np.uint8)
-    assert gate.blind(slope, GateSettings(min_contrast=LEAST)) == "", "a soft picture is one, too"
+    assert gate.low_contrast(slope, GateSettings(min_contrast=LEAST)) == "", (
+        "a soft picture is one, too"
+    )
 
 
-def test_without_a_limit_nothing_is_blind_and_nothing_is_dull():
-    assert gate.blind(noise(3.0, 0.0), GateSettings()) == "" == gate.dull(0.0, GateSettings())
-    dull = gate.dull(6.994, GateSettings(min_entropy_bits=7.0))
-    assert dull == "entropy 6.99 below 7 bits"
+def test_without_a_limit_nothing_is_gated():
+    assert (
+        gate.low_contrast(noise(3.0, 0.0), GateSettings())
+        == ""
+        == gate.low_entropy(0.0, GateSettings())
+    )
+    reason = gate.low_entropy(6.994, GateSettings(min_entropy_bits=7.0))
+    assert reason == "entropy 6.99 below 7 bits"
 
 
 @pytest.mark.parametrize("shape", [(480, 640), (5, 7), (1, 1)])

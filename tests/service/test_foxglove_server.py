@@ -26,9 +26,9 @@ from ground_station.geometry.camera import Camera
 from ground_station.map import store
 from ground_station.service import notes
 from ground_station.service.foxglove.inbox import Inbox
-from ground_station.service.foxglove.log import SeldomHandler
+from ground_station.service.foxglove.log import RateLimitedHandler
 from ground_station.service.foxglove.topics import json_topic
-from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.notes import EventNote, FrameNote, PayloadNote, RecordingNote
 
 RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))
@@ -378,7 +378,9 @@ def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
 def test_what_clients_make_the_sdk_say_is_said_once_a_minute() -> None:
     said: list[str] = []
     times_s = iter([0.0, 1.0, 59.0, 61.0])
-    handler = SeldomHandler(Seldom(lambda _, text: said.append(text), lambda: next(times_s)))
+    handler = RateLimitedHandler(
+        RateLimitedLog(lambda _, text: said.append(text), lambda: next(times_s))
+    )
     for number in range(4):
         text = f"client {number}: {'x' * 10_000}"
         handler.handle(logging.LogRecord("sdk", logging.ERROR, "", 0, text, None, None))

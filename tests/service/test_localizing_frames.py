@@ -11,7 +11,7 @@ import pytest
 
 from ground_station.service import notes
 from ground_station.service.localizing.frames import GONE, Taken, fault_of, take
-from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.notes import FrameNote
 from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter
 
@@ -95,7 +95,7 @@ def test_an_exposure_that_cannot_be_is_not_known(
 def test_what_repeats_is_said_once_a_minute_with_its_count() -> None:
     said: list[tuple[str, str]] = []
     now_s = [100.0]
-    seldom = Seldom(lambda name, text: said.append((name, text)), clock=lambda: now_s[0])
+    seldom = RateLimitedLog(lambda name, text: said.append((name, text)), clock=lambda: now_s[0])
     assert seldom("a", "first") and not seldom("a", "second") and seldom("b", "other")
     now_s[0] += 59.0
     assert not seldom("a", "third")

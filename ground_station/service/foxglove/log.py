@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 
-from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 
 _LENGTH = 200
 
 
-class SeldomHandler(logging.Handler):
+class RateLimitedHandler(logging.Handler):
     """Passes on one record of each logger a minute, with how many there were; warnings and up."""
 
-    def __init__(self, say: Seldom) -> None:
+    def __init__(self, say: RateLimitedLog) -> None:
         super().__init__(logging.WARNING)
         self._say = say
 
@@ -24,8 +24,8 @@ class SeldomHandler(logging.Handler):
             self.handleError(record)
 
 
-def install(say: Seldom) -> None:
+def install(say: RateLimitedLog) -> None:
     """Puts it in place of what Python would print."""
     logger = logging.getLogger("foxglove")
-    logger.addHandler(SeldomHandler(say))
+    logger.addHandler(RateLimitedHandler(say))
     logger.propagate = False

@@ -26,7 +26,7 @@ from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.payload import Payload
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
 from ground_station.service.foxglove.world import World
-from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.notes import (
     EstimateNote,
     EventNote,
@@ -58,7 +58,7 @@ class Publishing:
     def __init__(self, bus: Bus, folder: Path, settings: StationSettings) -> None:
         self._bus, self._folder, self._settings = bus, folder, settings
         self._inbox = Inbox()
-        self._complain = Seldom(_print)
+        self._complain = RateLimitedLog(_print)
         self._context = Context()
         self._payloads: dict[str, Payload] = {}
         self._flown: dict[str, str] = {}  # the map that each payload flies in
@@ -79,7 +79,7 @@ class Publishing:
         self._topics = {topic.id: topic for topic in topics}
         self._of_map = (self._plan.id, self._landmarks.id)
 
-        log.install(Seldom(_print))
+        log.install(RateLimitedLog(_print))
         self.server = _listen(settings, context, self)
         bus.hear(notes.FRAME, FrameNote, self._hear_frame)
         bus.hear(notes.ESTIMATE, EstimateNote, self._later(self._take_estimate))

@@ -17,7 +17,7 @@ from ground_station.service.pictures import PictureWriter
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.feedback import StreamAccount
-from ground_station.stream.several import Stream
+from ground_station.stream.multi_stream import Stream
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import messages
 from pi_firmware.wire.clock_offset import Offset

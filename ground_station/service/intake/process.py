@@ -24,7 +24,7 @@ from ground_station.service.settings import StationSettings
 from ground_station.stream import commands
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.feedback import Feedback
-from ground_station.stream.several import SeveralReceiver
+from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import keys, messages
@@ -110,12 +110,12 @@ class Intake:
         self._subscriber = self._listener.session.zenoh.declare_subscriber(
             keys.every_payload("*"), self._heard
         )
-        self.video = SeveralReceiver(
+        self.video = MultiStreamReceiver(
             settings.video.port,
             settings.video.host,
             owner=self._roster.owner,
             on_frame=self._take,
-            most=settings.payloads.most,
+            max_streams=settings.payloads.most,
             srtp_keys=srtp_keys,
         )
         feedback = Feedback(self._listener, self.video.stream_of)

@@ -20,7 +20,7 @@ from ground_station.service.localizing import derive, frames
 from ground_station.service.localizing.derive import Accounts
 from ground_station.service.localizing.frames import Taken
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
-from ground_station.service.localizing.seldom import Seldom
+from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.notes import EventNote, FrameNote
 from ground_station.service.overload import Overload
 from ground_station.service.pictures import PictureReader
@@ -56,7 +56,7 @@ class Localizing:
         self._failed = 0
         self._own, self._overload = Accounts(), Overload()
         self._told_s = 0.0
-        self._complain = Seldom(lambda name, text: self._event(notes.WARNING, name, text))
+        self._complain = RateLimitedLog(lambda name, text: self._event(notes.WARNING, name, text))
         self._newest = bus.newest(notes.FRAME, FrameNote, payload_id)
         self._loader.begin(Path(settings.map.folder))
         bus.serve(bus.process, self._do)

@@ -11,10 +11,10 @@ from board_cards import FastDisk, Person
 
 from deploy.board import faults, light, network, provision, status
 from deploy.board.faults import Fault
-from deploy.board.lamp import Lamp
 from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Teller, View
 from deploy.board.network import Link
 from deploy.board.releases.service import Seen
+from deploy.board.status_led import StatusLed
 from deploy.errors import DeployError
 
 GOOD = {"state": provision.IN_FORCE, "payload_id": "blimp-1", "wifi": True}
@@ -41,7 +41,7 @@ class Led:
 def test_a_fault_is_so_many_short_blinks_and_a_pause(tmp_path: Path, name: str) -> None:
     led = Led(tmp_path, name)
     seen: list[tuple[str, float]] = []
-    lamp = Lamp(tmp_path, lambda s: seen.append((led.read()[1], s)))
+    lamp = StatusLed(tmp_path, lambda s: seen.append((led.read()[1], s)))
     lamp.blink(3)
     assert seen == [("255", 0.2), ("0", 0.3)] * 3 + [("0", 1.5)]
     assert led.read()[0] == "none"
@@ -49,7 +49,7 @@ def test_a_fault_is_so_many_short_blinks_and_a_pause(tmp_path: Path, name: str) 
 
 def test_streaming_is_the_kernels_heartbeat_and_is_set_once(tmp_path: Path) -> None:
     led = Led(tmp_path)
-    lamp = Lamp(tmp_path, lambda s: None)
+    lamp = StatusLed(tmp_path, lambda s: None)
     lamp.steady()
     assert led.read() == ("none", "255")
     lamp.heartbeat()
@@ -71,9 +71,9 @@ def test_a_kernel_without_the_heartbeat_and_a_board_without_a_light(
         return write(path, text, *rest)
 
     monkeypatch.setattr(Path, "write_text", refusing)
-    Lamp(tmp_path, lambda s: None).heartbeat()
+    StatusLed(tmp_path, lambda s: None).heartbeat()
     assert led.read() == ("none", "255")
-    dark = Lamp(tmp_path / "none", lambda s: None)
+    dark = StatusLed(tmp_path / "none", lambda s: None)
     dark.blink(2)
     dark.heartbeat()
 

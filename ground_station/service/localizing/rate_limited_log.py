@@ -8,7 +8,7 @@ from collections.abc import Callable
 _PERIOD_S = 60.0
 
 
-class Seldom:
+class RateLimitedLog:
     """Says a text of each name at most once a minute, through `say(name, text)`."""
 
     def __init__(

@@ -147,8 +147,8 @@ class _Candidate:
         return any((a + 1) & 0xFFFF == b for a, b in itertools.pairwise(numbers))
 
 
-class SeveralReceiver:
-    """Receives the video of up to `most` payloads at a port; a context manager.
+class MultiStreamReceiver:
+    """Receives the video of up to `max_streams` payloads at a port; a context manager.
 
     `owner` says whose a stream is; `on_frame` gets each frame with its payload's id, on that
     stream's own thread, and must not wait. A payload has one stream at a time: another that is its
@@ -165,10 +165,10 @@ class SeveralReceiver:
         *,
         owner: Owner,
         on_frame: OnFrame,
-        most: int = 16,
+        max_streams: int = 16,
         srtp_keys: Mapping[str, bytes] | None = None,
     ) -> None:
-        self._owner, self._on_frame, self._most = owner, on_frame, most
+        self._owner, self._on_frame, self._max_streams = owner, on_frame, max_streams
         self._counters = Counters()
         self._unprotector = None if srtp_keys is None else Unprotector(srtp_keys, self._counters)
         self._streams: dict[int, Stream] = {}
@@ -182,7 +182,7 @@ class SeveralReceiver:
         self._thread = threading.Thread(target=self._run, name="video-receiver", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> SeveralReceiver:
+    def __enter__(self) -> MultiStreamReceiver:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -311,7 +311,7 @@ class SeveralReceiver:
                 if now_ns - stream.last_ns < _GIVE_WAY_NS:
                     return False
                 self._drop(stream)
-        if len(self._streams) < self._most:
+        if len(self._streams) < self._max_streams:
             return True
         silent = min(self.streams(), key=lambda stream: stream.last_ns)
         if now_ns - silent.last_ns < _GIVE_WAY_NS:

@@ -10,7 +10,7 @@ _NAMES = ("ACT", "led0")  # of today's kernels and of older ones
 _ON_S, _OFF_S, _PAUSE_S = 0.2, 0.3, 1.5
 
 
-class Lamp:
+class StatusLed:
     """The light below `root`/sys; a board without one is dark and nothing fails."""
 
     def __init__(self, root: Path, sleep: Callable[[float], object] = time.sleep) -> None:

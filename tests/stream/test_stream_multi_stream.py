@@ -12,9 +12,9 @@ import pytest
 from numbered_flight import encoded, number_in, packets, stamped
 from srtp_sender import SrtpSender
 
-from ground_station.stream import several
+from ground_station.stream import multi_stream
 from ground_station.stream.assembly import ReceivedFrame
-from ground_station.stream.several import SeveralReceiver
+from ground_station.stream.multi_stream import MultiStreamReceiver
 from pi_firmware.wire.errors import StreamError
 
 FRAMES = 45
@@ -40,7 +40,7 @@ class Port:
         self.frames: dict[str, list[ReceivedFrame]] = {}
         self.held = threading.Event()
         self.held.set()
-        self.receiver = SeveralReceiver(
+        self.receiver = MultiStreamReceiver(
             0,
             owner=self._owner,
             on_frame=self._take,
@@ -105,7 +105,7 @@ def test_two_streams_are_told_apart_and_each_counts_its_own(one_and_two: Port) -
 def test_one_that_is_not_taken_does_not_hold_up_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(several, "_QUEUE_PACKETS", 50)
+    monkeypatch.setattr(multi_stream, "_QUEUE_PACKETS", 50)
     with Port({1: "slow", 2: "two"}) as port:
         port.held.clear()
         slow, two = packets(units(), ssrc=1), packets(units(), ssrc=2)
@@ -211,7 +211,7 @@ def test_with_keys_each_payload_is_its_own_and_nobody_elses() -> None:
 
 
 def test_there_are_only_so_many_streams_and_a_silent_one_gives_way() -> None:
-    with Port({1: "one", 2: "two"}, most=1) as port:
+    with Port({1: "one", 2: "two"}, max_streams=1) as port:
         port.send(packets(units(), ssrc=1))
         port.send(packets(units()[:2], ssrc=2))
         assert until(lambda: port.shown("one") == [*range(FRAMES)])
@@ -226,7 +226,7 @@ def test_what_fails_with_a_frame_ends_neither_stream() -> None:
         seen.append(frame.sequence)
 
     seen: list[int] = []
-    with SeveralReceiver(0, owner=lambda *_: "one", on_frame=fails) as receiver:
+    with MultiStreamReceiver(0, owner=lambda *_: "one", on_frame=fails) as receiver:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for number, datagram in enumerate(packets(units(), ssrc=1)):
                 sender.sendto(datagram, ("127.0.0.1", receiver.port))
@@ -238,4 +238,6 @@ def test_what_fails_with_a_frame_ends_neither_stream() -> None:
 
 def test_a_port_in_use_is_one_line(one_and_two: Port) -> None:
     with pytest.raises(StreamError, match="in use"):
-        SeveralReceiver(one_and_two.receiver.port, owner=lambda *_: None, on_frame=lambda *_: None)
+        MultiStreamReceiver(
+            one_and_two.receiver.port, owner=lambda *_: None, on_frame=lambda *_: None
+        )
