@@ -59,17 +59,17 @@ def write_report(
             shown(
                 "Where corners were seen",
                 "The corners of the board in the picture; the four corners of the picture framed",
-                lambda dress: pictures.coverage(result, dress),
+                lambda theme: pictures.coverage(result, theme),
             ),
             shown(
                 f"Residuals, {times:g} times as long",
                 "Arrows from where the lens puts each corner to where it was seen",
-                lambda dress: pictures.residuals(result, dress),
+                lambda theme: pictures.residuals(result, theme),
             ),
             shown(
                 "Each view",
                 "The RMS of each view's residuals, and the median",
-                lambda dress: pictures.per_view(result, dress),
+                lambda theme: pictures.per_view(result, theme),
             ),
         ],
         views=views,

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
-from ground_station.presentation.dress import Dress, dressed
+from ground_station.presentation.theme import Theme, themed
 
 WIDTH_IN = 6.6
 _SMALL = 8.5
@@ -19,18 +19,18 @@ _ARROW_SHARE = 0.02
 """Of the width: how long a residual of usual size is drawn."""
 
 
-def coverage(result: Result, dress: Dress) -> Figure:
+def coverage(result: Result, theme: Theme) -> Figure:
     """All corners that count, in the picture; its four corners are framed."""
-    figure, axes = _picture(result, dress)
+    figure, axes = _picture(result, theme)
     for k, (view, kept) in enumerate(zip(result.views, result.fit.used, strict=True)):
         px = view.seen.px
         label = "corner of the board" if k == 0 else None
-        axes.plot(*px[kept].T, ".", color=dress.estimate, ms=2.5, label=label)
+        axes.plot(*px[kept].T, ".", color=theme.estimate, ms=2.5, label=label)
         if not kept.all():
-            axes.plot(*px[~kept].T, "x", color=dress.second, ms=5, mew=1.2)
+            axes.plot(*px[~kept].T, "x", color=theme.second, ms=5, mew=1.2)
     if result.corners[1]:
-        axes.plot([], [], "x", color=dress.second, ms=5, mew=1.2, label="left out as wrong")
-    _legend(axes, dress)
+        axes.plot([], [], "x", color=theme.second, ms=5, mew=1.2, label="left out as wrong")
+    _legend(axes, theme)
     return figure
 
 
@@ -42,63 +42,63 @@ def magnification(result: Result) -> float:
     return float(power * (5 if times >= 5 else 2 if times >= 2 else 1))
 
 
-def residuals(result: Result, dress: Dress) -> Figure:
+def residuals(result: Result, theme: Theme) -> Figure:
     """From where the lens puts each corner to where it was seen, magnified."""
-    figure, axes = _picture(result, dress)
+    figure, axes = _picture(result, theme)
     px = np.concatenate([v.seen.px[k] for v, k in zip(result.views, result.fit.used, strict=True)])
     off = np.concatenate([r[k] for r, k in zip(result.fit.residuals, result.fit.used, strict=True)])
     axes.quiver(
         *px.T, *(off * magnification(result)).T, angles="xy", scale_units="xy", scale=1,
-        width=0.0014, headwidth=4, color=dress.estimate,
+        width=0.0014, headwidth=4, color=theme.estimate,
     )  # fmt: skip
     return figure
 
 
-def per_view(result: Result, dress: Dress) -> Figure:
+def per_view(result: Result, theme: Theme) -> Figure:
     """The RMS of each view, in order of the inputs, and the median."""
-    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained", facecolor=dress.paper)
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained", facecolor=theme.paper)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    dressed(axes, dress, _SMALL)
+    themed(axes, theme, _SMALL)
     order = np.lexsort(
         ([v.seen.index for v in result.views], [v.seen.source for v in result.views])
     )
     values = np.array(result.fit.view_rms_px())[order]
-    axes.bar(np.arange(1, len(values) + 1), values, color=dress.estimate, width=0.75)
-    axes.axhline(float(np.median(values)), color=dress.limit, ls="--", lw=1.2, label="median")
+    axes.bar(np.arange(1, len(values) + 1), values, color=theme.estimate, width=0.75)
+    axes.axhline(float(np.median(values)), color=theme.limit, ls="--", lw=1.2, label="median")
     axes.set_xlabel("view", fontsize=_SMALL)
     axes.set_ylabel("RMS, px", fontsize=_SMALL)
     axes.set_xlim(0.4, len(values) + 0.6)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(False, axis="x")
-    _legend(axes, dress)
+    _legend(axes, theme)
     return figure
 
 
-def _picture(result: Result, dress: Dress) -> tuple[Figure, Axes]:
+def _picture(result: Result, theme: Theme) -> tuple[Figure, Axes]:
     w, h = result.size_px
     figure = Figure(figsize=(WIDTH_IN, 0.5 + 6.0 * h / w), layout="constrained")
-    figure.set_facecolor(dress.paper)
+    figure.set_facecolor(theme.paper)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    dressed(axes, dress, _SMALL)
+    themed(axes, theme, _SMALL)
     axes.set_aspect("equal")
     axes.set_xlim(-0.01 * w, 1.01 * w)
     axes.set_ylim(1.01 * h, -0.01 * h)
-    axes.add_patch(Rectangle((0, 0), w - 1, h - 1, fill=False, edgecolor=dress.ink, lw=0.8))
+    axes.add_patch(Rectangle((0, 0), w - 1, h - 1, fill=False, edgecolor=theme.ink, lw=0.8))
     wide, high = CORNER_SHARE * w, CORNER_SHARE * h
     for x in (0, w - wide):
         for y in (0, h - high):
             axes.add_patch(
-                Rectangle((x, y), wide, high, fill=False, edgecolor=dress.limit, lw=0.8, ls=":")
+                Rectangle((x, y), wide, high, fill=False, edgecolor=theme.limit, lw=0.8, ls=":")
             )
     axes.set_xlabel("u, px", fontsize=_SMALL)
     axes.set_ylabel("v, px", fontsize=_SMALL)
     return figure, axes
 
 
-def _legend(axes: Axes, dress: Dress) -> None:
+def _legend(axes: Axes, theme: Theme) -> None:
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
-        labelcolor=dress.ink, fontsize=_SMALL, borderaxespad=0.2,
+        labelcolor=theme.ink, fontsize=_SMALL, borderaxespad=0.2,
     )  # fmt: skip

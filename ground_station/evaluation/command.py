@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         write_json(args.json, _document(result, estimate, truth, args))
     if args.plot:
         from ground_station.evaluation import plots
-        from ground_station.presentation.dress import write_png
+        from ground_station.presentation.theme import write_png
 
         write_png(plots.evaluation(result, args.align or "none"), args.plot)
     return 0

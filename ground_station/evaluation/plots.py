@@ -1,6 +1,6 @@
 """Pictures of an evaluation: the path over the floor plan, errors and latency over time.
 
-In a light and a dark dress; lines differ in style as well as in colour.
+In a light and a dark theme; lines differ in style as well as in colour.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.dress import LIGHT, Dress, dressed, figure_of, legend
+from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend, themed
 
 Array = npt.NDArray[np.float64]
 
@@ -30,20 +30,20 @@ def trajectory_plot(
     truth: Trajectory | None,
     estimate: Trajectory | None,
     floorplan: FloorPlan | None = None,
-    dress: Dress = LIGHT,
+    theme: Theme = LIGHT,
 ) -> Figure:
     """The path seen from above, x to the right and y up, metres."""
-    figure, (axes,) = figure_of(1, (8.0, 5.6), dress)
+    figure, (axes,) = figure_of(1, (8.0, 5.6), theme)
     if floorplan is not None:
-        show_floorplan(axes, floorplan, dress)
+        show_floorplan(axes, floorplan, theme)
     if truth is not None and len(truth):
         x, y = _broken(truth)
-        axes.plot(x, y, color=dress.truth, linewidth=2.6, alpha=0.55, label="true path")
+        axes.plot(x, y, color=theme.truth, linewidth=2.6, alpha=0.55, label="true path")
     if estimate is not None and len(estimate):
         x, y = _broken(estimate)
-        axes.plot(x, y, color=dress.estimate, linewidth=1.1, label="estimated path")
+        axes.plot(x, y, color=theme.estimate, linewidth=1.1, label="estimated path")
         axes.plot(
-            *estimate.position_m[0, :2], "o", color=dress.estimate, markersize=6, label="first pose"
+            *estimate.position_m[0, :2], "o", color=theme.estimate, markersize=6, label="first pose"
         )
     axes.set_aspect("equal")
     axes.set_xlabel("x, m")
@@ -54,7 +54,7 @@ def trajectory_plot(
             bbox_to_anchor=(1.0, 1.0),
             ncols=3,
             frameon=False,
-            labelcolor=dress.ink,
+            labelcolor=theme.ink,
             fontsize=9,
         )
     return figure
@@ -67,23 +67,23 @@ def error_plot(
     *,
     position_limit_m: float | None = None,
     rotation_limit_deg: float | None = None,
-    dress: Dress = LIGHT,
+    theme: Theme = LIGHT,
 ) -> Figure:
     """Position error (cm) over rotation error (°), both over time (s); limits are RMSE bounds."""
-    figure, (upper, lower) = figure_of(2, (8.0, 4.4), dress)
+    figure, (upper, lower) = figure_of(2, (8.0, 4.4), theme)
     limit_cm = None if position_limit_m is None else position_limit_m * 100
     rows = (
-        (upper, np.asarray(position_m) * 100, limit_cm, "position error, cm", dress.estimate),
-        (lower, np.asarray(rotation_deg), rotation_limit_deg, "rotation error, °", dress.second),
+        (upper, np.asarray(position_m) * 100, limit_cm, "position error, cm", theme.estimate),
+        (lower, np.asarray(rotation_deg), rotation_limit_deg, "rotation error, °", theme.second),
     )
     for axes, values, limit, label, colour in rows:
         axes.plot(*_broken_series(time_s, values), color=colour, linewidth=1.1)
         axes.set_ylabel(label)
         if limit is not None:
             axes.axhline(
-                limit, color=dress.limit, linestyle="--", lw=1.2, label="bound of the RMSE"
+                limit, color=theme.limit, linestyle="--", lw=1.2, label="bound of the RMSE"
             )
-            legend(axes, dress)
+            legend(axes, theme)
         axes.set_ylim(0, 1.3 * max(float(np.nanmax(values, initial=0.0)), limit or 0.0, 1e-3))
     lower.set_xlabel("time, s")
     return figure
@@ -95,19 +95,19 @@ def latency_plot(
     *,
     median_ms: float | None = None,
     p99_ms: float | None = None,
-    dress: Dress = LIGHT,
+    theme: Theme = LIGHT,
 ) -> Figure:
     """Capture-to-pose latency of each frame (ms) over time (s)."""
-    figure, (axes,) = figure_of(1, (8.0, 3.0), dress)
-    axes.plot(time_s, latency_ms, ".", color=dress.estimate, markersize=4)
+    figure, (axes,) = figure_of(1, (8.0, 3.0), theme)
+    axes.plot(time_s, latency_ms, ".", color=theme.estimate, markersize=4)
     axes.set_xlabel("time, s")
     axes.set_ylabel("latency, ms")
     for value, name, style in ((median_ms, "median", "-"), (p99_ms, "99th percentile", "--")):
         if value is not None:
             label = f"{name}, {value:.0f} ms"
-            axes.axhline(value, color=dress.limit, linestyle=style, linewidth=1.2, label=label)
+            axes.axhline(value, color=theme.limit, linestyle=style, linewidth=1.2, label=label)
     axes.set_ylim(0, 1.5 * max(float(np.nanmax(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
-    legend(axes, dress)
+    legend(axes, theme)
     return figure
 
 
@@ -132,19 +132,19 @@ def evaluation(result: Evaluation, align: str = "none") -> Figure:
     lower.set_ylabel("rotation, °")
     lower.set_xlabel("time, s")
     for axes in (path, upper, lower):
-        dressed(axes, LIGHT)
+        themed(axes, LIGHT)
     upper.set_ylim(bottom=0)
     lower.set_ylim(bottom=0)
     legend(path, LIGHT)
     return figure
 
 
-def show_floorplan(axes: Axes, plan: FloorPlan, dress: Dress) -> None:
+def show_floorplan(axes: Axes, plan: FloorPlan, theme: Theme) -> None:
     width_m, height_m = plan.size_m
     x, y, yaw = plan.origin
     to_world = Affine2D().rotate(yaw).translate(x, y)
     # Walls in a soft tone of the ink, free space in the paper's colour: the path stays in front.
-    ink = np.array([int(dress.ink[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.uint8)
+    ink = np.array([int(theme.ink[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.uint8)
     rgba: Any = np.empty((*plan.image.shape, 4), dtype=np.uint8)
     rgba[..., :3] = ink
     rgba[..., 3] = (255 - plan.image) // 2

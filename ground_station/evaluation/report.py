@@ -267,19 +267,19 @@ def _figures(data: ReportData) -> list[Shown]:
         add(
             "Path over the floor plan" if plan else "Path from above",
             "The true and the estimated path, seen from above",
-            lambda dress: plots.trajectory_plot(data.truth, data.estimate, plan, dress),
+            lambda theme: plots.trajectory_plot(data.truth, data.estimate, plan, theme),
         )
     if np.size(data.error_time_s):
         add(
             "Error over time, unaligned",
             "Position and rotation error of each localized frame over time",
-            lambda dress: plots.error_plot(
+            lambda theme: plots.error_plot(
                 data.error_time_s,
                 data.error_position_m,
                 data.error_rotation_deg,
                 position_limit_m=data.position_limit_m,
                 rotation_limit_deg=data.rotation_limit_deg,
-                dress=dress,
+                theme=theme,
             ),
         )
     if np.size(data.latency_time_s):
@@ -287,12 +287,12 @@ def _figures(data: ReportData) -> list[Shown]:
         add(
             "Latency over time, capture to pose",
             "The time from capture to pose of each localized frame",
-            lambda dress: plots.latency_plot(
+            lambda theme: plots.latency_plot(
                 data.latency_time_s,
                 data.latency_each_ms,
                 median_ms=latency.get("p50"),
                 p99_ms=latency.get("p99"),
-                dress=dress,
+                theme=theme,
             ),
         )
     return figures

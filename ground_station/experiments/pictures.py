@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ground_station.evaluation.plots import show_floorplan
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.dress import Dress, dressed
+from ground_station.presentation.theme import Theme, themed
 
 _MOST_PATHS = 4
 _LEAST_M, _MOST_M = 0.002, 0.5
@@ -31,7 +31,7 @@ _HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7
 """Okabe and Ito's, readable on both papers."""
 
 
-def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress) -> Figure:
+def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, theme: Theme) -> Figure:
     """The default's path of each case's first seed from above, its colour the position error."""
     shown = [(c["title"], s) for c in cases if (s := first_series(c, "default"))][:_MOST_PATHS]
     count = max(1, len(shown))
@@ -40,18 +40,18 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress)
     panel_m = plan.size_m if plan is not None else _extent([series for _, series in shown])
     wide = _WIDTH_IN / columns - _LABELS_IN
     tall = min(wide * panel_m[1] / panel_m[0], _HIGHEST_IN) + _LABELS_IN
-    figure, axes = _figure(rows, columns, (_WIDTH_IN, tall * rows + _BAR_IN), dress)
+    figure, axes = _figure(rows, columns, (_WIDTH_IN, tall * rows + _BAR_IN), theme)
     points = None
     for one, (title, series) in zip(axes, shown, strict=False):
         if plan is not None:
-            show_floorplan(one, plan, dress)
+            show_floorplan(one, plan, theme)
         error = np.clip(series["position_m"], _LEAST_M, _MOST_M)
         points = one.scatter(
             series["x_m"], series["y_m"], c=error, s=5, cmap=_COLOURS,
             norm=LogNorm(_LEAST_M, _MOST_M),
         )  # fmt: skip
         one.set_aspect("equal")
-        one.set_title(title, color=dress.ink, fontsize=9)
+        one.set_title(title, color=theme.ink, fontsize=9)
         one.set_xlabel("x, m")
         one.set_ylabel("y, m")
     for one in axes[len(shown) :]:
@@ -62,14 +62,14 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, dress: Dress)
             label="position error, m", ticks=_MARKS_M, format="%g",
         )  # fmt: skip
         bar.ax.minorticks_off()
-        bar.ax.tick_params(colors=dress.ink, labelsize=8)
-        bar.ax.xaxis.label.set_color(dress.ink)
+        bar.ax.tick_params(colors=theme.ink, labelsize=8)
+        bar.ax.xaxis.label.set_color(theme.ink)
     return figure
 
 
-def over_time(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
+def over_time(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     """Position error of each case's first seed over time, the preset thesis dashed."""
-    figure, (axes,) = _figure(1, 1, (8.0, 3.2), dress)
+    figure, (axes,) = _figure(1, 1, (8.0, 3.2), theme)
     for hue, case in zip(_hues(len(cases)), cases, strict=True):
         for preset, style in _STYLES.items():
             series = first_series(case, preset)
@@ -81,16 +81,16 @@ def over_time(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
     _logarithmic(axes, y=True)
     axes.set_xlabel("time, s")
     axes.set_ylabel("position error, cm")
-    _legend(axes, dress)
+    _legend(axes, theme)
     return figure
 
 
-def distribution(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
+def distribution(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     """The share of a flight's frames within an error, over all seeds; the thesis's way dashed.
 
     Frames that were not localized count: a line that ends below 1 has lost the rest.
     """
-    figure, (axes,) = _figure(1, 1, (8.0, 3.4), dress)
+    figure, (axes,) = _figure(1, 1, (8.0, 3.4), theme)
     for hue, case in zip(_hues(len(cases)), cases, strict=True):
         for preset, style in _STYLES.items():
             runs = [r for r in case["presets"].get(preset, {}).get("runs", []) if "failed" not in r]
@@ -107,15 +107,15 @@ def distribution(cases: Sequence[dict[str, Any]], dress: Dress) -> Figure:
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("position error, cm")
     axes.set_ylabel("share of frames")
-    _legend(axes, dress)
+    _legend(axes, theme)
     return figure
 
 
-def sweep(cases: Sequence[dict[str, Any]], level: str, dress: Dress) -> Figure:
+def sweep(cases: Sequence[dict[str, Any]], level: str, theme: Theme) -> Figure:
     """Position error and share localized over what the cases vary, mean and spread."""
-    figure, (upper, lower) = _figure(2, 1, (8.0, 4.6), dress)
+    figure, (upper, lower) = _figure(2, 1, (8.0, 4.6), theme)
     places = np.arange(len(cases))
-    for (preset, style), hue in zip(_STYLES.items(), (dress.second, dress.estimate), strict=True):
+    for (preset, style), hue in zip(_STYLES.items(), (theme.second, theme.estimate), strict=True):
         found = [case["presets"].get(preset, {}) for case in cases]
         mean = [_value(row.get("position_m"), "mean") for row in found]
         std = [_value(row.get("position_m"), "std") for row in found]
@@ -132,7 +132,7 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, dress: Dress) -> Figure:
     lower.set_ylim(0, 104)
     lower.set_xticks(places, [str(case["title"]) for case in cases])
     lower.set_xlabel(level)
-    _legend(upper, dress)
+    _legend(upper, theme)
     return figure
 
 
@@ -185,20 +185,20 @@ def _broken(
 
 
 def _figure(
-    rows: int, columns: int, size_inches: tuple[float, float], dress: Dress
+    rows: int, columns: int, size_inches: tuple[float, float], theme: Theme
 ) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=theme.paper)
     FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, squeeze=False, sharex="col" if columns == 1 else False)
     axes = list(grid.ravel())
     for one in axes:
-        dressed(one, dress, 8)
+        themed(one, theme, 8)
     return figure, axes
 
 
-def _legend(axes: Axes, dress: Dress) -> None:
+def _legend(axes: Axes, theme: Theme) -> None:
     if axes.get_legend_handles_labels()[1]:
         axes.legend(
-            loc="best", fontsize=8, facecolor=dress.paper, edgecolor=dress.grid,
-            labelcolor=dress.ink, framealpha=0.85,
+            loc="best", fontsize=8, facecolor=theme.paper, edgecolor=theme.grid,
+            labelcolor=theme.ink, framealpha=0.85,
         )  # fmt: skip

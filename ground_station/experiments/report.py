@@ -97,23 +97,23 @@ def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Show
         level = experiment["level"]
         found.append(
             shown(f"Error over {level}", f"{name}: position error and share localized over {level}",
-                  lambda dress: pictures.sweep(experiment["cases"], level, dress))
+                  lambda theme: pictures.sweep(experiment["cases"], level, theme))
         )  # fmt: skip
     indoors = {case["flight"]["scene"] for case in cases if not case["flight"]["folder"]}
     plan = atrium if indoors == {"atrium"} else None
     if any(pictures.first_series(case, "default") for case in cases):
         found.append(
             shown("Paths, coloured by their error", f"{name}: paths from above, by error",
-                  lambda dress: pictures.paths(cases, plan, dress))
+                  lambda theme: pictures.paths(cases, plan, theme))
         )  # fmt: skip
     found.append(
         shown("Error over time, the preset thesis dashed", f"{name}: position error over time",
-              lambda dress: pictures.over_time(cases, dress))
+              lambda theme: pictures.over_time(cases, theme))
     )  # fmt: skip
     found.append(
         shown("Share of frames within an error, the preset thesis dashed",
               f"{name}: distribution of the position error",
-              lambda dress: pictures.distribution(cases, dress))
+              lambda theme: pictures.distribution(cases, theme))
     )  # fmt: skip
     return found
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ground_station.map.levelling import levelled
 from ground_station.map.store import Map
-from ground_station.presentation.dress import Dress, dressed
+from ground_station.presentation.theme import Theme, themed
 
 F64 = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _VIEW = 0.03
 """Of the picture's longer side: the line by which a camera shows where it looks."""
 
 
-def from_above(map_: Map, missing: Collection[str], title: str, dress: Dress) -> Figure:
+def from_above(map_: Map, missing: Collection[str], title: str, theme: Theme) -> Figure:
     """Landmarks, and cameras in the order of their names, joined where no image is `missing`.
 
     `missing` are names of images without a place. Where such are between two cameras, these are
@@ -39,29 +39,29 @@ def from_above(map_: Map, missing: Collection[str], title: str, dress: Dress) ->
     width, height = (max(float(side), _LEAST_IN) for side in sides)
     figure = Figure(
         figsize=(width + _LABELS_IN, height + _LABELS_IN), layout="constrained",
-        facecolor=dress.paper,
+        facecolor=theme.paper,
     )  # fmt: skip
     FigureCanvasAgg(figure)
     axes: Axes = figure.subplots()
-    dressed(axes, dress, 8)
+    themed(axes, theme, 8)
     some = slice(None, None, max(1, -(-len(position) // _MOST_POINTS)))
     axes.plot(
-        *position[some, :2].T, ".", color=dress.truth, alpha=0.5, ms=3.0, mew=0,
+        *position[some, :2].T, ".", color=theme.truth, alpha=0.5, ms=3.0, mew=0,
         label=f"{len(position)} landmarks", zorder=1,
     )  # fmt: skip
-    _draw_way(axes, upright, missing, dress)
+    _draw_way(axes, upright, missing, theme)
     looks = upright.keyframes.wTc[:, :2, 2] * _VIEW * float((high - low).max())
     lines = np.stack([place[:, :2], place[:, :2] + looks], axis=1)
-    axes.add_collection(LineCollection(list(lines), colors=dress.estimate, linewidths=0.8))
+    axes.add_collection(LineCollection(list(lines), colors=theme.estimate, linewidths=0.8))
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
     unit = "m" if map_.info.units == "m" else "the map's own lengths"
     axes.set_xlabel(f"from above, {unit}", fontsize=8)
-    axes.set_title(title, color=dress.ink, fontsize=9, loc="left", wrap=True)
+    axes.set_title(title, color=theme.ink, fontsize=9, loc="left", wrap=True)
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False,
-        labelcolor=dress.ink, fontsize=8, markerscale=2.0,
+        labelcolor=theme.ink, fontsize=8, markerscale=2.0,
     )  # fmt: skip
     return figure
 
@@ -76,7 +76,7 @@ def _bounds(position: F64, place: F64) -> tuple[F64, F64]:
     return low - margin, high + margin
 
 
-def _draw_way(axes: Axes, map_: Map, missing: Collection[str], dress: Dress) -> None:
+def _draw_way(axes: Axes, map_: Map, missing: Collection[str], theme: Theme) -> None:
     """The cameras in the order of their names, and the gaps between them."""
     names = map_.keyframes.names
     order = sorted(range(len(names)), key=names.__getitem__)
@@ -86,16 +86,16 @@ def _draw_way(axes: Axes, map_: Map, missing: Collection[str], dress: Dress) -> 
     ranks = np.array([rank[names[k]] for k in order])
     gaps = np.diff(ranks) - 1
     steps = np.stack([place[:-1], place[1:]], axis=1)
-    axes.plot(*place.T, "o", color=dress.estimate, ms=3.0, label=f"{len(names)} cameras", zorder=3)
-    whole = LineCollection(list(steps[gaps == 0]), colors=dress.estimate, linewidths=1.2)
+    axes.plot(*place.T, "o", color=theme.estimate, ms=3.0, label=f"{len(names)} cameras", zorder=3)
+    whole = LineCollection(list(steps[gaps == 0]), colors=theme.estimate, linewidths=1.2)
     axes.add_collection(whole)
     if missing:
         label = f"{len(missing)} images without a place"
-        axes.plot([], [], "--", color=dress.second, lw=1.6, label=label)
+        axes.plot([], [], "--", color=theme.second, lw=1.6, label=label)
     for (start, end), count in zip(steps[gaps > 0], gaps[gaps > 0], strict=True):
-        axes.plot(*np.stack([start, end]).T, "--", color=dress.second, lw=1.6, zorder=4)
+        axes.plot(*np.stack([start, end]).T, "--", color=theme.second, lw=1.6, zorder=4)
         axes.annotate(
-            str(count), tuple((start + end) / 2), color=dress.second, fontsize=9, zorder=5,
+            str(count), tuple((start + end) / 2), color=theme.second, fontsize=9, zorder=5,
             xytext=(3, 3), textcoords="offset points",
         )  # fmt: skip
     # What is missing at the ends has no line to be on.
@@ -103,6 +103,6 @@ def _draw_way(axes: Axes, map_: Map, missing: Collection[str], dress: Dress) -> 
     for text, k, count, where in ends:
         axes.annotate(
             f"{text} ({count} missing {where} it)" if count else text, tuple(place[k]),
-            color=dress.second if count else dress.ink, fontsize=8, zorder=5,
+            color=theme.second if count else theme.ink, fontsize=8, zorder=5,
             xytext=(4, -9), textcoords="offset points",
         )  # fmt: skip

@@ -1,1 +1,1 @@
-"""How the product shows itself: pages, pictures and tables in one dress."""
+"""How the product shows itself: pages, pictures and tables in one theme."""

@@ -15,7 +15,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from ground_station.files import write_text
-from ground_station.presentation.dress import DARK, LIGHT, Dress, png
+from ground_station.presentation.theme import DARK, LIGHT, Theme, png
 from pi_firmware.wire.text import printable
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -31,9 +31,9 @@ class Shown:
     words: str
 
 
-def shown(heading: str, words: str, draw: Callable[[Dress], Figure]) -> Shown:
-    """The picture that `draw` makes in each dress."""
-    light, dark = (data_uri("png", png(draw(dress))) for dress in (LIGHT, DARK))
+def shown(heading: str, words: str, draw: Callable[[Theme], Figure]) -> Shown:
+    """The picture that `draw` makes in each theme."""
+    light, dark = (data_uri("png", png(draw(theme))) for theme in (LIGHT, DARK))
     return Shown(heading, light, dark, words)
 
 

@@ -96,7 +96,7 @@ def _replay(args: argparse.Namespace) -> int:
     from ground_station.replay.cases.outcome import write_outcome
     from ground_station.replay.cases.taken import outcome_of
     from ground_station.replay.replay import replay, settings_for
-    from ground_station.replay.stand import LOOPBACK
+    from ground_station.replay.rig import LOOPBACK
     from pi_firmware.wire.recording import RecordingReader
 
     settings = settings_for(

@@ -24,7 +24,7 @@ from ground_station.map import store
 from ground_station.progress import Progress
 from ground_station.recording.flight import camera_of, trajectory_of
 from ground_station.replay import live
-from ground_station.replay.stand import LOOPBACK, Stand
+from ground_station.replay.rig import LOOPBACK, Rig
 from pi_firmware.wire import config
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
 
@@ -118,7 +118,7 @@ def replay(
     map_: store.Map,
     localizer_settings: LocalizerSettings,
     settings: ReplaySettings,
-    stand: Stand = LOOPBACK,
+    stand: Rig = LOOPBACK,
 ) -> ReplayResult:
     """Starts the firmware on the recording as its own process and localizes what it streams.
 

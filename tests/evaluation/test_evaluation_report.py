@@ -29,7 +29,7 @@ from ground_station.evaluation.report import (
 )
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import load_floorplan
-from ground_station.presentation.dress import write_png
+from ground_station.presentation.theme import write_png
 
 
 def circle(n: int = 100) -> Trajectory:

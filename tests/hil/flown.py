@@ -23,7 +23,7 @@ from ground_station.replay.cases.outcome import Outcome, write_outcome
 from ground_station.replay.cases.source import check_case
 from ground_station.replay.cases.taken import outcome_of
 from ground_station.replay.replay import replay, settings_for
-from ground_station.replay.stand import Running, Stand
+from ground_station.replay.rig import Rig, Running
 from pi_firmware.wire.errors import BlimpError
 
 AGAIN = "again"
@@ -44,7 +44,7 @@ class Payload(Protocol):
 
     def recording(self, path: Path) -> Path: ...
 
-    def stand(self, settings: tuple[str, ...], link: Any) -> Stand: ...
+    def stand(self, settings: tuple[str, ...], link: Any) -> Rig: ...
 
 
 Link = LoopbackLink | ProxyLink | NamespaceLink
@@ -128,7 +128,7 @@ def _link(case: Case, payload: Payload, stack: contextlib.ExitStack) -> Link:
     return ProxyLink(case.link, payload.link_host, payload.link_port)
 
 
-def _stand(payload: Payload, settings: tuple[str, ...], link: Link, folder: Path) -> Stand:
+def _stand(payload: Payload, settings: tuple[str, ...], link: Link, folder: Path) -> Rig:
     made = link.stand() if isinstance(link, NamespaceLink) else payload.stand(settings, link)
     flying = _logged(made.payload, folder / _LOG)
     return dataclasses.replace(made, payload=flying, start_timeout_s=_START_S)

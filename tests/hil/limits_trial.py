@@ -97,7 +97,7 @@ def fly(trial: Trial) -> Outcome:
     from ground_station.map import store
     from ground_station.replay.cases.resources import Watch
     from ground_station.replay.replay import replay, settings_for
-    from ground_station.replay.stand import LOOPBACK, Running, Stand
+    from ground_station.replay.rig import LOOPBACK, Rig, Running
     from ground_station.stream.receiver import Receiver
 
     receivers: list[Receiver] = []
@@ -139,7 +139,7 @@ def fly(trial: Trial) -> Outcome:
         payload=tuple(trial.payload),
         pictures=1,
     )
-    stand = Stand(
+    stand = Rig(
         receiver=receiver,
         telemetry=LOOPBACK.telemetry,
         link=lambda port: contextlib.nullcontext(trial.link_port or port),

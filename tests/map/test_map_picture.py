@@ -10,7 +10,7 @@ import pytest
 
 from ground_station.map.levelling import levelled
 from ground_station.map.picture import from_above
-from ground_station.presentation.dress import LIGHT, write_png
+from ground_station.presentation.theme import LIGHT, write_png
 
 
 def texts(figure):

@@ -18,7 +18,7 @@ from parsed_page import Page
 
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.dress import DARK, LIGHT
+from ground_station.presentation.theme import DARK, LIGHT
 from ground_station.replay.cases import judge, page, pictures
 from ground_station.replay.cases.compare import compare
 from ground_station.replay.cases.judge import Judged
@@ -159,12 +159,12 @@ def test_states_are_drawn_where_they_were_and_pauses_left_out() -> None:
 
 def test_pictures_of_nothing_are_drawn_all_the_same() -> None:
     none, empty = np.empty(0), Trajectory.from_poses([], [])
-    for dress in (LIGHT, DARK):
+    for theme in (LIGHT, DARK):
         for figure in (
-            pictures.path(np.empty((0, 3)), none, under=[("A", empty)], dress=dress),
+            pictures.path(np.empty((0, 3)), none, under=[("A", empty)], theme=theme),
             pictures.over_time([("error, cm", [pictures.Series("A", none, none)], None)],
-                               [pictures.Strip("A", none, [])], dress=dress),
-            pictures.distributions([("ms", [("A", none), ("B", np.array([np.nan]))])], dress),
+                               [pictures.Strip("A", none, [])], theme=theme),
+            pictures.distributions([("ms", [("A", none), ("B", np.array([np.nan]))])], theme),
         ):  # fmt: skip
             assert isinstance(figure.canvas, FigureCanvasAgg)
             figure.canvas.draw()

@@ -155,13 +155,13 @@ def test_any_datagrams_are_taken_or_refused(datagrams: list[bytes]) -> None:
 def test_header_extensions_sources_and_padding_are_passed_over() -> None:
     plain = packets([b"\x00\x00\x01\x65\x11\x22"])[0]
     header, payload = plain[:12], plain[12:]
-    dressed = (
+    themed = (
         bytes([0xB1]) + header[1:] + b"\x00" * 4 + b"\xbe\xde\x00\x01\x00\x00\x00\x00"
         + payload + b"\x00\x00\x03"
     )  # fmt: skip
-    packet = rtp.parse(dressed, 0)
+    packet = rtp.parse(themed, 0)
     assert packet is not None and packet.payload == payload
-    assert rtp.parse(dressed[:20], 0) is None
+    assert rtp.parse(themed[:20], 0) is None
     assert rtp.parse(bytes([0xA0]) + header[1:] + b"\x41\xff", 0) is None
 
 

@@ -67,7 +67,7 @@ def _campus(args: argparse.Namespace) -> int:
     print("\n".join(scale.table(rows)))
     if args.plot:
         from ground_station.bench.maps.plot import scaling_plot
-        from ground_station.presentation.dress import write_png
+        from ground_station.presentation.theme import write_png
 
         write_png(scaling_plot(rows, _ALLOWED_GB), args.plot)
     return 0

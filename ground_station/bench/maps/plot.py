@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ground_station.presentation.dress import LIGHT, dressed
+from ground_station.presentation.theme import LIGHT, themed
 
 _SIGNS = "osD^vXP"
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -43,7 +43,7 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
     upper.plot(x, linear, "--", color=LIGHT.limit, lw=1.2, label="linear")
     lower.axhline(most_gb, color=LIGHT.limit, linestyle="--", lw=1.2, label="allowed")
     for axes, name in ((upper, "time, s"), (lower, "peak memory, GB")):
-        dressed(axes, LIGHT)
+        themed(axes, LIGHT)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylabel(name)

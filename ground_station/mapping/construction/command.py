@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.mapping.construction.verdict import next_step, verdict
     from ground_station.mapping.construction.workers import open_workers
     from ground_station.mapping.settings import load_settings, with_changes
-    from ground_station.presentation.dress import LIGHT, write_png
+    from ground_station.presentation.theme import LIGHT, write_png
 
     check_target(Path(args.out))
     changes = {

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.replay.cases.resources import Side, Watch
-from ground_station.replay.stand import Running, Stand
+from ground_station.replay.rig import Rig, Running
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import messages
 
@@ -18,7 +18,7 @@ from pi_firmware.wire import messages
 class Observed:
     """Watches one flight; a context manager around it. `stand` is what is to be flown on."""
 
-    def __init__(self, stand: Stand) -> None:
+    def __init__(self, stand: Rig) -> None:
         self._telemetry: TelemetryListener | None = None
         self._payload: Watch | None = None
         self._ground = Watch(os.getpid())

@@ -97,7 +97,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
             shown(
                 "Where the poses of B are off those of A",
                 "B's path from above, coloured by its distance from A's pose of the same frame",
-                lambda dress: pictures.path(
+                lambda theme: pictures.path(
                     b.position_m[c.pairs.b],
                     c.position_m,
                     under=[("A", c.a.estimate)],
@@ -105,7 +105,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
                     first_m=first,
                     floorplan=plan,
                     label="B off A, cm",
-                    dress=dress,
+                    theme=theme,
                 ),
             )
         )
@@ -126,7 +126,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
             shown(
                 "Over time",
                 "Errors of both runs, their difference and their states over time",
-                lambda dress: pictures.over_time(panels, strips, dress=dress),
+                lambda theme: pictures.over_time(panels, strips, theme=theme),
             )
         )
     sets = []
@@ -139,7 +139,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
         shown(
             "How often",
             "The share of frames up to an error, and up to a latency, of both runs",
-            lambda dress: pictures.distributions(sets, dress),
+            lambda theme: pictures.distributions(sets, theme),
         )
     )
     return found
@@ -191,23 +191,23 @@ def _of_case(case: Judged) -> list[Shown]:
         shown(
             "Path",
             "The path from above, coloured by its error",
-            lambda dress: pictures.path(
+            lambda theme: pictures.path(
                 frames.position_m[frames.finite],
                 shown_off[frames.finite],
                 under=under,
                 floorplan=outcome.floorplan,
                 label="error, cm",
-                dress=dress,
+                theme=theme,
             ),
         ),
         shown(
             "Over time",
             "Error, latency and state over time; what was out is shaded",
-            lambda dress: pictures.over_time(
+            lambda theme: pictures.over_time(
                 panels,
                 [Strip("state", seconds, frames.state)],
                 _outages_s(outcome, start_ns),
-                dress,
+                theme,
             ),
         ),
     ]

@@ -21,7 +21,7 @@ from ground_station.evaluation.plots import GAP_S
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.dress import LIGHT, Dress, dressed
+from ground_station.presentation.theme import LIGHT, Theme, themed
 
 Array = npt.NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def path(
     first_m: Array | None = None,
     floorplan: FloorPlan | None = None,
     label: str = "off, cm",
-    dress: Dress = LIGHT,
+    theme: Theme = LIGHT,
 ) -> Figure:
     """A path from above, each of its poses (N, 3) coloured by how far it is off (N,).
 
@@ -73,34 +73,34 @@ def path(
     (3,) where two runs part. Where nothing is off a colour scale would only mislead: it ends at a
     millimetre at least.
     """
-    figure = plots.trajectory_plot(None, None, floorplan, dress)
+    figure = plots.trajectory_plot(None, None, floorplan, theme)
     figure.set_size_inches(WIDTH_IN, 4.9)
     axes = figure.axes[0]
     for k, (name, trajectory) in enumerate(under):
         x, y = _broken(trajectory.time_ns / 1e9, trajectory.position_m[:, :2].T)
         style = "-" if k == 0 else "--"
-        axes.plot(x, y, color=dress.truth, lw=3.2 - 2 * k, alpha=0.4, ls=style, label=name)
+        axes.plot(x, y, color=theme.truth, lw=3.2 - 2 * k, alpha=0.4, ls=style, label=name)
     if lost_m is not None and len(lost_m):
-        axes.plot(*lost_m[:, :2].T, "x", color=dress.second, ms=5, mew=1.2, label="without a pose")
+        axes.plot(*lost_m[:, :2].T, "x", color=theme.second, ms=5, mew=1.2, label="without a pose")
     finite = np.isfinite(off_m)
     if finite.any():
         order = np.argsort(off_m[finite])  # the worst on top
         xy, cm = points_m[finite][order, :2], 100 * off_m[finite][order]
         # Dark on white paper, light on black: far off stands out on both.
-        scale = "cividis_r" if dress is LIGHT else "cividis"
+        scale = "cividis_r" if theme is LIGHT else "cividis"
         top = max(0.1, float(cm[-1]))
         drawn = axes.scatter(
             xy[:, 0], xy[:, 1], s=9, c=cm, cmap=scale, vmin=0.0, vmax=top, zorder=3
         )
         bar = figure.colorbar(drawn, ax=axes, fraction=0.045, pad=0.02)
-        bar.set_label(label, color=dress.ink, fontsize=_SMALL)
-        bar.ax.tick_params(colors=dress.ink, labelsize=_SMALL)
+        bar.set_label(label, color=theme.ink, fontsize=_SMALL)
+        bar.ax.tick_params(colors=theme.ink, labelsize=_SMALL)
         bar.outline.set_visible(False)
     if first_m is not None and np.isfinite(first_m).all():
-        axes.plot(*first_m[:2], "o", mfc="none", mec=dress.second, ms=13, mew=2, zorder=4,
+        axes.plot(*first_m[:2], "o", mfc="none", mec=theme.second, ms=13, mew=2, zorder=4,
                   label="first difference")  # fmt: skip
     _zoom(axes, [points_m, *(t.position_m for _, t in under)])
-    _legend_above(axes, dress)
+    _legend_above(axes, theme)
     return figure
 
 
@@ -120,62 +120,62 @@ def over_time(
     panels: Sequence[tuple[str, Sequence[Series], float | None]],
     strips: Sequence[Strip] = (),
     outages_s: Sequence[tuple[float, float]] = (),
-    dress: Dress = LIGHT,
+    theme: Theme = LIGHT,
 ) -> Figure:
     """Panels over one another, each a label, its series and a bound; the states below; outages
     shaded. Times are seconds from the flight's first frame."""
     rows = len(panels) + bool(strips)
     heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)] * bool(strips)
-    figure = _sheet((WIDTH_IN, sum(heights) + 0.7), dress)
+    figure = _sheet((WIDTH_IN, sum(heights) + 0.7), theme)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (label, series, bound) in zip(grid, panels, strict=False):
-        dressed(axes, dress, _SMALL)
+        themed(axes, theme, _SMALL)
         # Of what is nothing at all the axis shows a usual span, not the rounding.
         top = max(_LEAST.get(label.rpartition(", ")[2], 1e-6), bound or 0.0)
         for one in series:
-            colour, line = _style(one.style, dress)
+            colour, line = _style(one.style, theme)
             t, v = _broken(one.time_s, one.values[None, :])
             axes.plot(t, v, color=colour, ls=line, lw=1.2, label=one.label)
             top = max(top, float(np.nanmax(one.values, initial=0.0)))
         if bound is not None:
-            axes.axhline(bound, color=dress.limit, ls=":", lw=1.4, label="bound")
+            axes.axhline(bound, color=theme.limit, ls=":", lw=1.4, label="bound")
         axes.set_ylim(0, 1.15 * top)
         axes.set_ylabel(label, fontsize=_SMALL)
-        _shade(axes, outages_s, dress)
+        _shade(axes, outages_s, theme)
         if len(series) > 1 or bound is not None or outages_s:
-            _legend_above(axes, dress)
+            _legend_above(axes, theme)
     if strips:
-        _draw_strips(grid[-1], strips, dress)
-        _shade(grid[-1], outages_s, dress)
+        _draw_strips(grid[-1], strips, theme)
+        _shade(grid[-1], outages_s, theme)
     grid[-1].set_xlabel("time, s", fontsize=_SMALL)
     return figure
 
 
 def distributions(
-    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], dress: Dress = LIGHT
+    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], theme: Theme = LIGHT
 ) -> Figure:
     """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
-    figure = _sheet((WIDTH_IN, 2.9), dress)
+    figure = _sheet((WIDTH_IN, 2.9), theme)
     grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axes, (label, sets) in zip(grid, panels, strict=True):
-        dressed(axes, dress, _SMALL)
+        themed(axes, theme, _SMALL)
         for k, (name, values) in enumerate(sets):
             known = np.sort(values[np.isfinite(values)])
             if not len(known):
                 continue
-            colour, line = _style(k, dress)
+            colour, line = _style(k, theme)
             share = np.arange(1, len(known) + 1) / len(known)
             axes.step(known, share, where="post", color=colour, ls=line, lw=1.4, label=name)
         axes.set_xlim(left=0)
         axes.set_ylim(0, 1.02)
         axes.set_xlabel(label, fontsize=_SMALL)
-        _legend_above(axes, dress)
+        _legend_above(axes, theme)
     grid[0].set_ylabel("share of frames", fontsize=_SMALL)
     return figure
 
 
-def _draw_strips(axes: Axes, strips: Sequence[Strip], dress: Dress) -> None:
-    dressed(axes, dress, _SMALL)
+def _draw_strips(axes: Axes, strips: Sequence[Strip], theme: Theme) -> None:
+    themed(axes, theme, _SMALL)
     axes.grid(False)
     seen: set[str] = set()
     for row, strip in enumerate(strips):
@@ -188,7 +188,7 @@ def _draw_strips(axes: Axes, strips: Sequence[Strip], dress: Dress) -> None:
     axes.legend(
         handles=[Patch(color=_STATES[name], label=name) for name in _STATES if name in seen],
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
-        labelcolor=dress.ink, fontsize=_SMALL - 1, handlelength=1.0, borderpad=0.0,
+        labelcolor=theme.ink, fontsize=_SMALL - 1, handlelength=1.0, borderpad=0.0,
     )  # fmt: skip
 
 
@@ -208,27 +208,27 @@ def _stretches(strip: Strip) -> list[tuple[str, float, float]]:
     return found
 
 
-def _sheet(size_in: tuple[float, float], dress: Dress) -> Figure:
-    figure = Figure(figsize=size_in, layout="constrained", facecolor=dress.paper)
+def _sheet(size_in: tuple[float, float], theme: Theme) -> Figure:
+    figure = Figure(figsize=size_in, layout="constrained", facecolor=theme.paper)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _style(k: int, dress: Dress) -> tuple[str, str]:
-    return (dress.estimate, "-") if k == 0 else (dress.second, "--")
+def _style(k: int, theme: Theme) -> tuple[str, str]:
+    return (theme.estimate, "-") if k == 0 else (theme.second, "--")
 
 
-def _shade(axes: Axes, outages_s: Sequence[tuple[float, float]], dress: Dress) -> None:
+def _shade(axes: Axes, outages_s: Sequence[tuple[float, float]], theme: Theme) -> None:
     for number, (begin_s, end_s) in enumerate(outages_s):
         label = "out" if number == 0 else None
-        axes.axvspan(begin_s, end_s, color=dress.ink, alpha=0.13, lw=0, label=label)
+        axes.axvspan(begin_s, end_s, color=theme.ink, alpha=0.13, lw=0, label=label)
 
 
-def _legend_above(axes: Axes, dress: Dress) -> None:
+def _legend_above(axes: Axes, theme: Theme) -> None:
     if axes.get_legend_handles_labels()[1]:
         axes.legend(
             loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
-            labelcolor=dress.ink, fontsize=_SMALL, handlelength=1.6, borderpad=0.0,
+            labelcolor=theme.ink, fontsize=_SMALL, handlelength=1.6, borderpad=0.0,
             columnspacing=1.2,
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ground_station.presentation.dress import LIGHT, figure_of
+from ground_station.presentation.theme import LIGHT, figure_of
 from soaking.judging import slope_text
 from soaking.measures import CLOCK, DESCRIPTORS, KINDS, LATENCY, MEMORY, Array, Measure
 from soaking.trend import Trend, trend

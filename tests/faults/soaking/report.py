@@ -35,7 +35,7 @@ def write(
 
 def draw(out: Path, measures: Sequence[Measure], settled_s: float, title: str) -> Path:
     """Draws the picture beside a document; returns its path."""
-    from ground_station.presentation.dress import write_png
+    from ground_station.presentation.theme import write_png
     from soaking.drawing import picture
 
     path = out.with_suffix(".png")

@@ -9,7 +9,7 @@ from ground_station.replay.cases.outcome import Outage
 
 
 class LoopbackLink:
-    """`Stand.link`'s form; nothing is injected."""
+    """`Rig.link`'s form; nothing is injected."""
 
     kind = "loopback"
 

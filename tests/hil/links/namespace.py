@@ -25,7 +25,7 @@ from ground_station.errors import GroundStationError
 from ground_station.keys.authority import Authority
 from ground_station.replay.cases.case import Link
 from ground_station.replay.cases.outcome import Outage
-from ground_station.replay.stand import LOOPBACK, Stand
+from ground_station.replay.rig import LOOPBACK, Rig
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
@@ -94,9 +94,9 @@ class NamespaceLink:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def stand(self) -> Stand:
+    def stand(self) -> Rig:
         """The ground's ends on the cable, and the firmware in its namespace."""
-        return Stand(self._open, self._listen, self, self._fly)
+        return Rig(self._open, self._listen, self, self._fly)
 
     @contextlib.contextmanager
     def __call__(self, receiver_port: int) -> Iterator[int]:

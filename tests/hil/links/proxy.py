@@ -20,7 +20,7 @@ _SHARED = [field.name for field in dataclasses.fields(Impairment)]
 
 
 class ProxyLink:
-    """Relays the video through `ImpairedLink`; `Stand.link`'s form: a port in, a port out.
+    """Relays the video through `ImpairedLink`; `Rig.link`'s form: a port in, a port out.
 
     `host` and `port` are where the payload sends to (0: a free one).
     """

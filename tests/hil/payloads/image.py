@@ -21,7 +21,7 @@ from payloads.ssh import SshPayload
 from payloads.target import Target
 
 from ground_station.errors import InputError
-from ground_station.replay.stand import Stand
+from ground_station.replay.rig import Rig
 
 HIL = Path(__file__).resolve().parents[1]
 CHECKOUT = HIL.parents[1]
@@ -102,7 +102,7 @@ class ImagePayload:
         """The recording as small as the board bears it."""
         return small.small(path, self._cache, SIZE)
 
-    def stand(self, settings: tuple[str, ...], link: Any) -> Stand:
+    def stand(self, settings: tuple[str, ...], link: Any) -> Rig:
         """For one flight; the rig's card records from the start, which a replay does not need."""
         assert self._ssh is not None
         return self._ssh.stand((*_SETTINGS, *settings), link)

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from ground_station.replay.stand import LOOPBACK, Running, Stand
+from ground_station.replay.rig import LOOPBACK, Rig, Running
 
 
 class ProcessPayload:
@@ -30,7 +30,7 @@ class ProcessPayload:
         """What it flies for a recording: the same."""
         return path
 
-    def stand(self, settings: tuple[str, ...], link: Any) -> Stand:
+    def stand(self, settings: tuple[str, ...], link: Any) -> Rig:
         """For one flight; `settings` are in the replay's configuration already."""
         return dataclasses.replace(LOOPBACK, link=link, payload=self.payload)
 

@@ -20,7 +20,7 @@ from typing import Any
 from payloads.distant import Flight
 from payloads.target import SshError, Target, parsed, reason
 
-from ground_station.replay.stand import Stand
+from ground_station.replay.rig import Rig
 from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
@@ -134,10 +134,10 @@ class SshPayload:
         """What it flies for a recording: the same."""
         return path
 
-    def stand(self, settings: tuple[str, ...], link: Any) -> Stand:
+    def stand(self, settings: tuple[str, ...], link: Any) -> Rig:
         """For one flight: `settings` are the firmware's, `link` the suite's."""
         behind = link.kind != "loopback"
-        made = Stand(
+        made = Rig(
             receiver=lambda queue_frames: self._receiver(queue_frames, behind),
             telemetry=self._telemetry,
             link=link,
@@ -281,9 +281,9 @@ class SshPayload:
         return [*self.target.words(), shlex.join(words)]
 
 
-def _of(stand: Stand, payload_id: str | None) -> Stand:
+def _of(stand: Rig, payload_id: str | None) -> Rig:
     """The stand of a payload whose certificate has a name of its own."""
-    if "payload_id" not in {field.name for field in dataclasses.fields(Stand)}:
+    if "payload_id" not in {field.name for field in dataclasses.fields(Rig)}:
         raise SshError(f"'{payload_id}': this ground station replays payloads called 'replay' only")
     return dataclasses.replace(stand, **{"payload_id": payload_id})
 

@@ -23,7 +23,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.alignment import align
 from ground_station.map import store
 from ground_station.mapping.registration.page import serve as pages
-from ground_station.mapping.registration.page.desk import Desk
+from ground_station.mapping.registration.page.session import RegistrationSession
 from ground_station.mapping.registration.picks import read_picks
 from ground_station.mapping.registration.plan import load_plan
 from ground_station.mapping.registration.register import register_map
@@ -44,15 +44,17 @@ def draw_plan(folder: Path) -> Path:
 
 
 class Stand:
-    """A desk that is served on loopback, and what a test knows of it."""
+    """A session that is served on loopback, and what a test knows of it."""
 
     def __init__(self, folder: Path, plan: Path, built: Any) -> None:
         self.folder, self.built = folder, built
-        self.desk = Desk(folder, store.load(folder), load_plan(folder, str(plan), None), None, 0)
+        self.session = RegistrationSession(
+            folder, store.load(folder), load_plan(folder, str(plan), None), None, 0
+        )
         self.ended = threading.Event()
         self.socket = socket.create_server(("127.0.0.1", 0))
         self.port = self.socket.getsockname()[1]
-        app = pages.build(self.desk, TOKEN, self.ended.set)
+        app = pages.build(self.session, TOKEN, self.ended.set)
         config = uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run, args=([self.socket],), daemon=True)
@@ -116,7 +118,7 @@ def true_up(stand: Stand) -> dict[str, float]:
     """How far a person would tilt what the page found, and the level of the floor, in its words."""
     from ground_station.mapping.registration import upright
 
-    turn = upright.upright_rotation(upright.find_up(stand.desk.map, "cameras").upright.direction)
+    turn = upright.upright_rotation(upright.find_up(stand.session.map, "cameras").upright.direction)
     up = turn @ (np.array([0, 0, 1.0]) @ stand.truth.rotation)
     # R = Rz Ry Rx of lower-case "xy" angles: up is (sin b cos a, -sin a, cos a cos b).
     a, b = -np.arcsin(up[1]), np.arctan2(up[0], up[2])
@@ -131,8 +133,8 @@ def true_up(stand: Stand) -> dict[str, float]:
 
 def places_to_pick(stand: Stand) -> list[np.ndarray]:
     """Places of the map with landmarks, x and y in the top view: the ends of the walls and more."""
-    turned = stand.desk._turned(stand.desk.map.landmarks.position_m)
-    world = stand.truth.apply(stand.desk.map.landmarks.position_m)
+    turned = stand.session._turned(stand.session.map.landmarks.position_m)
+    world = stand.truth.apply(stand.session.map.landmarks.position_m)
     wanted = [[8.0, 2.6], [8.0, 5.8], [5.0, 6.0], [7.2, 6.0], [8.0, 4.2]]
     return [turned[np.argmin(np.linalg.norm(world[:, :2] - w, axis=1)), :2] for w in wanted]
 
@@ -169,7 +171,7 @@ class Page:
     def pick(self, place: np.ndarray, off_px: float = 0.0) -> None:
         """One pick: in the map, then where the plan shows it, or that far beside."""
         self.click("map", *place)
-        pending = self.stand.desk._pending
+        pending = self.stand.session._pending
         assert pending is not None and pending.pick is not None
         self.click("plan", *np.add(self.stand.pixel_of(pending.pick.place), [0, off_px]))
 
@@ -191,20 +193,20 @@ def test_a_map_is_registered_on_the_page(browser: Any, stand: Stand, tmp_path: P
     page.fill("#scale-length", "8")
     page.keyboard.press("Enter")
     eventually(lambda: "m a pixel" in hand.text("#plan-words"))
-    assert stand.desk.plan.scale.resolution_m == pytest.approx(RESOLUTION_M, rel=0.01)
+    assert stand.session.plan.scale.resolution_m == pytest.approx(RESOLUTION_M, rel=0.01)
     assert stand.ask("upright", {"source": "cameras", **true_up(stand)})[0] == 200
     page.reload()
     page.wait_for_selector("body[data-ready]")
     page.click("#map-turn")
     hand.settled()
-    assert stand.desk._quarters == 1
+    assert stand.session._quarters == 1
     places = places_to_pick(stand)
     # The wrong order, and two picks: both said, nothing lost.
     hand.click("plan", 100, 100)
     assert hand.text("#problem") == "click the place in the map first, then on the plan"
     for place in places[:2]:
         hand.pick(place)
-    assert page.is_disabled("#save") and len(stand.desk._picks) == 2
+    assert page.is_disabled("#save") and len(stand.session._picks) == 2
     for place in places[2:4]:
         hand.pick(place)
     assert page.is_enabled("#save") and page.is_hidden("#problem")
@@ -273,59 +275,59 @@ def test_only_who_knows_the_address_from_this_machine_gets_anything(untouched: S
 def test_what_cannot_be_is_refused_in_one_line_and_changes_nothing(
     untouched: Stand, what: str, body: Any, words: str
 ) -> None:
-    before = untouched.desk.state()
+    before = untouched.session.state()
     status, answer = untouched.ask(what, body)
     assert 400 <= status < 500 and words in answer["detail"] and "\n" not in answer["detail"]
-    assert untouched.desk.state() == before
+    assert untouched.session.state() == before
     assert not store.load_info(untouched.folder).registered
 
 
 def test_picks_outlive_the_program_and_the_browser(stand: Stand) -> None:
     """Two picks, and the machine goes: the next page begins with them."""
-    desk = stand.desk
-    desk.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
+    session = stand.session
+    session.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
     for k, place in enumerate(places_to_pick(stand)[:4], 1):
-        desk.click(place, 0.1, desk._up.low, desk._up.high, False)
-        assert desk._pending is not None and desk._pending.pick is not None
-        desk.place(stand.pixel_of(desk._pending.pick.place))
-        again = Desk(stand.folder, store.load(stand.folder), desk.plan, None, 0)
+        session.click(place, 0.1, session._up.low, session._up.high, False)
+        assert session._pending is not None and session._pending.pick is not None
+        session.place(stand.pixel_of(session._pending.pick.place))
+        again = RegistrationSession(stand.folder, store.load(stand.folder), session.plan, None, 0)
         assert len(again.state()["picks"]) == k
-    desk.delete("2")
-    again = Desk(stand.folder, store.load(stand.folder), desk.plan, None, 0)
-    shown, before = again.state(), desk.state()
+    session.delete("2")
+    again = RegistrationSession(stand.folder, store.load(stand.folder), session.plan, None, 0)
+    shown, before = again.state(), session.state()
     assert [pick["name"] for pick in shown["picks"]] == ["1", "3", "4"]
     assert shown["picks"] == before["picks"] and "3 picks of PICKS.draft.toml" in shown["notes"]
     again.save()
     assert not (stand.folder / "PICKS.draft.toml").exists()
     assert len(read_picks(stand.folder / "PICKS.toml").picks) == 3
-    renamed = dataclasses.replace(desk.plan, name="other.png")
-    told = Desk(stand.folder, store.load(stand.folder), renamed, None, 0)
+    renamed = dataclasses.replace(session.plan, name="other.png")
+    told = RegistrationSession(stand.folder, store.load(stand.folder), renamed, None, 0)
     assert len(told.state()["picks"]) == 3
-    other = dataclasses.replace(desk.plan, image=255 - desk.plan.image)
-    told = Desk(stand.folder, store.load(stand.folder), other, None, 0)
+    other = dataclasses.replace(session.plan, image=255 - session.plan.image)
+    told = RegistrationSession(stand.folder, store.load(stand.folder), other, None, 0)
     assert told.state()["picks"] == [] and "of another plan" in told.state()["notes"][0]
 
 
 def test_picks_are_refused_until_they_determine_something(stand: Stand) -> None:
     """Too few, twice the same, and on one line."""
-    desk = stand.desk
-    desk.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
+    session = stand.session
+    session.scale(np.array([0.0, 0.0]), np.array([400.0, 0.0]), 8.0)
     places = places_to_pick(stand)
-    low, high = desk._up.low, desk._up.high
+    low, high = session._up.low, session._up.high
     for k, place in enumerate(places[:2]):
-        desk.click(place, 0.05, low, high, False)
-        desk.place(np.array([50.0 + 100 * k, 50.0 + 80 * k]))
+        session.click(place, 0.05, low, high, False)
+        session.place(np.array([50.0 + 100 * k, 50.0 + 80 * k]))
     assert stand.ask("save", {})[1]["detail"] == "2 picks; at least 3 are needed"
-    desk.click(places[0], 0.05, low, high, False)
+    session.click(places[0], 0.05, low, high, False)
     with pytest.raises(MapError, match="'1' and '3' are the same place in the map"):
-        desk.place(np.array([300.0, 10.0]))
-    desk.click(places[2], 0.05, low, high, False)
+        session.place(np.array([300.0, 10.0]))
+    session.click(places[2], 0.05, low, high, False)
     with pytest.raises(MapError, match="'2' and '3' are the same place on the plan"):
-        desk.place(np.array([150.0, 130.0]))
+        session.place(np.array([150.0, 130.0]))
     with pytest.raises(MapError, match="the click is beside the plan"):
-        desk.place(np.array([900.0, 10.0]))
-    desk.place(np.array([250.0, 210.0]))
-    assert "picks on the plan lie on one line" in desk.state()["problem"]
+        session.place(np.array([900.0, 10.0]))
+    session.place(np.array([250.0, 210.0]))
+    assert "picks on the plan lie on one line" in session.state()["problem"]
     assert stand.ask("save", {})[0] == 409
     assert not store.load_info(stand.folder).registered
     assert not (stand.folder / "PICKS.toml").exists()

@@ -65,19 +65,19 @@ def test_eight_wall_corners_fit_as_they_are_clicked(browser: Any, stand: Stand) 
     from ground_station.geometry.alignment import align
 
     into_map = align(world, model, True)
-    scale = stand.desk.plan.scale
+    scale = stand.session.plan.scale
     assert scale is not None
     for corner in CORNERS_M:
         place = into_map.apply(np.array([[*corner, 2.0]]))[0]
-        at = stand.desk._turned(place[None])[0, :2] + rng.uniform(-0.03, 0.03, 2)
+        at = stand.session._turned(place[None])[0, :2] + rng.uniform(-0.03, 0.03, 2)
         hand.click("map", *at)
-        pending = stand.desk._pending
+        pending = stand.session._pending
         assert pending is not None and pending.pick is not None
-        clicked = stand.desk._turned(pending.pick.place[None])[0, :2]
+        clicked = stand.session._turned(pending.pick.place[None])[0, :2]
         assert np.linalg.norm(clicked - at) < 0.02  # a thousandth of the screen's width
         hand.click("plan", *scale.to_pixels(corner)[0])
     shot(hand, "corners")
-    assert stand.desk.state()["fit"]["residual_rms_m"] <= 0.05
+    assert stand.session.state()["fit"]["residual_rms_m"] <= 0.05
     assert hand.text("#picks").count("most") == 1
     assert hand.problems == []
     hand.page.close()
@@ -89,10 +89,10 @@ def test_an_offer_is_shown_taken_by_a_key_and_can_be_switched_off(
     """A click beside a pillar stays there until somebody presses S."""
     hand = Page(browser, stand)
     pillar = np.array([7.5, 2.2])
-    beside = stand.desk._turned(np.array([[*pillar, 2.0]]))[0, :2] + [0.25, 0.15]
+    beside = stand.session._turned(np.array([[*pillar, 2.0]]))[0, :2] + [0.25, 0.15]
 
     def pending() -> dict[str, Any]:
-        shown: dict[str, Any] = stand.desk.state()["pending"]
+        shown: dict[str, Any] = stand.session.state()["pending"]
         return shown
 
     hand.click("map", *beside)
@@ -102,7 +102,7 @@ def test_an_offer_is_shown_taken_by_a_key_and_can_be_switched_off(
     shot(hand, "offer")
     hand.page.keyboard.press("s")
     eventually(lambda: pending()["offer"] is None)
-    off_m = np.linalg.norm(stand.desk._pending.pick.place[:2] - pillar)  # type: ignore[union-attr]
+    off_m = np.linalg.norm(stand.session._pending.pick.place[:2] - pillar)  # type: ignore[union-attr]
     assert off_m < 0.3  # within its round, of which the cameras saw one side
     hand.page.uncheck("#offers")
     hand.click("map", *beside)
@@ -115,28 +115,28 @@ def test_an_offer_is_shown_taken_by_a_key_and_can_be_switched_off(
 def test_two_rough_clicks_and_the_walls_do_the_rest(browser: Any, stand: Stand) -> None:
     """Each click is half a metre off; the accepted fit puts the flight where it truly was."""
     hand = Page(browser, stand)
-    scale = stand.desk.plan.scale
+    scale = stand.session.plan.scale
     assert scale is not None
     assert hand.page.is_disabled("#walls-fit")
     for corner, off in ((CORNERS_M[0], [0.5, 0.3]), (CORNERS_M[2], [-0.4, 0.5])):
-        hand.click("map", *(stand.desk._turned(np.array([[*corner, 2.0]]))[0, :2] + off))
+        hand.click("map", *(stand.session._turned(np.array([[*corner, 2.0]]))[0, :2] + off))
         hand.click("plan", *scale.to_pixels(corner)[0])
     hand.page.click("#walls-fit")
     hand.settled()
     shot(hand, "walls")
     said = hand.text("#walls-words")
     assert "on walls" in said and "before" in said and hand.page.is_visible("#walls-refuse")
-    assert stand.desk.state()["walls"]["residual_m"] <= 0.05
+    assert stand.session.state()["walls"]["residual_m"] <= 0.05
     hand.page.click("#walls-refuse")
     hand.settled()
-    assert len(stand.desk._picks) == 2 and stand.desk.state()["walls"] is None
+    assert len(stand.session._picks) == 2 and stand.session.state()["walls"] is None
     hand.page.click("#walls-fit")
     hand.settled()
     hand.page.click("#walls-accept")
     hand.settled()
     shot(hand, "accepted")
-    assert stand.desk.state()["fit"]["residual_rms_m"] <= 0.05
-    stand.desk.save()
+    assert stand.session.state()["fit"]["residual_rms_m"] <= 0.05
+    stand.session.save()
     placed = store.load(stand.folder).keyframes.wTc[:, :2, 3]
     off = np.linalg.norm(placed - truth()[1][:, :2], axis=1)
     assert np.median(off) <= 0.05 and off.max() < 0.10

@@ -21,7 +21,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from ground_station.errors import MapError
 from ground_station.map import store
 from ground_station.mapping.registration.distances import Distances
-from ground_station.mapping.registration.page.desk import Desk
+from ground_station.mapping.registration.page.session import RegistrationSession
 from ground_station.mapping.registration.plan import load_plan
 from ground_station.mapping.registration.registration import Registration
 from pi_firmware.wire.errors import BlimpError
@@ -100,7 +100,7 @@ class Upright(_Strict):
     height_m: _Number = 0.0
 
 
-def build(desk: Desk, token: str, done: Callable[[], None]) -> FastAPI:
+def build(session: RegistrationSession, token: str, done: Callable[[], None]) -> FastAPI:
     """The application; `done` is called once the map is saved and the answer is on its way."""
     nonce = secrets.token_urlsafe(16)
     html = _page(nonce)
@@ -146,74 +146,74 @@ def build(desk: Desk, token: str, done: Callable[[], None]) -> FastAPI:
 
     @app.get(f"{root}/state")
     def state() -> Any:
-        return desk.state()
+        return session.state()
 
     @app.get(f"{root}/points")
     def points() -> Response:
-        return Response(desk.points(), media_type="application/octet-stream")
+        return Response(session.points(), media_type="application/octet-stream")
 
     @app.get(f"{root}/plan.png")
     def plan() -> Response:
-        return Response(desk.picture(), media_type="image/png")
+        return Response(session.picture(), media_type="image/png")
 
     @app.post(f"{root}/click")
     def click(asked: Click) -> Any:
         at = np.array([asked.x, asked.y])
-        desk.click(at, asked.radius, asked.low, asked.high, asked.offers)
-        return desk.state()
+        session.click(at, asked.radius, asked.low, asked.high, asked.offers)
+        return session.state()
 
     @app.post(f"{root}/snap")
     def snap() -> Any:
-        desk.snap()
-        return desk.state()
+        session.snap()
+        return session.state()
 
     @app.post(f"{root}/place")
     def place(asked: Place) -> Any:
-        desk.place(np.array([asked.u, asked.v]))
-        return desk.state()
+        session.place(np.array([asked.u, asked.v]))
+        return session.state()
 
     @app.post(f"{root}/redo")
     def redo(asked: Named) -> Any:
-        desk.redo(asked.name)
-        return desk.state()
+        session.redo(asked.name)
+        return session.state()
 
     @app.post(f"{root}/delete")
     def delete(asked: Named) -> Any:
-        desk.delete(asked.name)
-        return desk.state()
+        session.delete(asked.name)
+        return session.state()
 
     @app.post(f"{root}/scale")
     def scale(asked: Scale) -> Any:
         one, other = (np.array([place.u, place.v]) for place in (asked.one, asked.other))
-        desk.scale(one, other, asked.length_m)
-        return desk.state()
+        session.scale(one, other, asked.length_m)
+        return session.state()
 
     @app.post(f"{root}/turn")
     def turn() -> Any:
-        desk.turn()
-        return desk.state()
+        session.turn()
+        return session.state()
 
     @app.post(f"{root}/upright")
     def upright(asked: Upright) -> Any:
         tilt = asked.tilt_x_deg, asked.tilt_y_deg
-        desk.upright(asked.source, tilt, asked.level, asked.height_m)
-        return desk.state()
+        session.upright(asked.source, tilt, asked.level, asked.height_m)
+        return session.state()
 
     @app.post(f"{root}/walls")
     def walls(asked: Heights) -> Any:
-        desk.propose(asked.low, asked.high)
-        return desk.state()
+        session.propose(asked.low, asked.high)
+        return session.state()
 
     @app.post(f"{root}/decide")
     def decide(asked: Decision) -> Any:
-        desk.decide(asked.accept)
-        return desk.state()
+        session.decide(asked.accept)
+        return session.state()
 
     @app.post(f"{root}/save")
     def save(tasks: BackgroundTasks) -> Any:
-        desk.save()
+        session.save()
         tasks.add_task(done)  # once the answer is out
-        return desk.state()
+        return session.state()
 
     return app
 
@@ -232,7 +232,9 @@ def serve(
 
     Raises `BlimpError` for a map or plan that cannot be used, and a port that is taken.
     """
-    desk = Desk(folder, store.load(folder), load_plan(folder, plan, resolution_m), distances, seed)
+    session = RegistrationSession(
+        folder, store.load(folder), load_plan(folder, plan, resolution_m), distances, seed
+    )
     token = secrets.token_urlsafe(24)
     try:
         listener = socket.create_server(("127.0.0.1", port))
@@ -243,7 +245,7 @@ def serve(
     def done() -> None:
         running[0].should_exit = True
 
-    app = build(desk, token, done)
+    app = build(session, token, done)
     running.append(
         uvicorn.Server(
             uvicorn.Config(
@@ -266,7 +268,7 @@ def serve(
             running[0].run(sockets=[listener])
     except KeyboardInterrupt:
         pass
-    return desk.found
+    return session.found
 
 
 def _has_display() -> bool:

@@ -31,7 +31,7 @@ class Running(Protocol):
 
 
 @dataclass(frozen=True)
-class Stand:
+class Rig:
     """Makes a flight's parties, each a context manager that ends what it began.
 
     `receiver` takes how many frames may wait for the localizer. `link` takes the receiver's UDP
@@ -50,7 +50,7 @@ class Stand:
     """From the started firmware to its first frame; more where the processor is emulated."""
 
 
-LOOPBACK = Stand(
+LOOPBACK = Rig(
     receiver=lambda queue_frames: Receiver(port=0, queue_frames=queue_frames),
     telemetry=lambda: TelemetryListener(["tcp/127.0.0.1:0"]),
     link=contextlib.nullcontext,

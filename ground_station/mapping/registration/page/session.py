@@ -45,7 +45,7 @@ class Pending:
     heights: tuple[float, float] = (0.0, 0.0)
 
 
-class Desk:
+class RegistrationSession:
     """State of the page. Safe from any thread; a change that is refused leaves it as it was."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The dress of a picture: its colours by day and by night, and what they are put on.
+"""The theme of a picture: its colours by day and by night, and what they are put on.
 
 Figures are plain objects (no global state). Colours are of Okabe and Ito's palette, which people of
 every colour vision can tell apart.
@@ -20,7 +20,7 @@ _DPI = 160
 
 
 @dataclass(frozen=True)
-class Dress:
+class Theme:
     """The colours of a picture."""
 
     paper: str
@@ -32,45 +32,45 @@ class Dress:
     limit: str
 
 
-LIGHT = Dress("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", "#8a5a00")
-DARK = Dress("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
+LIGHT = Theme("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", "#8a5a00")
+DARK = Theme("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
 
 
 def figure_of(
-    rows: int, size_inches: tuple[float, float], dress: Dress
+    rows: int, size_inches: tuple[float, float], theme: Theme
 ) -> tuple[Figure, list[Axes]]:
-    """A figure in that dress and its axes, one below the other with the same x."""
-    figure = Figure(figsize=size_inches, layout="constrained", facecolor=dress.paper)
+    """A figure in that theme and its axes, one below the other with the same x."""
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=theme.paper)
     FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     for one in axes:
-        dressed(one, dress)
+        themed(one, theme)
     return figure, axes
 
 
-def dressed(axes: Axes, dress: Dress, label_size: float | None = None) -> None:
+def themed(axes: Axes, theme: Theme, label_size: float | None = None) -> None:
     """Gives axes a page's colours and two spines; the numbers' size in points, where given."""
-    axes.set_facecolor(dress.paper)
-    axes.grid(True, color=dress.grid, linewidth=0.6)
+    axes.set_facecolor(theme.paper)
+    axes.grid(True, color=theme.grid, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(colors=dress.ink, length=3)
+    axes.tick_params(colors=theme.ink, length=3)
     if label_size is not None:
         axes.tick_params(labelsize=label_size)
-    axes.xaxis.label.set_color(dress.ink)
-    axes.yaxis.label.set_color(dress.ink)
+    axes.xaxis.label.set_color(theme.ink)
+    axes.yaxis.label.set_color(theme.ink)
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(dress.ink)
+        spine.set_color(theme.ink)
 
 
-def legend(axes: Axes, dress: Dress) -> None:
-    """A legend in that dress, where anything has a label."""
+def legend(axes: Axes, theme: Theme) -> None:
+    """A legend in that theme, where anything has a label."""
     if axes.get_legend_handles_labels()[1]:
         axes.legend(
             loc="upper right",
-            facecolor=dress.paper,
-            edgecolor=dress.grid,
-            labelcolor=dress.ink,
+            facecolor=theme.paper,
+            edgecolor=theme.grid,
+            labelcolor=theme.ink,
             fontsize=9,
             framealpha=0.9,
         )
