@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ground_station.service.notes import ALARM, INFO, STATION, WARNING
+from ground_station.service.bus_messages import ALARM, INFO, STATION, WARNING
 from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
 
 HOLD_S = 3.0

@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ground_station.errors import GroundStationError
-from ground_station.service import notes
-from ground_station.service.notes import N, Note, ProcessNote
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import Message, N, ProcessMessage
 from pi_firmware.wire.errors import BlimpError
 
 _SOCKET = "bus"
 _OPEN_LIMIT_S = 10.0
 
 Do = Callable[[Mapping[str, Any]], Mapping[str, Any]]
-T = TypeVar("T", bound=Note)
+T = TypeVar("T", bound=Message)
 
 
 class BusError(GroundStationError):
@@ -67,33 +67,33 @@ class Router:
 
 
 class Newest(Generic[T]):
-    """Keeps the newest note only; `skipped` counts those that nobody took. Safe from any thread."""
+    """Keeps the newest message only, from any thread; `skipped` counts those that nobody took."""
 
     def __init__(self) -> None:
         self.skipped = 0
         self._note: T | None = None
         self._there = threading.Condition()
 
-    def put(self, note: T) -> None:
-        """Takes a note in place of the one before."""
+    def put(self, message: T) -> None:
+        """Takes a message in place of the one before."""
         with self._there:
             self.skipped += self._note is not None
-            self._note = note
+            self._note = message
             self._there.notify()
 
     def take(self, timeout_s: float) -> T | None:
-        """The newest note that was not taken yet; None when none comes in time."""
+        """The newest message that was not taken yet; None when none comes in time."""
         with self._there:
             self._there.wait_for(lambda: self._note is not None, timeout_s)
-            note, self._note = self._note, None
-            return note
+            message, self._note = self._note, None
+            return message
 
 
 class Bus:
     """A process's place on the bus; a context manager.
 
-    Handlers run on a thread of the session and must return soon. `dropped` counts what was no note.
-    Raises `BusError` when there is no bus in the folder.
+    Handlers run on a thread of the session and must return soon. `dropped` counts what was no
+    message. Raises `BusError` when there is no bus in the folder.
     """
 
     def __init__(self, folder: Path, process: str) -> None:
@@ -119,30 +119,30 @@ class Bus:
         """Leaves the bus."""
         self._session.close()
 
-    def say(self, kind: str, payload_id: str, note: Note) -> None:
+    def publish(self, kind: str, payload_id: str, message: Message) -> None:
         """Tells all processes; one that is too slow to hear loses it."""
-        self._session.put(f"station/{kind}/{payload_id}", notes.encode(note))
+        self._session.put(f"station/{kind}/{payload_id}", bus_messages.encode(message))
 
-    def hear(
+    def subscribe(
         self, kind: str, of: type[N], take: Callable[[str, N], None], payload_id: str = "*"
     ) -> None:
-        """Calls `take` with the payload's id and each note of a kind."""
+        """Calls `take` with the payload's id and each message of a kind."""
 
         def received(sample: Any) -> None:
             try:
-                note = notes.decode(of, sample.payload.to_bytes())
-            except notes.NoteError:
+                message = bus_messages.decode(of, sample.payload.to_bytes())
+            except bus_messages.MessageError:
                 self.dropped += 1
                 return
-            take(str(sample.key_expr).rpartition("/")[2], note)
+            take(str(sample.key_expr).rpartition("/")[2], message)
 
         key = f"station/{kind}/{payload_id}"
         self._declared.append(self._session.declare_subscriber(key, received))
 
     def newest(self, kind: str, of: type[N], payload_id: str = "*") -> Newest[N]:
-        """Where the newest note of a kind lies."""
+        """Where the newest message of a kind lies."""
         newest: Newest[N] = Newest()
-        self.hear(kind, of, lambda _, note: newest.put(note), payload_id)
+        self.subscribe(kind, of, lambda _, message: newest.put(message), payload_id)
         return newest
 
     def serve(self, name: str, do: Do) -> None:
@@ -153,7 +153,7 @@ class Bus:
             try:
                 request = json.loads(query.payload.to_bytes()) if query.payload else None
                 if not isinstance(request, dict):
-                    raise notes.NoteError("the question is no JSON object")
+                    raise bus_messages.MessageError("the question is no JSON object")
                 answer = {"done": True, "reason": "", **do(request)}
             except BlimpError as error:
                 answer = {"done": False, "reason": str(error)}
@@ -164,7 +164,7 @@ class Bus:
 
         self._declared.append(self._session.declare_queryable(key, asked))
 
-    def ask(
+    def query(
         self, name: str, request: Mapping[str, Any], timeout_s: float = 5.0
     ) -> Mapping[str, Any]:
         """Asks at a name; without an answer in time it is a refusal that says so."""
@@ -178,7 +178,7 @@ class Bus:
                         return {"done": False, "reason": "", **answer}
         return {"done": False, "reason": f"the service's {name} did not answer"}
 
-    def beat(self) -> None:
+    def heartbeat(self) -> None:
         """Says that this process lives, at most once a second; to be called from its main loop."""
         now_s = time.monotonic()
         span_s = now_s - self._beat_s
@@ -187,14 +187,14 @@ class Bus:
         used_s = _cpu_s()
         share = (used_s - self._cpu_s) / span_s if span_s > 0 else 0.0
         self._beat_s, self._cpu_s = now_s, used_s
-        note = ProcessNote(
+        message = ProcessMessage(
             name=self.process,
             pid=os.getpid(),
             memory_MB=_resident_mb(),
             cpu=share,
             uptime_s=now_s - self._started_s,
         )
-        self.say(notes.PROCESS, notes.STATION, note)
+        self.publish(bus_messages.PROCESS, bus_messages.STATION, message)
 
 
 def _cpu_s() -> float:

@@ -1,6 +1,6 @@
 """The service's processes: one table, started, watched and started again.
 
-Each says on the bus that it lives (`Bus.beat`). One that ends or falls silent is started anew,
+Each says on the bus that it lives (`Bus.heartbeat`). One that ends or falls silent is started anew,
 after a pause that doubles; nobody else waits for it.
 """
 
@@ -85,7 +85,7 @@ class Child:
         """Whether it was heard within a minute: restarts of its own may still mend it."""
         return not self.spec.beats or self._clock() - self._last_heard_s < _START_S
 
-    def beat(self, pid: int) -> None:
+    def heartbeat(self, pid: int) -> None:
         """It was heard; a beat of the process before it does not count."""
         if self._process is not None and pid == self._process.pid:
             self._heard_s = self._last_heard_s = self._clock()
@@ -178,12 +178,12 @@ class Children:
             child.terminate()
             child.wait(time.monotonic() + _TERM_S)
 
-    def beat(self, name: str, pid: int) -> None:
+    def heartbeat(self, name: str, pid: int) -> None:
         """A process was heard."""
         with self._lock:
             child = self._children.get(name)
         if child is not None:
-            child.beat(pid)
+            child.heartbeat(pid)
 
     def step(self) -> None:
         """Starts what is due; raises `ServiceError` when a needed process cannot start."""

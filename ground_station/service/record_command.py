@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pi_firmware.wire.text import printable
 
 if TYPE_CHECKING:
-    from ground_station.service.notes import Note
+    from ground_station.service.bus_messages import Message
 
 _EPILOG = """\
 examples:
@@ -85,12 +85,12 @@ class _Report:
     def __init__(self) -> None:
         self.frames: dict[str, dict[str, int]] = {}
 
-    def take(self, kind: str, payload_id: str, note: Note) -> None:
+    def take(self, kind: str, payload_id: str, note: Message) -> None:
         """Prints events, and keeps each payload's newest account."""
-        from ground_station.service.notes import STATION, EventNote, PayloadNote
+        from ground_station.service.bus_messages import STATION, EventMessage, PayloadMessage
 
-        if isinstance(note, EventNote):
+        if isinstance(note, EventMessage):
             who = "" if payload_id == STATION else f"{payload_id}: "
             print(f"{who}{note.name}: {printable(note.text, 300, ' ')}", flush=True)
-        elif isinstance(note, PayloadNote) and note.stream.get("packets"):
+        elif isinstance(note, PayloadMessage) and note.stream.get("packets"):
             self.frames[payload_id] = note.frames

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ground_station.errors import InputError
-from ground_station.service import notes, processes
+from ground_station.service import bus_messages, processes
 from ground_station.service.bus import Bus, Router
-from ground_station.service.notes import EventNote, PayloadNote, ProcessNote
+from ground_station.service.bus_messages import EventMessage, PayloadMessage, ProcessMessage
 from ground_station.service.processes import Children
 from ground_station.service.settings import RUN_FILE, Run, StationSettings, write_run
 from pi_firmware.wire import config
@@ -63,10 +63,12 @@ class _Parent:
         self._alive_s: dict[str, float] = {}
         specs = processes.table(folder, foxglove=settings.foxglove.enabled, demo=demo)
         self.children = Children(specs, self._report)
-        bus.hear(
-            notes.PROCESS, ProcessNote, lambda _, note: self.children.beat(note.name, note.pid)
+        bus.subscribe(
+            bus_messages.PROCESS,
+            ProcessMessage,
+            lambda _, note: self.children.heartbeat(note.name, note.pid),
         )
-        bus.hear(notes.PAYLOAD, PayloadNote, self._hear_payload)
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._hear_payload)
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
         """Until `stop`; systemd's watchdog is fed while restarts of a process may still help."""
@@ -74,14 +76,14 @@ class _Parent:
         while not stop.wait(_STEP_S):
             self.children.step()
             self._follow_payloads()
-            self._bus.beat()
+            self._bus.heartbeat()
             now_s = time.monotonic()
             if now_s - fed_s > _FEED_S and self.children.hopeful():
                 fed_s = now_s
                 ready = ready or (self.children.living() and notifier.ready())
                 notifier.alive()
 
-    def _hear_payload(self, payload_id: str, note: PayloadNote) -> None:
+    def _hear_payload(self, payload_id: str, note: PayloadMessage) -> None:
         if note.alive:
             with self._lock:
                 self._alive_s[payload_id] = time.monotonic()
@@ -102,9 +104,11 @@ class _Parent:
 
     def _report(self, text: str) -> None:
         print(f"blimp serve: {text}", file=sys.stderr, flush=True)
-        note = EventNote(time.time_ns(), "station", notes.WARNING, "process-restarted", text)
+        note = EventMessage(
+            time.time_ns(), "station", bus_messages.WARNING, "process-restarted", text
+        )
         with contextlib.suppress(Exception):  # the bus may be what fails
-            self._bus.say(notes.EVENT, notes.STATION, note)
+            self._bus.publish(bus_messages.EVENT, bus_messages.STATION, note)
 
 
 @contextlib.contextmanager

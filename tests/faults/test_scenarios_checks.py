@@ -26,8 +26,8 @@ from scenarios.tcp_wire import TcpWire
 from scenarios.walk import DRAWS, WALK_S, drawn, shrunk
 from scenarios.world import combined
 
-from ground_station.service import notes
-from ground_station.service.notes import EstimateNote, FrameNote
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 from pi_firmware.wire.recording import RecordingWriter
 
 COUNTS = {"captured": 100, "gated": 10, "sent": 88, "discarded": 2}
@@ -71,13 +71,16 @@ def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
 def test_an_estimate_has_its_frame_whichever_is_heard_first(frame_first: bool) -> None:
     """Two processes tell of them: on a busy machine a pose was of a stream that nobody knew."""
     heard, ears = Heard(), {}
-    bus: Any = SimpleNamespace(hear=lambda key, kind, take: ears.setdefault(key, take))
+    bus: Any = SimpleNamespace(subscribe=lambda key, kind, take: ears.setdefault(key, take))
     heard.listen(bus, 1)
-    frame = FrameNote(0, 0, 153, 5, 6, 7, 640, 480, ssrc=99)
-    said = [(notes.FRAME, frame), (notes.ESTIMATE, EstimateNote(153, 5, 6, 8, "TRACKING"))]
+    frame = FrameMessage(0, 0, 153, 5, 6, 7, 640, 480, ssrc=99)
+    said = [
+        (bus_messages.FRAME, frame),
+        (bus_messages.ESTIMATE, EstimateMessage(153, 5, 6, 8, "TRACKING")),
+    ]
     for key, note in said if frame_first else reversed(said):
         ears[key]("blimp-1", note)
-    ears[notes.ESTIMATE]("blimp-1", EstimateNote(154, 5, 9, 9, "TRACKING"))
+    ears[bus_messages.ESTIMATE]("blimp-1", EstimateMessage(154, 5, 9, 9, "TRACKING"))
     assert [(told.at, told.ssrc) for told in heard.estimates()] == [(0, 99), (-1, 0)]
 
 
@@ -123,7 +126,7 @@ def test_each_localizer_process_counts_from_its_own_beginning() -> None:
 
 
 def told(state: str, position_m: list[float] | None, time_ns: int, ssrc: int = 7) -> Told:
-    note = EstimateNote(1, time_ns, time_ns, time_ns, state, position_m=position_m)
+    note = EstimateMessage(1, time_ns, time_ns, time_ns, state, position_m=position_m)
     return Told("blimp-1", note, 0, ssrc, 0.0, 0)
 
 

@@ -207,10 +207,10 @@ class Heard:
     """Every estimate on the service's bus, by payload: recorded time, TRACKING or not, latency."""
 
     def __init__(self, bus: Any) -> None:
-        from ground_station.service import notes
+        from ground_station.service import bus_messages
 
         self.frames: dict[str, list[tuple[int, bool, float | None]]] = {}
-        bus.hear(notes.ESTIMATE, notes.EstimateNote, self._take)
+        bus.subscribe(bus_messages.ESTIMATE, bus_messages.EstimateMessage, self._take)
 
     def _take(self, payload_id: str, note: Any) -> None:
         known = note.capture_ns is not None and note.position_m is not None

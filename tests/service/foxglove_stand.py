@@ -21,9 +21,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from ground_station.service import notes, settings
+from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
-from ground_station.service.notes import EstimateNote, FrameNote, ProcessNote
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage, ProcessMessage
 from ground_station.service.pictures import PictureWriter
 from ground_station.service.settings import Run
 from pi_firmware.wire.config import from_mapping
@@ -42,7 +42,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.02)
 
 
-def estimate(sequence: int = 7, **fields: Any) -> EstimateNote:
+def estimate(sequence: int = 7, **fields: Any) -> EstimateMessage:
     """A solved frame's."""
     values: dict[str, Any] = {
         "sequence": sequence,
@@ -59,7 +59,7 @@ def estimate(sequence: int = 7, **fields: Any) -> EstimateNote:
         "inliers": 40,
         "map": "atrium",
     }
-    return EstimateNote(**(values | fields))
+    return EstimateMessage(**(values | fields))
 
 
 class Station:
@@ -76,17 +76,19 @@ class Station:
         self.open()
 
     def open(self) -> None:
-        self.beats: list[ProcessNote] = []
+        self.beats: list[ProcessMessage] = []
         self.router = Router(self.folder)
         self.bus = Bus(self.folder, "station")
-        self.bus.hear(notes.PROCESS, ProcessNote, lambda _, note: self.beats.append(note))
+        self.bus.subscribe(
+            bus_messages.PROCESS, ProcessMessage, lambda _, note: self.beats.append(note)
+        )
 
     def close(self) -> None:
         self.bus.close()
         self.router.close()
 
-    def say(self, note: EstimateNote, payload_id: str = PAYLOAD) -> None:
-        self.bus.say(notes.ESTIMATE, payload_id, note)
+    def say(self, note: EstimateMessage, payload_id: str = PAYLOAD) -> None:
+        self.bus.publish(bus_messages.ESTIMATE, payload_id, note)
 
     def show(self, image: Any, sequence: int, **fields: Any) -> None:
         slot, stamp = self.pictures.write(image)
@@ -102,7 +104,7 @@ class Station:
             "height_px": image.shape[0],
             "ssrc": 1,
         }
-        self.bus.say(notes.FRAME, PAYLOAD, FrameNote(**(values | fields)))
+        self.bus.publish(bus_messages.FRAME, PAYLOAD, FrameMessage(**(values | fields)))
 
 
 @contextmanager

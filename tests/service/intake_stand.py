@@ -29,13 +29,13 @@ from numbered_flight import (  # noqa: E402
 )
 from payload_process import PayloadProcess, free_port  # noqa: E402
 
-from ground_station.service import notes  # noqa: E402
+from ground_station.service import bus_messages  # noqa: E402
 from ground_station.service.bus import Bus, Router  # noqa: E402
-from ground_station.service.notes import (  # noqa: E402
-    EventNote,
-    FrameNote,
-    PayloadNote,
-    RecordingNote,
+from ground_station.service.bus_messages import (  # noqa: E402
+    EventMessage,
+    FrameMessage,
+    PayloadMessage,
+    RecordingMessage,
 )
 from ground_station.service.pictures import PictureReader  # noqa: E402
 from ground_station.service.settings import Run, StationSettings, write_run  # noqa: E402
@@ -83,38 +83,42 @@ class Heard:
     """All notes that were said, and the number that each frame's picture shows."""
 
     def __init__(self, bus: Bus, folder: Path) -> None:
-        self.frames: list[tuple[str, FrameNote, int]] = []
+        self.frames: list[tuple[str, FrameMessage, int]] = []
         """With the picture's number, -1 where the picture had gone."""
-        self.payloads: dict[str, list[PayloadNote]] = {}
-        self.events: list[tuple[str, EventNote]] = []
-        self.recording: list[RecordingNote] = []
+        self.payloads: dict[str, list[PayloadMessage]] = {}
+        self.events: list[tuple[str, EventMessage]] = []
+        self.recording: list[RecordingMessage] = []
         self.latency_ms: list[float] = []
         """From the last packet of a frame to its note's being here."""
         self._folder = folder
         self._readers: dict[str, PictureReader] = {}
         self._lock = threading.Lock()
-        bus.hear(notes.FRAME, FrameNote, self._frame)
-        bus.hear(notes.PAYLOAD, PayloadNote, self._payload)
-        bus.hear(notes.EVENT, EventNote, lambda who, note: self.events.append((who, note)))
-        bus.hear(notes.RECORDING, RecordingNote, lambda _, note: self.recording.append(note))
+        bus.subscribe(bus_messages.FRAME, FrameMessage, self._frame)
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._payload)
+        bus.subscribe(
+            bus_messages.EVENT, EventMessage, lambda who, note: self.events.append((who, note))
+        )
+        bus.subscribe(
+            bus_messages.RECORDING, RecordingMessage, lambda _, note: self.recording.append(note)
+        )
 
-    def _frame(self, payload_id: str, note: FrameNote) -> None:
+    def _frame(self, payload_id: str, note: FrameMessage) -> None:
         self.latency_ms.append((time.time_ns() - note.arrival_ns) / 1e6)
         reader = self._readers.setdefault(payload_id, PictureReader(self._folder, payload_id))
         image = reader.read(note.slot, note.stamp)
         self.frames.append((payload_id, note, -1 if image is None else number_in(image)))
 
-    def _payload(self, payload_id: str, note: PayloadNote) -> None:
+    def _payload(self, payload_id: str, note: PayloadMessage) -> None:
         with self._lock:
             self.payloads.setdefault(payload_id, []).append(note)
 
-    def payload(self, payload_id: str) -> PayloadNote | None:
+    def payload(self, payload_id: str) -> PayloadMessage | None:
         """The newest note of one payload."""
         with self._lock:
             said = self.payloads.get(payload_id)
             return said[-1] if said else None
 
-    def of(self, payload_id: str) -> list[tuple[FrameNote, int]]:
+    def of(self, payload_id: str) -> list[tuple[FrameMessage, int]]:
         """One payload's frames so far."""
         return [(note, number) for who, note, number in list(self.frames) if who == payload_id]
 
@@ -197,12 +201,12 @@ class Stand:
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """A question to the intake."""
-        return dict(self.bus.ask("intake", request, timeout_s=30.0))
+        return dict(self.bus.query("intake", request, timeout_s=30.0))
 
-    def settled(self, payload_id: str, ended: dict[str, int]) -> PayloadNote:
+    def settled(self, payload_id: str, ended: dict[str, int]) -> PayloadMessage:
         """The payload's note once it tells of all frames that the payload says it sent."""
 
-        def told() -> PayloadNote | None:
+        def told() -> PayloadMessage | None:
             note = self.heard.payload(payload_id)
             said = note.frames if note is not None else {}
             fits = all(said.get(name) == value for name, value in ended.items())

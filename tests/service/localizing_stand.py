@@ -17,9 +17,14 @@ from typing import Any
 
 import tomli_w
 
-from ground_station.service import notes, settings
+from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
-from ground_station.service.notes import EstimateNote, EventNote, FrameNote, ProcessNote
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    FrameMessage,
+    ProcessMessage,
+)
 from ground_station.service.pictures import PictureWriter
 from ground_station.service.settings import Run
 from ground_station.stream.receiver import ReceivedFrame, Receiver
@@ -50,16 +55,20 @@ class Station:
         self.settings = run.station
         self.router = Router(run_folder)
         self.bus = Bus(run_folder, "station")
-        self.estimates: list[EstimateNote] = []
-        self.events: list[EventNote] = []
-        self.beats: list[ProcessNote] = []
+        self.estimates: list[EstimateMessage] = []
+        self.events: list[EventMessage] = []
+        self.beats: list[ProcessMessage] = []
         self.said = 0
         self.pictures = PictureWriter(run_folder, PAYLOAD)
-        self.bus.hear(notes.ESTIMATE, EstimateNote, lambda _, note: self.estimates.append(note))
-        self.bus.hear(notes.EVENT, EventNote, lambda _, note: self.events.append(note))
-        self.bus.hear(notes.PROCESS, ProcessNote, self._beat)
+        self.bus.subscribe(
+            bus_messages.ESTIMATE, EstimateMessage, lambda _, note: self.estimates.append(note)
+        )
+        self.bus.subscribe(
+            bus_messages.EVENT, EventMessage, lambda _, note: self.events.append(note)
+        )
+        self.bus.subscribe(bus_messages.PROCESS, ProcessMessage, self._beat)
 
-    def _beat(self, _: str, note: ProcessNote) -> None:
+    def _beat(self, _: str, note: ProcessMessage) -> None:
         if note.name == NAME:
             self.beats.append(note)
 
@@ -67,15 +76,15 @@ class Station:
         self.bus.close()
         self.router.close()
 
-    def event(self, name: str) -> EventNote | None:
+    def event(self, name: str) -> EventMessage | None:
         return next((event for event in list(self.events) if event.name == name), None)
 
-    def say(self, note: FrameNote) -> FrameNote:
+    def say(self, note: FrameMessage) -> FrameMessage:
         self.said += 1
-        self.bus.say(notes.FRAME, PAYLOAD, note)
+        self.bus.publish(bus_messages.FRAME, PAYLOAD, note)
         return note
 
-    def show(self, image: Any, sequence: int, time_ns: int, /, **fields: Any) -> FrameNote:
+    def show(self, image: Any, sequence: int, time_ns: int, /, **fields: Any) -> FrameMessage:
         """A frame as an intake tells it."""
         slot, stamp = self.pictures.write(image)
         now_ns = time.time_ns()
@@ -91,9 +100,9 @@ class Station:
             "height_px": image.shape[0],
             "ssrc": 1,
         }
-        return self.say(FrameNote(**(values | fields)))
+        return self.say(FrameMessage(**(values | fields)))
 
-    def pass_on(self, frame: ReceivedFrame) -> FrameNote:
+    def pass_on(self, frame: ReceivedFrame) -> FrameMessage:
         """A received frame; payload and station share a clock here."""
         return self.show(
             frame.image,

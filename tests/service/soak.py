@@ -35,9 +35,9 @@ from soaking.table import Row, show
 from standing import Service, Viewer
 
 from ground_station.errors import GroundStationError
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.notes import EstimateNote, PayloadNote
+from ground_station.service.bus_messages import EstimateMessage, PayloadMessage
 
 NAME = "blimp-1"
 STATION, PAYLOAD = "station", "payload"
@@ -62,18 +62,18 @@ class Heard:
     """The newest of what is said of the payload, and how long each pose took."""
 
     def __init__(self, bus: Bus) -> None:
-        self.payload: PayloadNote | None = None
-        self.estimate: EstimateNote | None = None
+        self.payload: PayloadMessage | None = None
+        self.estimate: EstimateMessage | None = None
         self.states: Counter[str] = Counter()
         self.latency_ms: deque[tuple[float, float]] = deque()
         """(monotonic s, ms from capture to pose), until somebody takes it."""
-        bus.hear(notes.PAYLOAD, PayloadNote, self._hear_payload, NAME)
-        bus.hear(notes.ESTIMATE, EstimateNote, self._hear_estimate, NAME)
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._hear_payload, NAME)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._hear_estimate, NAME)
 
-    def _hear_payload(self, _: str, note: PayloadNote) -> None:
+    def _hear_payload(self, _: str, note: PayloadMessage) -> None:
         self.payload = note
 
-    def _hear_estimate(self, _: str, note: EstimateNote) -> None:
+    def _hear_estimate(self, _: str, note: EstimateMessage) -> None:
         self.estimate = note
         self.states[note.state] += 1
         if note.capture_ns is not None and note.position_m is not None:

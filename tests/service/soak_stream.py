@@ -37,8 +37,8 @@ from ground_station.errors import GroundStationError
 from ground_station.localization.estimate import State
 from ground_station.recording.flight import FlightRecording
 from ground_station.recording.frames import FrameRange
-from ground_station.service import notes
-from ground_station.service.notes import EstimateNote
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage
 
 NAME = "localizer"
 RATE_HZ = 30
@@ -77,12 +77,14 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
     """Shows the stream's frames one by one."""
     images = [frame.image for frame in FlightRecording(SAMPLE / "flight.mcap", STRETCH)]
     covered = np.zeros_like(images[0])
-    said: queue.SimpleQueue[EstimateNote] = queue.SimpleQueue()
+    said: queue.SimpleQueue[EstimateMessage] = queue.SimpleQueue()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         told = stack.enter_context(station(folder))
         process = stack.enter_context(localizer(folder))
-        told.bus.hear(notes.ESTIMATE, EstimateNote, lambda _, note: said.put(note), PAYLOAD)
+        told.bus.subscribe(
+            bus_messages.ESTIMATE, EstimateMessage, lambda _, note: said.put(note), PAYLOAD
+        )
         until(lambda: told.event("map-loaded") is not None, "the map")
         start_s, lost = time.monotonic(), False
         for k, image in zip(

@@ -24,9 +24,9 @@ from payload_process import PayloadProcess, free_port
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.notes import EstimateNote
+from ground_station.service.bus_messages import EstimateMessage
 
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
 START_S = 60.0
@@ -351,9 +351,9 @@ class Estimates:
         """From capture to pose; those with a pose and a known capture time."""
         self.done_ns: dict[str, list[int]] = {}
         self.states: dict[str, dict[str, int]] = {}
-        bus.hear(notes.ESTIMATE, EstimateNote, self._take)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._take)
 
-    def _take(self, payload_id: str, note: EstimateNote) -> None:
+    def _take(self, payload_id: str, note: EstimateMessage) -> None:
         states = self.states.setdefault(payload_id, {})
         states[note.state] = states.get(note.state, 0) + 1
         self.done_ns.setdefault(payload_id, []).append(note.done_ns)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import web_station as station
 
-from ground_station.service import alarms, notes
+from ground_station.service import alarms, bus_messages
 from ground_station.service.web.snapshot import Snapshot
 
 S = 1_000_000_000
@@ -29,9 +29,9 @@ def told(tmp_path):
     clock = Clock()
     snapshot = Snapshot(station.run_of(tmp_path), "0", clock)
     say: dict[str, Callable[[str, Any], None]] = {
-        notes.FRAME: snapshot.frame, notes.ESTIMATE: snapshot.estimate,
-        notes.PAYLOAD: snapshot.payload, notes.EVENT: snapshot.event,
-        notes.RECORDING: snapshot.recording, notes.PROCESS: snapshot.process,
+        bus_messages.FRAME: snapshot.frame, bus_messages.ESTIMATE: snapshot.estimate,
+        bus_messages.PAYLOAD: snapshot.payload, bus_messages.EVENT: snapshot.event,
+        bus_messages.RECORDING: snapshot.recording, bus_messages.PROCESS: snapshot.process,
     }  # fmt: skip
     station.say_all(lambda kind, name, note: say[kind](name, note))
     return snapshot, clock

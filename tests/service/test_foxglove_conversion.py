@@ -14,14 +14,14 @@ from foxglove_stand import CAPTURE_NS, PAYLOAD, estimate
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry import poses
-from ground_station.service.foxglove import checks, conversion, documents, drawing, world
-from ground_station.service.notes import (
-    EventNote,
-    FrameNote,
-    PayloadNote,
-    RecordingNote,
+from ground_station.service.bus_messages import (
+    EventMessage,
+    FrameMessage,
+    PayloadMessage,
+    RecordingMessage,
     as_document,
 )
+from ground_station.service.foxglove import checks, conversion, documents, drawing, world
 
 SAMPLES = 40_000
 NEAR = 0.03  # of the deviations' product; a sample's own error is 1 / sqrt(SAMPLES) of it
@@ -128,7 +128,7 @@ def test_a_covariance_that_cannot_be_is_not_told(covariance: object) -> None:
 def test_stamps_are_the_captures_or_the_next_best() -> None:
     assert checks.stamp_ns(estimate()) == CAPTURE_NS
     assert checks.stamp_ns(estimate(capture_ns=None)) == CAPTURE_NS + 50_000_000
-    frame = FrameNote(1, 2, 3, 4, 5, 1_000, 640, 480, 9)
+    frame = FrameMessage(1, 2, 3, 4, 5, 1_000, 640, 480, 9)
     assert checks.stamp_ns(frame) == 1_000
     # Foxglove's stamps end in 2106.
     assert checks.stamp_ns(estimate(capture_ns=1 << 62)) == CAPTURE_NS + 50_000_000
@@ -142,9 +142,9 @@ def test_stamps_are_the_captures_or_the_next_best() -> None:
             documents.estimate_schema(),
             documents.estimate(PAYLOAD, estimate(), checks.solved(estimate())),
         ),
-        (documents.event_schema(), documents.event("-", EventNote(1, "web", "info", "a", "b"))),
-        (documents.status_schema(), documents.status(PayloadNote(True, 5, clock={"a": 1}))),
-        (documents.recording_schema(), as_document(RecordingNote(True, "f", free_MB=1.5))),
+        (documents.event_schema(), documents.event("-", EventMessage(1, "web", "info", "a", "b"))),
+        (documents.status_schema(), documents.status(PayloadMessage(True, 5, clock={"a": 1}))),
+        (documents.recording_schema(), as_document(RecordingMessage(True, "f", free_MB=1.5))),
     ],
 )
 def test_what_is_said_is_what_the_schema_says(schema: dict, document: dict) -> None:

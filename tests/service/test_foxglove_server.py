@@ -24,12 +24,17 @@ from websockets.typing import Subprotocol
 
 from ground_station.geometry.camera import Camera
 from ground_station.map import store
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import (
+    EventMessage,
+    FrameMessage,
+    PayloadMessage,
+    RecordingMessage,
+)
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.log import RateLimitedHandler
 from ground_station.service.foxglove.topics import json_topic
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.notes import EventNote, FrameNote, PayloadNote, RecordingNote
 
 RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))
 SCHEMAS = {
@@ -161,7 +166,7 @@ def test_the_scene_has_marker_ellipsoid_and_trail(stand: SimpleNamespace) -> Non
         expected = 2 * 2.7955 * np.sqrt([1e-4, 2e-4, 3e-4])
         assert np.allclose(sorted([size.x, size.y, size.z]), expected, rtol=1e-3)
         # Gone: drawn no more.
-        gone = PayloadNote(False, 1)
+        gone = PayloadMessage(False, 1)
         client.until(
             lambda: (
                 {"marker", "ellipsoid"}
@@ -172,7 +177,7 @@ def test_the_scene_has_marker_ellipsoid_and_trail(stand: SimpleNamespace) -> Non
                 }
             ),
             "deletion",
-            lambda: stand.station.bus.say(notes.PAYLOAD, PAYLOAD, gone),
+            lambda: stand.station.bus.publish(bus_messages.PAYLOAD, PAYLOAD, gone),
         )
 
 
@@ -212,9 +217,9 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
 ) -> None:
     station = stand.station
     battery = {"schema": "blimp.battery/1.1", "time_ns": 5, "voltage": 3.9}
-    note = PayloadNote(True, 1, battery=battery, health={"uptime_s": 3.0}, rate_hz=30.0)
-    event = EventNote(CAPTURE_NS, "localizer", "warning", "map-refused", "why")
-    recording = RecordingNote(True, "a.mcap", 1.0)
+    note = PayloadMessage(True, 1, battery=battery, health={"uptime_s": 3.0}, rate_hz=30.0)
+    event = EventMessage(CAPTURE_NS, "localizer", "warning", "map-refused", "why")
+    recording = RecordingMessage(True, "a.mcap", 1.0)
     kept = (
         "/events", "/log", "/recording", "/map/floorplan", "/map/landmarks",
         f"/{PAYLOAD}/battery", f"/{PAYLOAD}/health", f"/{PAYLOAD}/status",
@@ -229,9 +234,9 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
         first.subscribe(*kept)
 
         def say() -> None:
-            station.bus.say(notes.PAYLOAD, PAYLOAD, note)
-            station.bus.say(notes.EVENT, PAYLOAD, event)
-            station.bus.say(notes.RECORDING, notes.STATION, recording)
+            station.bus.publish(bus_messages.PAYLOAD, PAYLOAD, note)
+            station.bus.publish(bus_messages.EVENT, PAYLOAD, event)
+            station.bus.publish(bus_messages.RECORDING, bus_messages.STATION, recording)
             station.show(RAMP, 1)
             station.say(estimate())
 
@@ -280,10 +285,10 @@ def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
         for note in hostile:
             stand.station.say(note)
         bus = stand.station.bus
-        bus.say(notes.EVENT, PAYLOAD, EventNote("x", 1, [2], None, {}))  # type: ignore[arg-type]
-        bus.say(notes.PAYLOAD, PAYLOAD, PayloadNote("x", [], battery=3, health=[]))  # type: ignore[arg-type]
-        bus.say(notes.FRAME, PAYLOAD, FrameNote(-1, "a", None, 0, 0, 0, 640, 480, 0))  # type: ignore[arg-type]
-        bus.say(notes.ESTIMATE, "No Payload", estimate())
+        bus.publish(bus_messages.EVENT, PAYLOAD, EventMessage("x", 1, [2], None, {}))  # type: ignore[arg-type]
+        bus.publish(bus_messages.PAYLOAD, PAYLOAD, PayloadMessage("x", [], battery=3, health=[]))  # type: ignore[arg-type]
+        bus.publish(bus_messages.FRAME, PAYLOAD, FrameMessage(-1, "a", None, 0, 0, 0, 640, 480, 0))  # type: ignore[arg-type]
+        bus.publish(bus_messages.ESTIMATE, "No Payload", estimate())
         client.until(
             lambda: any(
                 said["sequence"] == 77 for _, said in client.received[f"/{PAYLOAD}/estimate"]
@@ -291,7 +296,9 @@ def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
             "the next",
             lambda: stand.station.say(estimate(77)),
         )
-        bus.say(notes.EVENT, PAYLOAD, EventNote(CAPTURE_NS, "web", "info", "next", "one"))
+        bus.publish(
+            bus_messages.EVENT, PAYLOAD, EventMessage(CAPTURE_NS, "web", "info", "next", "one")
+        )
         client.until(
             lambda: any(said.message == "next: one" for _, said in client.received["/log"]),
             "the next event",
@@ -399,7 +406,7 @@ def test_a_full_inbox_loses_the_oldest_and_counts_them() -> None:
     for number in range(2003):
         inbox.put(lambda number=number: seen.append(number))
     for number in range(3):
-        inbox.frame("a", FrameNote(number, 0, number, 0, 0, 0, 1, 1, 1))
+        inbox.frame("a", FrameMessage(number, 0, number, 0, 0, 0, 1, 1, 1))
     tasks, frames = inbox.take(0.0)
     for task in tasks:
         task()

@@ -22,8 +22,8 @@ from intake_stand import (
     stamped,
 )
 
-from ground_station.service import notes
-from ground_station.service.notes import EstimateNote
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.telemetry import open_session
 
@@ -216,8 +216,8 @@ def test_poses_reach_the_payload_and_commands_are_answered(tmp_path: Path) -> No
         )
         stand.payload("blimp-1")
         eventually(lambda: len(stand.heard.of("blimp-1")) > 5)
-        bad = EstimateNote(sequence=1, time_ns=1, clock_ns=1, done_ns=1, state="ELATED")
-        said = EstimateNote(
+        bad = EstimateMessage(sequence=1, time_ns=1, clock_ns=1, done_ns=1, state="ELATED")
+        said = EstimateMessage(
             sequence=7, time_ns=70, clock_ns=71, done_ns=72, state="TRACKING",
             position_m=[1.0, 2.0, 3.0], quaternion_xyzw=[0.0, 0.0, 1.0, 0.0],
             covariance=[float(k) for k in range(36)], relocalized=True,
@@ -225,7 +225,7 @@ def test_poses_reach_the_payload_and_commands_are_answered(tmp_path: Path) -> No
 
         def told() -> bool:
             for note in (bad, said):
-                stand.bus.say(notes.ESTIMATE, "blimp-1", note)
+                stand.bus.publish(bus_messages.ESTIMATE, "blimp-1", note)
             return bool(poses)
 
         eventually(told)

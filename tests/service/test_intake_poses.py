@@ -12,13 +12,13 @@ import pytest
 from ground_station.geometry import poses
 from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.service import pose_feed
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 from ground_station.service.intake.poses import pose_message
 from ground_station.service.localizing.derive import Accounts, estimate_note
-from ground_station.service.notes import EstimateNote, FrameNote
 from pi_firmware.wire import messages
 
 NOW_NS = 77
-FRAME = FrameNote(0, 2, 9, 5, 6, 7, 640, 480, 1)
+FRAME = FrameMessage(0, 2, 9, 5, 6, 7, 640, 480, 1)
 ESTIMATE = PoseEstimate(
     time_ns=5,
     index=9,
@@ -71,6 +71,6 @@ def test_what_is_not_finite_is_told_as_lost_or_left_out(value: float) -> None:
     ],
 )
 def test_a_note_that_is_not_as_agreed_is_refused(wrong: dict[str, Any]) -> None:
-    note: EstimateNote = replace(NOTE, **wrong)
+    note: EstimateMessage = replace(NOTE, **wrong)
     with pytest.raises((ValueError, TypeError)):
         pose_message(note, NOW_NS)

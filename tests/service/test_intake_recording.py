@@ -33,10 +33,10 @@ from mcap_doctor import complaints
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.recording.flight import trajectory_of
 from ground_station.recording.open import open_input
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage, EventMessage
 from ground_station.service.intake import files as files_module
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.notes import EstimateNote, EventNote
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire import annexb, keys, messages
@@ -93,8 +93,8 @@ def sequences(path: Path, prefix: str = "") -> list[int]:
     return [value["sequence"] for _, value in RecordingReader(path).json(prefix + FRAME_INFO_TOPIC)]
 
 
-def estimate(index: int, **more: object) -> EstimateNote:
-    note = EstimateNote(
+def estimate(index: int, **more: object) -> EstimateMessage:
+    note = EstimateMessage(
         sequence=index, time_ns=capture_ns(index), clock_ns=capture_ns(index),
         capture_ns=log_ns(index), done_ns=log_ns(index) + 5, state="TRACKING",
         position_m=[1.0 * index, 2.0, 3.0], quaternion_xyzw=[0.0, 0.0, 0.0, 1.0],
@@ -115,7 +115,7 @@ def test_a_recording_holds_all_that_was_said_on_the_grounds_clock(tmp_path: Path
     made.estimate("blimp-1", estimate(30, position_m=None, quaternion_xyzw=None, state="LOST"))
     made.estimate("blimp-1", estimate(31, position_m=["far"]))
     made.message("blimp-1", keys.BATTERY, battery)
-    made.note(notes.EVENT, "-", EventNote(1, "web", "info", "hello", "there"))
+    made.note(bus_messages.EVENT, "-", EventMessage(1, "web", "info", "hello", "there"))
     made.close()
     (path,) = recorded(tmp_path / "out")
     reader = RecordingReader(path)
@@ -256,7 +256,7 @@ def test_a_disk_without_room_is_a_reason_and_an_alarm(tmp_path: Path) -> None:
     wait_for(lambda: not made.file)
     assert "deleted" in made.state().problem
     wait_for(lambda: events.told[-1][0] == "recording-ended")
-    assert events.told[-1][1] == notes.ALARM
+    assert events.told[-1][1] == bus_messages.ALARM
     assert made.start() and made.state().problem == ""
     made.close()
 

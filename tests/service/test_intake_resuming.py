@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EventMessage
 from ground_station.service.intake import resuming
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.notes import EventNote
 from ground_station.service.settings import RecordingSettings
 from pi_firmware.wire.recording import RecordingReader
 
@@ -38,7 +38,7 @@ def record(folder: Path, *, cut: bool, age_s: float = 0.0) -> Path:
     station = Station(folder)
     path = folder / station.recorder.start()
     for index in range(3):
-        station.recorder.note(notes.EVENT, "-", EventNote(index, "web", "info", "a", "b"))
+        station.recorder.note(bus_messages.EVENT, "-", EventMessage(index, "web", "info", "a", "b"))
     station.recorder.close()
     if cut:
         # The last byte of the summary's footer, and what a chunk needs not.
@@ -56,8 +56,8 @@ def test_one_that_was_cut_goes_on_in_a_new_file(tmp_path: Path) -> None:
     station.begin()
     state = station.recorder.state()
     assert state.active and state.file == "flight-000003.mcap" and state.problem == ""
-    ((level, text),) = station.said(notes.RECORDING_RESUMED)
-    assert level == notes.WARNING and text == state.resumed
+    ((level, text),) = station.said(bus_messages.RECORDING_RESUMED)
+    assert level == bus_messages.WARNING and text == state.resumed
     assert text.startswith(f"{cut.name} was cut and has no index; {state.file} goes on, ")
     lost_s = float(text.split(", ")[1].split()[0])
     assert 0.3 <= lost_s < 60
@@ -106,7 +106,7 @@ def test_one_that_cannot_go_on_is_a_problem_until_one_begins(tmp_path: Path) -> 
     station.begin()
     problem = station.recorder.state().problem
     assert problem.startswith(f"{cut.name} was cut and cannot go on: recording.folder")
-    assert station.told[-1][1:] == (notes.ALARM, problem)
+    assert station.told[-1][1:] == (bus_messages.ALARM, problem)
     assert station.recorder.state().problem == problem
     able = Station(tmp_path)
     able.recorder.refuse("it could not")

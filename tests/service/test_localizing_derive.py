@@ -9,7 +9,8 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.localization.estimate import Counts, Observations, PoseEstimate, State
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 from ground_station.service.localizing.derive import (
     Accounts,
     estimate_note,
@@ -19,11 +20,10 @@ from ground_station.service.localizing.derive import (
     unsolved_note,
     world_velocity,
 )
-from ground_station.service.notes import EstimateNote, FrameNote
 
 # The camera looks along the world's y axis: its x is the world's x, its y is down.
 ALONG_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-FRAME = FrameNote(0, 2, 7, 1_000, 2_000, 3_000, 640, 480, 1, capture_ns=2_500)
+FRAME = FrameMessage(0, 2, 7, 1_000, 2_000, 3_000, 640, 480, 1, capture_ns=2_500)
 
 
 def looking(yaw_deg: float, pitch_deg: float = 0.0) -> np.ndarray:
@@ -137,8 +137,8 @@ def test_a_note_has_the_frames_numbers_and_the_poses() -> None:
     assert (told.inliers, told.expected, told.tracked) == (20, 40, True)
     assert told.points_px == [0.0, 0.2, 1.0, 1.2] and told.stage_ms == {"total": 12.346}
     assert (told.processed, told.localized, told.skipped) == (5, 4, 3)
-    json.loads(notes.encode(told), parse_constant=pytest.fail)
-    assert notes.decode(EstimateNote, notes.encode(told)) == told
+    json.loads(bus_messages.encode(told), parse_constant=pytest.fail)
+    assert bus_messages.decode(EstimateMessage, bus_messages.encode(told)) == told
 
 
 def test_a_pose_that_is_not_finite_is_lost() -> None:

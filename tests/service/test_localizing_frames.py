@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import FrameMessage
 from ground_station.service.localizing.frames import GONE, Taken, fault_of, take
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.notes import FrameNote
 from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter
 
 IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
@@ -30,7 +30,7 @@ def ring(tmp_path: Path) -> tuple[PictureWriter, PictureReader]:
 def test_a_frame_is_taken_with_its_picture(ring: tuple[PictureWriter, PictureReader]) -> None:
     writer, reader = ring
     slot, stamp = writer.write(IMAGE)
-    note = FrameNote(**FIELDS | {"slot": slot, "stamp": stamp, "exposure_s": 0.01})
+    note = FrameMessage(**FIELDS | {"slot": slot, "stamp": stamp, "exposure_s": 0.01})
     taken = take(reader, note)
     assert isinstance(taken, Taken)
     assert (taken.image == IMAGE).all() and taken.exposure_s == 0.01 and taken.note is note
@@ -41,24 +41,24 @@ def test_a_picture_that_was_overwritten_is_gone(ring: tuple[PictureWriter, Pictu
     slot, stamp = writer.write(IMAGE)
     for _ in range(SLOTS):
         writer.write(IMAGE)
-    assert take(reader, FrameNote(**FIELDS | {"slot": slot, "stamp": stamp})) is GONE
+    assert take(reader, FrameMessage(**FIELDS | {"slot": slot, "stamp": stamp})) is GONE
 
 
 def test_without_a_ring_a_picture_is_gone(tmp_path: Path) -> None:
-    assert take(PictureReader(tmp_path, "blimp-1"), FrameNote(**FIELDS)) is GONE
+    assert take(PictureReader(tmp_path, "blimp-1"), FrameMessage(**FIELDS)) is GONE
 
 
 @pytest.mark.parametrize("slot", [SLOTS, 99, 1 << 40])
 def test_a_slot_out_of_range_is_gone(slot: int, ring: tuple[PictureWriter, PictureReader]) -> None:
     writer, reader = ring
     writer.write(IMAGE)
-    assert take(reader, FrameNote(**FIELDS | {"slot": slot})) is GONE
+    assert take(reader, FrameMessage(**FIELDS | {"slot": slot})) is GONE
 
 
 def test_a_picture_of_another_size_is_refused(ring: tuple[PictureWriter, PictureReader]) -> None:
     writer, reader = ring
     slot, stamp = writer.write(IMAGE)
-    note = FrameNote(**FIELDS | {"slot": slot, "stamp": stamp, "width_px": 640})
+    note = FrameMessage(**FIELDS | {"slot": slot, "stamp": stamp, "width_px": 640})
     assert take(reader, note) == "its picture has 64x48 px, not 640x48"
 
 
@@ -72,13 +72,15 @@ def test_a_picture_of_another_size_is_refused(ring: tuple[PictureWriter, Picture
     ],
 )  # fmt: skip
 def test_values_that_cannot_be_are_named(name: str, value: Any) -> None:
-    assert fault_of(FrameNote(**FIELDS)) == ""
-    assert fault_of(FrameNote(**FIELDS | {name: value})).startswith(f"{name} is ")
+    assert fault_of(FrameMessage(**FIELDS)) == ""
+    assert fault_of(FrameMessage(**FIELDS | {name: value})).startswith(f"{name} is ")
 
 
 def test_nan_on_the_bus_is_refused_and_not_believed() -> None:
     """JSON's parser takes NaN, though JSON has none."""
-    note = notes.decode(FrameNote, json.dumps(FIELDS | {"time_ns": float("nan")}).encode())
+    note = bus_messages.decode(
+        FrameMessage, json.dumps(FIELDS | {"time_ns": float("nan")}).encode()
+    )
     assert fault_of(note)
 
 
@@ -88,7 +90,7 @@ def test_an_exposure_that_cannot_be_is_not_known(
 ) -> None:
     writer, reader = ring
     _, stamp = writer.write(IMAGE)
-    taken = take(reader, FrameNote(**FIELDS | {"stamp": stamp, "exposure_s": exposure}))
+    taken = take(reader, FrameMessage(**FIELDS | {"stamp": stamp, "exposure_s": exposure}))
     assert isinstance(taken, Taken) and taken.exposure_s is None
 
 

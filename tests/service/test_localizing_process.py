@@ -33,11 +33,11 @@ from ground_station.localization.localizer import Localizer
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
 from ground_station.replay.firmware import FirmwareProcess
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.localizing import maps
 from ground_station.service.localizing.process import RESTART, Localizing
-from ground_station.service.notes import EstimateNote
 from ground_station.service.pictures import SLOTS
 
 pytestmark = pytest.mark.alone
@@ -77,13 +77,13 @@ def running(run_folder: Path, shelf: Path) -> Iterator[tuple[Station, subprocess
         yield told, process
 
 
-def error_m(note: EstimateNote) -> float:
+def error_m(note: EstimateMessage) -> float:
     """How far a pose is from the flight's truth at the camera's time."""
     assert note.position_m is not None
     return float(np.linalg.norm(TRUTH.at(note.time_ns)[:3, 3] - note.position_m))
 
 
-def localized(told: Station, frame: Frame, **fields: Any) -> EstimateNote:
+def localized(told: Station, frame: Frame, **fields: Any) -> EstimateMessage:
     """One frame shown, and what is said of it."""
     before = len(told.estimates)
     note = told.show(frame.image, frame.index, frame.time_ns, **fields)
@@ -164,7 +164,7 @@ def test_relocalize_forgets_the_pose_and_searches(
     told, _ = running
     said = [localized(told, frame) for frame in flight[:5]]
     assert [note.relocalized for note in said] == [True, False, False, False, False]
-    assert told.bus.ask(NAME, {"do": "relocalize"}) == {"done": True, "reason": ""}
+    assert told.bus.query(NAME, {"do": "relocalize"}) == {"done": True, "reason": ""}
     assert localized(told, flight[5]).relocalized
     assert not localized(told, flight[6]).relocalized
 
@@ -174,7 +174,7 @@ def test_a_map_is_changed_while_frames_come(
 ) -> None:
     told, _ = running
     assert localized(told, flight[0]).map == "atrium"
-    answer = told.bus.ask(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
+    answer = told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
     assert answer["done"] and answer["map"] == "hall"
     until(lambda: any("'hall' is in use" in event.text for event in told.events), "the map")
     changed = localized(told, flight[1])
@@ -197,7 +197,7 @@ def test_a_map_that_is_refused_leaves_the_old_one_in_use(
 ) -> None:
     told, process = running
     localized(told, flight[0])
-    answer = told.bus.ask(NAME, {"do": "map", "name": name}, timeout_s=LIMIT_S)
+    answer = told.bus.query(NAME, {"do": "map", "name": name}, timeout_s=LIMIT_S)
     assert not answer["done"] and reason in answer["reason"] and "\n" not in answer["reason"]
     kept = localized(told, flight[1])
     assert kept.map == "atrium" and kept.position_m and not kept.relocalized
@@ -209,7 +209,7 @@ def test_a_question_that_is_not_known_is_refused(
     request_: dict[str, Any], running: tuple[Station, subprocess.Popen[str]]
 ) -> None:
     told, _ = running
-    answer = told.bus.ask(NAME, request_)
+    answer = told.bus.query(NAME, request_)
     assert not answer["done"] and "is not known (known: relocalize, map)" in answer["reason"]
 
 
@@ -224,12 +224,12 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
         refused = told.event("map-refused")
         assert refused is not None and refused.level == "alarm"
         assert "landmarks.safetensors" in refused.text and "\n" not in refused.text
-        answer = told.bus.ask(NAME, {"do": "relocalize"})
+        answer = told.bus.query(NAME, {"do": "relocalize"})
         assert not answer["done"] and "nothing to search: no map: " in answer["reason"]
         said = localized(told, flight[0])
         assert said.state == "INITIALIZING" and said.reason.startswith("no map: ")
         assert (said.processed, said.skipped, said.position_m) == (0, 1, None)
-        assert told.bus.ask(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)["done"]
+        assert told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)["done"]
         until(lambda: told.event("map-loaded") is not None, "the map")
         found = localized(told, flight[1])
         assert found.map == "hall" and error_m(found) < 0.1
@@ -254,7 +254,7 @@ def test_hostile_notes_are_counted_and_nothing_else(
     ]  # fmt: skip
     for fields in hostile:
         told.show(frame.image, frame.index, frame.time_ns, **fields)
-    values = json.loads(notes.encode(told.show(frame.image, 1, 1, time_ns=-1)))
+    values = json.loads(bus_messages.encode(told.show(frame.image, 1, 1, time_ns=-1)))
     session.put(key, json.dumps(values | {"time_ns": float("nan")}).encode())
     told.said += 1
     until(lambda: told.event("frame-refused") is not None, "the event")
@@ -369,7 +369,7 @@ def test_while_its_map_is_loaded_it_says_so(
         try:
             said = localized(told, flight[0])
             assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
-            answer = told.bus.ask(NAME, {"do": "map", "name": "atrium"})
+            answer = told.bus.query(NAME, {"do": "map", "name": "atrium"})
             assert answer["reason"] == "the map 'atrium' is being loaded; try again then"
             release.set()
             until(lambda: told.event("map-loaded") is not None, "the map")

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_station.service import notes, settings
+from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
-from ground_station.service.notes import EventNote, FrameNote, PayloadNote
+from ground_station.service.bus_messages import EventMessage, FrameMessage, PayloadMessage
 from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter, path_of
 from ground_station.service.processes import Child, Children, ServiceError, Spec
 from pi_firmware.wire.config import differences
@@ -87,9 +87,9 @@ def test_a_process_that_falls_silent_is_killed_and_started_anew(modules: Path) -
     child.step()
     first = child.pid
     assert first is not None and not child.living
-    child.beat(first + 1)  # of one that is long gone
+    child.heartbeat(first + 1)  # of one that is long gone
     assert not child.living
-    child.beat(first)
+    child.heartbeat(first)
     assert child.living
     clock.now_s += 9.9
     assert child.step() == "" and child.living
@@ -134,7 +134,7 @@ def test_a_later_process_waits_for_the_needed_ones_at_the_first_start_only(modul
         for _ in range(20):
             children.step()
         assert awaited.pid is not None and not waiting.started
-        awaited.beat(awaited.pid)
+        awaited.heartbeat(awaited.pid)
         children.step()
         assert waiting.started
         os.kill(awaited.pid, signal.SIGKILL)  # from here on none waits for the other
@@ -169,18 +169,24 @@ def _runs(pid: int) -> bool:
 
 def test_notes_cross_the_bus_and_what_is_none_is_dropped(bus_folder: Path) -> None:
     with Bus(bus_folder, "one") as one, Bus(bus_folder, "two") as two:
-        heard: list[tuple[str, EventNote]] = []
-        two.hear(notes.EVENT, EventNote, lambda payload, note: heard.append((payload, note)))
-        newest = two.newest(notes.PAYLOAD, PayloadNote, "blimp-1")
-        event = EventNote(1, "station", notes.INFO, "hello", "zwölf °")
-        until(lambda: bool(heard), lambda: one.say(notes.EVENT, "blimp-1", event))
+        heard: list[tuple[str, EventMessage]] = []
+        two.subscribe(
+            bus_messages.EVENT, EventMessage, lambda payload, note: heard.append((payload, note))
+        )
+        newest = two.newest(bus_messages.PAYLOAD, PayloadMessage, "blimp-1")
+        event = EventMessage(1, "station", bus_messages.INFO, "hello", "zwölf °")
+        until(lambda: bool(heard), lambda: one.publish(bus_messages.EVENT, "blimp-1", event))
         assert heard[0] == ("blimp-1", event)
         one._session.put("station/event/x", b'{"time_ns": 1}')
         one._session.put("station/event/x", b"\xff")
         until(lambda: two.dropped == 2)
-        one.say(notes.PAYLOAD, "blimp-2", PayloadNote(True, 1))
+        one.publish(bus_messages.PAYLOAD, "blimp-2", PayloadMessage(True, 1))
         for seen_ns in range(1, 6):
-            one.say(notes.PAYLOAD, "blimp-1", PayloadNote(True, seen_ns, lost_share=float("nan")))
+            one.publish(
+                bus_messages.PAYLOAD,
+                "blimp-1",
+                PayloadMessage(True, seen_ns, lost_share=float("nan")),
+            )
         until(lambda: newest.skipped == 4)
         note = newest.take(LIMIT_S)
         assert note is not None and note.seen_ns == 5 and note.lost_share is None
@@ -200,11 +206,15 @@ def test_questions_are_answered_refused_or_not_answered(bus_folder: Path) -> Non
 
     with Bus(bus_folder, "one") as one, Bus(bus_folder, "two") as two:
         one.serve("intake", do)
-        until(lambda: two.ask("intake", {"do": "x"})["done"] is True)
-        assert two.ask("intake", {"do": "x"}) == {"done": True, "reason": "", "asked": {"do": "x"}}
-        assert two.ask("intake", {"do": "refuse"}) == {"done": False, "reason": "not now"}
-        assert two.ask("intake", {"do": "break"})["reason"] == "KeyError: 'inside'"
-        nobody = two.ask("nobody", {}, timeout_s=0.5)
+        until(lambda: two.query("intake", {"do": "x"})["done"] is True)
+        assert two.query("intake", {"do": "x"}) == {
+            "done": True,
+            "reason": "",
+            "asked": {"do": "x"},
+        }
+        assert two.query("intake", {"do": "refuse"}) == {"done": False, "reason": "not now"}
+        assert two.query("intake", {"do": "break"})["reason"] == "KeyError: 'inside'"
+        nobody = two.query("nobody", {}, timeout_s=0.5)
         assert nobody == {"done": False, "reason": "the service's nobody did not answer"}
 
 
@@ -229,8 +239,8 @@ def test_a_picture_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_a_frames_note_survives_json() -> None:
-    note = FrameNote(1, 2, 3, 4, 5, 6, 640, 480, 7, exposure_s=0.01)
-    assert notes.decode(FrameNote, notes.encode(note)) == note
+    note = FrameMessage(1, 2, 3, 4, 5, 6, 640, 480, 7, exposure_s=0.01)
+    assert bus_messages.decode(FrameMessage, bus_messages.encode(note)) == note
 
 
 def test_the_shipped_file_documents_every_key() -> None:

@@ -9,7 +9,7 @@ import pytest
 import web_station as station
 from prometheus_client.parser import text_string_to_metric_families
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 
 P = station.PAYLOAD
 
@@ -19,7 +19,7 @@ P = station.PAYLOAD
 
 def test_the_state_tells_what_was_said(served):
     client, bus, _ = served
-    bus.put(notes.EVENT, P, station.event(text="second"))
+    bus.put(bus_messages.EVENT, P, station.event(text="second"))
     state = client.get("/api/state").json()
     view = state["payloads"][P]
     assert view["alive"] and view["estimate"]["state"] == "TRACKING"
@@ -31,11 +31,13 @@ def test_the_state_tells_what_was_said(served):
 
 def test_alarms_stand_in_the_state_and_are_told_to_the_others(served):
     client, bus, _ = served
-    bus.put(notes.RECORDING, notes.STATION, station.recording(problem="the disk is full"))
+    bus.put(
+        bus_messages.RECORDING, bus_messages.STATION, station.recording(problem="the disk is full")
+    )
     station.until(lambda: client.get("/api/state").json()["alarms"])
     (alarm,) = client.get("/api/state").json()["alarms"]
     assert (alarm["id"], alarm["level"], alarm["payload"]) == ("recording", "alarm", "-")
-    (said,) = [note for kind, _, note in bus.said if kind == notes.EVENT]
+    (said,) = [note for kind, _, note in bus.said if kind == bus_messages.EVENT]
     assert (said.source, said.level, said.name) == ("web", "alarm", "alarm-begins")
 
 
@@ -54,7 +56,7 @@ def value(found, name, **labels):
 
 def test_metrics_tell_the_same_numbers(served):
     client, bus, _ = served
-    bus.put(notes.PROCESS, notes.STATION, station.process(pid=101))
+    bus.put(bus_messages.PROCESS, bus_messages.STATION, station.process(pid=101))
     found = families(client)
     assert value(found, "blimp_frames_total", payload=P, fate="captured") == 100
     assert value(found, "blimp_frames_total", payload=P, fate="localized") == 8
@@ -78,8 +80,8 @@ def test_metrics_tell_the_same_numbers(served):
 def test_no_series_comes_twice_whatever_stands(served):
     client, bus, web = served
     for name in ("intake", "web", "foxglove"):
-        bus.put(notes.PROCESS, notes.STATION, station.process(name, 1))
-        bus.put(notes.PROCESS, notes.STATION, station.process(name, 2))
+        bus.put(bus_messages.PROCESS, bus_messages.STATION, station.process(name, 1))
+        bus.put(bus_messages.PROCESS, bus_messages.STATION, station.process(name, 2))
     web.live.step()
     lines = [line.rpartition(" ")[0] for line in client.get("/metrics").text.splitlines()]
     series = [line for line in lines if not line.startswith("#")]
@@ -90,7 +92,7 @@ def test_no_series_comes_twice_whatever_stands(served):
 def test_latencies_of_a_clock_that_was_stepped_do_not_count(served):
     client, bus, _ = served
     for capture_ns in (0, 1 << 62, None):
-        bus.put(notes.ESTIMATE, P, station.estimate(capture_ns=capture_ns))
+        bus.put(bus_messages.ESTIMATE, P, station.estimate(capture_ns=capture_ns))
     assert value(families(client), "blimp_capture_to_pose_seconds_count", payload=P) == 1
 
 
@@ -186,7 +188,7 @@ def test_what_fails_here_is_one_line_and_no_traceback(served, monkeypatch, capsy
     def fails(*_, **__):
         raise ZeroDivisionError("secret of the station")
 
-    monkeypatch.setattr(bus, "ask", fails)
+    monkeypatch.setattr(bus, "query", fails)
     answer = client.post("/api/recording", json={"active": True})
     assert answer.status_code == 500
     assert answer.json() == {"detail": "the station failed at this; its log says more"}
@@ -226,7 +228,7 @@ def test_only_so_many_wait_for_an_answer(served, monkeypatch):
         assert answer.wait(30.0)
         return {"done": True}
 
-    monkeypatch.setattr(bus, "ask", waits)
+    monkeypatch.setattr(bus, "query", waits)
 
     def post(_):
         return client.post("/api/recording", json={"active": True}).status_code

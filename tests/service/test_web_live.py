@@ -17,7 +17,7 @@ import pytest
 import web_station as station
 import websockets
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.web import live as live_module
 from ground_station.service.web.app import build
 from ground_station.service.web.outbox import SLOTS, TEXTS, Outbox
@@ -78,16 +78,16 @@ def test_a_viewer_is_greeted_with_everything_and_then_told_what_changes(served):
             assert hello["state"]["payloads"][P]["trail"]
             state = await next_of(viewer, "state")
             assert state["payloads"][P]["estimate"]["points_px"] == []
-            bus.put(notes.ESTIMATE, P, station.estimate(77))
+            bus.put(bus_messages.ESTIMATE, P, station.estimate(77))
             assert (await next_of(viewer, "estimate"))["estimate"]["points_px"]
-            bus.put(notes.EVENT, P, station.event(text="now"))
+            bus.put(bus_messages.EVENT, P, station.event(text="now"))
             event = (await next_of(viewer, "event"))["event"]
             assert (event["text"], event["payload"]) == ("now", P)
-            bus.put(notes.RECORDING, "-", station.recording(problem="disk", active=True))
+            bus.put(bus_messages.RECORDING, "-", station.recording(problem="disk", active=True))
             assert (await next_of(viewer, "recording"))["recording"]["problem"] == "disk"
             alarm = await next_of(viewer, "alarm")
             assert alarm["active"] and alarm["alarm"]["id"] == "recording"
-            bus.put(notes.RECORDING, "-", station.recording())
+            bus.put(bus_messages.RECORDING, "-", station.recording())
             while (alarm := await next_of(viewer, "alarm"))["alarm"]["id"] != "recording":
                 pass
             assert not alarm["active"]
@@ -97,9 +97,9 @@ def test_a_viewer_is_greeted_with_everything_and_then_told_what_changes(served):
 
 def test_a_note_of_other_types_ends_nothing(served, capfd):
     web, bus, port = served
-    bus.put(notes.ESTIMATE, P, station.estimate(points_px=None, stage_ms=[], done_ns="x"))
-    bus.put(notes.EVENT, P, station.event(text=None, level=7))
-    bus.put(notes.PAYLOAD, P, station.payload(battery=[], health="x", frames=None))
+    bus.put(bus_messages.ESTIMATE, P, station.estimate(points_px=None, stage_ms=[], done_ns="x"))
+    bus.put(bus_messages.EVENT, P, station.event(text=None, level=7))
+    bus.put(bus_messages.PAYLOAD, P, station.payload(battery=[], health="x", frames=None))
     web.snapshot.set_alarms([])
     web.snapshot._payloads[P].came_ns["frame"] = "what nobody checks"
 
@@ -120,7 +120,7 @@ def test_a_payload_that_goes_is_told(served):
     async def main():
         async with connect(port) as viewer:
             await next_of(viewer, "state")
-            bus.put(notes.PAYLOAD, P, station.payload(alive=False))
+            bus.put(bus_messages.PAYLOAD, P, station.payload(alive=False))
             assert (await next_of(viewer, "gone"))["payload"] == P
 
     run(main())
@@ -128,7 +128,7 @@ def test_a_payload_that_goes_is_told(served):
 
 def test_estimates_are_bounded_in_rate_and_those_of_others_come_seldom(served):
     _, bus, port = served
-    bus.put(notes.PAYLOAD, "blimp-2", station.payload())
+    bus.put(bus_messages.PAYLOAD, "blimp-2", station.payload())
     counted: Counter[str] = Counter()
 
     async def main():
@@ -137,7 +137,7 @@ def test_estimates_are_bounded_in_rate_and_those_of_others_come_seldom(served):
             begin_s = time.monotonic()
             while time.monotonic() - begin_s < 2.0:
                 for name in (P, "blimp-2"):  # a hundred times a second, or as often as can be
-                    bus.put(notes.ESTIMATE, name, station.estimate())
+                    bus.put(bus_messages.ESTIMATE, name, station.estimate())
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(0.01):
                         found = await next_of(viewer, "estimate")
@@ -165,7 +165,7 @@ def test_pictures_are_the_frames_and_come_only_to_who_looks(served, tmp_path):
             for sequence in range(5):
                 slot, stamp = ring.write(image)
                 note = station.frame(slot, stamp, sequence)
-                bus.put(notes.FRAME, P, note)
+                bus.put(bus_messages.FRAME, P, note)
                 found = await next_of(viewer, "video")
                 assert (found["sequence"], found["payload"]) == (sequence, P)
                 assert found["capture_ns"] == note.capture_ns
@@ -179,7 +179,7 @@ def test_pictures_are_the_frames_and_come_only_to_who_looks(served, tmp_path):
 
     run(main())
     station.until(lambda: not web.video._wanted)  # nobody looks: nothing is encoded
-    bus.put(notes.FRAME, P, station.frame())
+    bus.put(bus_messages.FRAME, P, station.frame())
     assert web.video.encoded == 5
 
 
@@ -205,7 +205,7 @@ def test_what_was_shown_is_measured(served):
 
 def test_another_payload_is_chosen(served):
     _, bus, port = served
-    bus.put(notes.PAYLOAD, "blimp-2", station.payload())
+    bus.put(bus_messages.PAYLOAD, "blimp-2", station.payload())
 
     async def main():
         async with connect(port, "/api/live?payload=no-such") as viewer:

@@ -13,9 +13,9 @@ import httpx
 import pytest
 import web_station as station
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus, Router
-from ground_station.service.notes import EventNote, ProcessNote
+from ground_station.service.bus_messages import EventMessage, ProcessMessage
 from ground_station.service.settings import write_run
 
 P = station.PAYLOAD
@@ -42,14 +42,14 @@ def refused(folder) -> str:
 def test_it_serves_what_the_bus_says_beats_and_ends(folder):
     write_run(folder, station.run_of(folder))
     with Bus(folder, "test") as bus, station.web_process(folder) as (process, port):
-        beats: list[ProcessNote] = []
-        bus.hear(notes.PROCESS, ProcessNote, lambda _, note: beats.append(note))
-        events: list[EventNote] = []
-        bus.hear(notes.EVENT, EventNote, lambda _, note: events.append(note))
+        beats: list[ProcessMessage] = []
+        bus.subscribe(bus_messages.PROCESS, ProcessMessage, lambda _, note: beats.append(note))
+        events: list[EventMessage] = []
+        bus.subscribe(bus_messages.EVENT, EventMessage, lambda _, note: events.append(note))
         bus.serve("intake", lambda request: {"values": {"asked": len(request)}})
 
         def flies():
-            station.say_all(bus.say)
+            station.say_all(bus.publish)
             state = httpx.get(f"http://127.0.0.1:{port}/api/state").json()
             return state["payloads"].get(P, {}).get("estimate")
 
@@ -58,7 +58,11 @@ def test_it_serves_what_the_bus_says_beats_and_ends(folder):
         assert next(note.pid for note in beats if note.name == "web") == process.pid
         answer = httpx.post(f"http://127.0.0.1:{port}/api/recording", json={"active": True})
         assert answer.json() == {"done": True, "reason": "", "values": {"asked": 1}}
-        bus.say(notes.RECORDING, notes.STATION, station.recording(problem="the disk is full"))
+        bus.publish(
+            bus_messages.RECORDING,
+            bus_messages.STATION,
+            station.recording(problem="the disk is full"),
+        )
         station.until(lambda: any(note.name == "alarm-begins" for note in events))
         begin_s = time.monotonic()
         process.send_signal(signal.SIGTERM)

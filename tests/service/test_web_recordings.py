@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import web_station as station
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -38,7 +38,9 @@ def test_recordings_are_listed_with_size_and_duration(served, shelf):
     (shelf / "not-one.txt").write_text("x")
     (shelf / "folder.mcap").mkdir()
     (shelf / "link.mcap").symlink_to("/etc/passwd")
-    bus.put(notes.RECORDING, notes.STATION, station.recording(active=True, file="b.mcap"))
+    bus.put(
+        bus_messages.RECORDING, bus_messages.STATION, station.recording(active=True, file="b.mcap")
+    )
     listed = {item["file"]: item for item in client.get("/api/recordings").json()}
     assert set(listed) == {"a.mcap", "b.mcap", "cut.mcap"}
     assert listed["a.mcap"]["duration_s"] == 2.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import web_station as station
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.web import trail
 from ground_station.service.web.snapshot import EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
 
@@ -171,7 +171,7 @@ def test_standing_still_is_no_gap_and_takes_no_room():
 
 def test_a_count_without_end_is_no_number_of_the_document(snapshot):
     for restarts in (1, float("inf")):
-        snapshot.process("", notes.ProcessNote("intake", 100, restarts=restarts))
+        snapshot.process("", bus_messages.ProcessMessage("intake", 100, restarts=restarts))
     document = snapshot.document()
     json.dumps(document, allow_nan=False)
     assert [item["restarts"] for item in document["processes"]] == [None]

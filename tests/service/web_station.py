@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.service import notes
-from ground_station.service.notes import (
-    EstimateNote,
-    EventNote,
-    FrameNote,
-    PayloadNote,
-    ProcessNote,
-    RecordingNote,
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    FrameMessage,
+    PayloadMessage,
+    ProcessMessage,
+    RecordingMessage,
 )
 from ground_station.service.pictures import PictureWriter
 from ground_station.service.settings import (
@@ -45,25 +45,25 @@ WIDTH, HEIGHT = 64, 48
 
 @dataclass
 class SilentBus:
-    """A bus on which `put` says what others would, and `ask` gives the answer that was set."""
+    """A bus on which `put` says what others would, and `query` gives the answer that was set."""
 
     dropped: int = 0
     asked: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     answer: Mapping[str, Any] = field(default_factory=lambda: {"done": True, "reason": ""})
-    said: list[tuple[str, str, notes.Note]] = field(default_factory=list)
+    said: list[tuple[str, str, bus_messages.Message]] = field(default_factory=list)
     _takes: dict[str, list[Callable[[str, Any], None]]] = field(default_factory=dict)
 
-    def hear(self, kind: str, _: type, take: Callable[[str, Any], None]) -> None:
+    def subscribe(self, kind: str, _: type, take: Callable[[str, Any], None]) -> None:
         self._takes.setdefault(kind, []).append(take)
 
-    def say(self, kind: str, payload_id: str, note: notes.Note) -> None:
+    def publish(self, kind: str, payload_id: str, note: bus_messages.Message) -> None:
         self.said.append((kind, payload_id, note))
 
-    def put(self, kind: str, payload_id: str, note: notes.Note) -> None:
+    def put(self, kind: str, payload_id: str, note: bus_messages.Message) -> None:
         for take in self._takes.get(kind, ()):
             take(payload_id, note)
 
-    def ask(self, name: str, request: Mapping[str, Any], timeout_s: float = 5.0) -> Any:
+    def query(self, name: str, request: Mapping[str, Any], timeout_s: float = 5.0) -> Any:
         self.asked.append((name, dict(request)))
         return self.answer
 
@@ -79,18 +79,18 @@ def run_of(folder: Path, **http: Any) -> Run:
     return Run(station, started_ns=time.time_ns())
 
 
-def frame(slot: int = 0, stamp: int = 2, sequence: int = 1, **values: Any) -> FrameNote:
+def frame(slot: int = 0, stamp: int = 2, sequence: int = 1, **values: Any) -> FrameMessage:
     now_ns = time.time_ns()
-    note = FrameNote(
+    note = FrameMessage(
         slot, stamp, sequence, time_ns=now_ns, clock_ns=now_ns, arrival_ns=now_ns,
         width_px=WIDTH, height_px=HEIGHT, ssrc=7, capture_ns=now_ns,
     )  # fmt: skip
     return replace(note, **values)
 
 
-def estimate(sequence: int = 1, **values: Any) -> EstimateNote:
+def estimate(sequence: int = 1, **values: Any) -> EstimateMessage:
     now_ns = time.time_ns()
-    note = EstimateNote(
+    note = EstimateMessage(
         sequence, now_ns, now_ns, done_ns=now_ns, state="TRACKING", capture_ns=now_ns - 40_000_000,
         position_m=[1.0, 2.0, 1.5], quaternion_xyzw=[0.0, 0.0, 0.0, 1.0], covariance=[0.01] * 36,
         position_sigma_m=[0.01] * 9, velocity_mps=[0.1, 0.0, 0.0], heading_deg=12.0, speed_mps=0.1,
@@ -100,9 +100,9 @@ def estimate(sequence: int = 1, **values: Any) -> EstimateNote:
     return replace(note, **values)
 
 
-def payload(**values: Any) -> PayloadNote:
+def payload(**values: Any) -> PayloadMessage:
     now_ns = time.time_ns()
-    note = PayloadNote(
+    note = PayloadMessage(
         alive=True, seen_ns=now_ns, ssrc=7, frames={"captured": 100, "received": 90, "lost": 1},
         stream={"packets": 1000, "packets_lost": 10}, rate_hz=29.9, bitrate_kbps=1500.0,
         clock={"offset_ns": 5, "uncertainty_ns": 100_000}, round_trip_s=0.01,
@@ -113,26 +113,28 @@ def payload(**values: Any) -> PayloadNote:
     return replace(note, **values)
 
 
-def event(**values: Any) -> EventNote:
-    return replace(EventNote(time.time_ns(), "station", notes.INFO, "hello", "a text"), **values)
+def event(**values: Any) -> EventMessage:
+    return replace(
+        EventMessage(time.time_ns(), "station", bus_messages.INFO, "hello", "a text"), **values
+    )
 
 
-def recording(**values: Any) -> RecordingNote:
-    return replace(RecordingNote(active=False, free_MB=50_000.0), **values)
+def recording(**values: Any) -> RecordingMessage:
+    return replace(RecordingMessage(active=False, free_MB=50_000.0), **values)
 
 
-def process(name: str = "intake", pid: int = 100, **values: Any) -> ProcessNote:
-    return replace(ProcessNote(name, pid, memory_MB=80.0, cpu=0.2, uptime_s=5.0), **values)
+def process(name: str = "intake", pid: int = 100, **values: Any) -> ProcessMessage:
+    return replace(ProcessMessage(name, pid, memory_MB=80.0, cpu=0.2, uptime_s=5.0), **values)
 
 
-def say_all(put: Callable[[str, str, notes.Note], None]) -> None:
+def say_all(put: Callable[[str, str, bus_messages.Message], None]) -> None:
     """One note of each kind, as a station with a payload that flies says them."""
-    put(notes.PROCESS, notes.STATION, process())
-    put(notes.RECORDING, notes.STATION, recording())
-    put(notes.PAYLOAD, PAYLOAD, payload())
-    put(notes.FRAME, PAYLOAD, frame())
-    put(notes.ESTIMATE, PAYLOAD, estimate())
-    put(notes.EVENT, PAYLOAD, event())
+    put(bus_messages.PROCESS, bus_messages.STATION, process())
+    put(bus_messages.RECORDING, bus_messages.STATION, recording())
+    put(bus_messages.PAYLOAD, PAYLOAD, payload())
+    put(bus_messages.FRAME, PAYLOAD, frame())
+    put(bus_messages.ESTIMATE, PAYLOAD, estimate())
+    put(bus_messages.EVENT, PAYLOAD, event())
 
 
 def texture(seed: int = 0) -> np.ndarray:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, FrameMessage
 from ground_station.service.foxglove import conversion
-from ground_station.service.notes import EstimateNote, EventNote, FrameNote
 
 Array = npt.NDArray[np.float64]
 
@@ -41,9 +41,9 @@ class Solved:
         return values
 
 
-def stamp_ns(note: FrameNote | EstimateNote) -> int:
+def stamp_ns(note: FrameMessage | EstimateMessage) -> int:
     """When its picture was taken, on this machine's clock; arrival or solution while unknown."""
-    later_ns = note.arrival_ns if isinstance(note, FrameNote) else note.done_ns
+    later_ns = note.arrival_ns if isinstance(note, FrameMessage) else note.done_ns
     for found_ns in (note.capture_ns, later_ns):
         if found_ns is not None and is_time(found_ns):
             return found_ns
@@ -55,13 +55,13 @@ def is_time(value: object) -> bool:
     return type(value) is int and 0 <= value <= LAST_NS
 
 
-def is_event(note: EventNote) -> bool:
+def is_event(note: EventMessage) -> bool:
     """Whether it is text throughout: it is kept, and told to all who come later."""
     words = (note.source, note.level, note.name, note.text)
     return all(isinstance(word, str) for word in words)
 
 
-def solved(note: EstimateNote) -> Solved | None:
+def solved(note: EstimateMessage) -> Solved | None:
     """The note's pose; None when it has none, or one that cannot be."""
     position, quaternion = numbers(note.position_m, 3), numbers(note.quaternion_xyzw, 4)
     if position is None or quaternion is None or not 0.5 < np.linalg.norm(quaternion) < 2:
@@ -75,7 +75,7 @@ def solved(note: EstimateNote) -> Solved | None:
     return Solved(conversion.body_pose(wTo), covariance)
 
 
-def points(note: EstimateNote) -> list[tuple[float, float]]:
+def points(note: EstimateMessage) -> list[tuple[float, float]]:
     """The tracked landmarks' pixels u, v; none when they cannot be."""
     flat = note.points_px
     if not isinstance(flat, list) or len(flat) % 2 or not all(map(_finite, flat)):

@@ -7,10 +7,15 @@ import types
 import typing
 from typing import Any
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    PayloadMessage,
+    RecordingMessage,
+)
 from ground_station.service.foxglove import conversion
 from ground_station.service.foxglove.checks import Solved, stamp_ns
-from ground_station.service.notes import EstimateNote, EventNote, PayloadNote, RecordingNote
 from pi_firmware.wire import messages
 
 _TYPES = {int: "integer", float: "number", str: "string", bool: "boolean", dict: "object"}
@@ -20,7 +25,7 @@ _ELSEWHERE = (
 _MESSAGES = ("battery", "health", "autopilot")
 
 
-def estimate(payload_id: str, note: EstimateNote, pose: Solved | None) -> dict[str, Any]:
+def estimate(payload_id: str, note: EstimateMessage, pose: Solved | None) -> dict[str, Any]:
     """An estimate: `header` and `pose` as in `geometry_msgs/PoseWithCovarianceStamped`.
 
     `pose` is null for a frame that was not solved, `covariance` where none is known: no zeros,
@@ -40,18 +45,18 @@ def estimate(payload_id: str, note: EstimateNote, pose: Solved | None) -> dict[s
             },
             "covariance": None if pose.covariance is None else pose.covariance.ravel().tolist(),
         }
-    rest = notes.as_document(note)
+    rest = bus_messages.as_document(note)
     return document | {name: rest[name] for name in rest if name not in _ELSEWHERE}
 
 
-def event(payload_id: str, note: EventNote) -> dict[str, Any]:
+def event(payload_id: str, note: EventMessage) -> dict[str, Any]:
     """An event and whose it is, "-" for the station's."""
-    return {"payload": payload_id, **notes.as_document(note)}
+    return {"payload": payload_id, **bus_messages.as_document(note)}
 
 
-def status(note: PayloadNote) -> dict[str, Any]:
+def status(note: PayloadMessage) -> dict[str, Any]:
     """A payload's account, without the messages that have topics of their own."""
-    document = notes.as_document(note)
+    document = bus_messages.as_document(note)
     return {name: document[name] for name in document if name not in _MESSAGES[:2]}
 
 
@@ -73,24 +78,24 @@ def estimate_schema() -> dict[str, Any]:
                 ),
                 covariance=numbers,
             ),
-            **_properties(EstimateNote, leave=_ELSEWHERE),
+            **_properties(EstimateMessage, leave=_ELSEWHERE),
         },
     )
 
 
 def event_schema() -> dict[str, Any]:
     """Of `event`."""
-    return _schema("blimp.Event", {"payload": {"type": "string"}, **_properties(EventNote)})
+    return _schema("blimp.Event", {"payload": {"type": "string"}, **_properties(EventMessage)})
 
 
 def recording_schema() -> dict[str, Any]:
-    """Of a `RecordingNote`."""
-    return _schema("blimp.Recording", _properties(RecordingNote))
+    """Of a `RecordingMessage`."""
+    return _schema("blimp.Recording", _properties(RecordingMessage))
 
 
 def status_schema() -> dict[str, Any]:
     """Of `status`."""
-    return _schema("blimp.Payload", _properties(PayloadNote, leave=_MESSAGES[:2]))
+    return _schema("blimp.Payload", _properties(PayloadMessage, leave=_MESSAGES[:2]))
 
 
 def battery_schema() -> dict[str, Any]:

@@ -38,10 +38,10 @@ from foxglove.messages import (
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.estimate import State
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EventMessage
 from ground_station.service.foxglove import conversion
 from ground_station.service.foxglove.checks import Solved
-from ground_station.service.notes import EventNote
 
 MARKER, ELLIPSOID, TRAIL = "marker", "ellipsoid", "trail"
 _LENGTH_M = 0.5
@@ -56,9 +56,9 @@ _COLOURS = {
 _UNKNOWN = (0.6, 0.6, 0.6)
 _BLUE = (0.34, 0.71, 0.91)
 _LEVELS = {
-    notes.INFO: LogLevel.Info,
-    notes.WARNING: LogLevel.Warning,
-    notes.ALARM: LogLevel.Error,
+    bus_messages.INFO: LogLevel.Info,
+    bus_messages.WARNING: LogLevel.Warning,
+    bus_messages.ALARM: LogLevel.Error,
 }
 
 
@@ -198,13 +198,13 @@ def gone(time_ns: int) -> SceneUpdate:
     return SceneUpdate(deletions=[_deletion(name, time_ns) for name in (MARKER, ELLIPSOID)])
 
 
-def log(payload_id: str, note: EventNote, time_ns: int) -> Log:
+def log(payload_id: str, note: EventMessage, time_ns: int) -> Log:
     """An event for the Log panel."""
     return Log(
         timestamp=stamp(time_ns),
         level=_LEVELS.get(note.level, LogLevel.Unknown),
         message=f"{note.name}: {note.text}",
-        name=note.source if payload_id == notes.STATION else f"{payload_id} {note.source}",
+        name=note.source if payload_id == bus_messages.STATION else f"{payload_id} {note.source}",
     )
 
 

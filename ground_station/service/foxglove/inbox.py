@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from ground_station.service.notes import FrameNote
+from ground_station.service.bus_messages import FrameMessage
 
 Task = Callable[[], object]
 _MOST = 2000
@@ -22,7 +22,7 @@ class Inbox:
     def __init__(self) -> None:
         self.dropped = self.skipped = 0
         self._tasks: deque[Task] = deque()
-        self._frames: dict[str, FrameNote] = {}
+        self._frames: dict[str, FrameMessage] = {}
         self._there = threading.Condition()
 
     def put(self, task: Task) -> None:
@@ -34,14 +34,14 @@ class Inbox:
             self._tasks.append(task)
             self._there.notify()
 
-    def frame(self, payload_id: str, note: FrameNote) -> None:
+    def frame(self, payload_id: str, note: FrameMessage) -> None:
         """Leaves a payload's newest frame."""
         with self._there:
             self.skipped += payload_id in self._frames
             self._frames[payload_id] = note
             self._there.notify()
 
-    def take(self, timeout_s: float) -> tuple[list[Task], dict[str, FrameNote]]:
+    def take(self, timeout_s: float) -> tuple[list[Task], dict[str, FrameMessage]]:
         """All there is; waits for something to come."""
         with self._there:
             self._there.wait_for(lambda: self._tasks or self._frames, timeout_s)

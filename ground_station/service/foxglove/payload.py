@@ -17,11 +17,11 @@ from foxglove.channels import (
 )
 
 from ground_station.geometry.camera import Camera
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage, PayloadMessage
 from ground_station.service.foxglove import checks, documents, drawing
 from ground_station.service.foxglove.checks import Solved
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
 from ground_station.service.localizing import frames
-from ground_station.service.notes import EstimateNote, FrameNote, PayloadNote
 from ground_station.service.pictures import PictureReader
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.trail import Trail
@@ -82,11 +82,11 @@ class Payload:
             *self._messages.values(),
         )  # fmt: skip
 
-    def wants(self, note: FrameNote) -> bool:
+    def wants(self, note: FrameMessage) -> bool:
         """Whether a frame is of use, from any thread: someone looks, or its size is another."""
         return self._image.wanted or (note.width_px, note.height_px) != self._size
 
-    def frame(self, note: FrameNote) -> None:
+    def frame(self, note: FrameMessage) -> None:
         """A received frame; its picture is encoded for those who look, as often as is allowed."""
         size = (note.width_px, note.height_px)
         if size != self._size:
@@ -103,7 +103,7 @@ class Payload:
         time_ns = checks.stamp_ns(note)
         self._image.say(lambda: self._encoded(taken, time_ns), time_ns)
 
-    def estimate(self, note: EstimateNote) -> None:
+    def estimate(self, note: EstimateMessage) -> None:
         """A frame's pose, or why there is none."""
         time_ns, pose = checks.stamp_ns(note), checks.solved(note)
         self._state, self._alive = str(note.state)[:32], True
@@ -123,7 +123,7 @@ class Payload:
                 self._trail_s = now_s
                 self._scene.say(lambda: self._line(time_ns), time_ns)
 
-    def status(self, note: PayloadNote) -> None:
+    def status(self, note: PayloadMessage) -> None:
         """What the intake says of it; its messages when they are new."""
         now_ns = time.time_ns()
         told = {"battery": note.battery, "health": note.health, "status": documents.status(note)}

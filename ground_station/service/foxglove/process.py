@@ -18,8 +18,15 @@ from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, P
 
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    FrameMessage,
+    PayloadMessage,
+    RecordingMessage,
+)
 from ground_station.service.cameras import camera_of
 from ground_station.service.foxglove import checks, documents, drawing, log, world
 from ground_station.service.foxglove.inbox import Inbox
@@ -27,13 +34,6 @@ from ground_station.service.foxglove.payload import Payload
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
 from ground_station.service.foxglove.world import World
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.notes import (
-    EstimateNote,
-    EventNote,
-    FrameNote,
-    PayloadNote,
-    RecordingNote,
-)
 from ground_station.service.settings import FoxgloveSettings, StationSettings
 from pi_firmware.wire.errors import BlimpError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
@@ -62,8 +62,8 @@ class Publishing:
         self._context = Context()
         self._payloads: dict[str, Payload] = {}
         self._flown: dict[str, str] = {}  # the map that each payload flies in
-        self._events: deque[tuple[str, EventNote, int]] = deque(maxlen=EVENTS)
-        self._recording: tuple[RecordingNote, int] | None = None
+        self._events: deque[tuple[str, EventMessage, int]] = deque(maxlen=EVENTS)
+        self._recording: tuple[RecordingMessage, int] | None = None
         self._reader = world.Reader(settings.map, self._take_world)
 
         context = self._context
@@ -81,16 +81,16 @@ class Publishing:
 
         log.install(RateLimitedLog(_print))
         self.server = _listen(settings, context, self)
-        bus.hear(notes.FRAME, FrameNote, self._hear_frame)
-        bus.hear(notes.ESTIMATE, EstimateNote, self._later(self._take_estimate))
-        bus.hear(notes.PAYLOAD, PayloadNote, self._later(self._take_status))
-        bus.hear(notes.EVENT, EventNote, self._later(self._take_event))
-        bus.hear(notes.RECORDING, RecordingNote, self._later(self._take_recording))
+        bus.subscribe(bus_messages.FRAME, FrameMessage, self._hear_frame)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._later(self._take_estimate))
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._later(self._take_status))
+        bus.subscribe(bus_messages.EVENT, EventMessage, self._later(self._take_event))
+        bus.subscribe(bus_messages.RECORDING, RecordingMessage, self._later(self._take_recording))
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set."""
         while not stop.is_set():
-            self._bus.beat()
+            self._bus.heartbeat()
             tasks, frames = self._inbox.take(_POLL_S)
             for task in tasks:
                 self._do(task)
@@ -114,25 +114,25 @@ class Publishing:
     def _later(self, take: Callable[[str, Any], None]) -> Callable[[str, Any], None]:
         return lambda payload_id, note: self._inbox.put(functools.partial(take, payload_id, note))
 
-    def _hear_frame(self, payload_id: str, note: FrameNote) -> None:
+    def _hear_frame(self, payload_id: str, note: FrameMessage) -> None:
         known = self._payloads.get(payload_id)
         if known is None or known.wants(note):
             self._inbox.frame(payload_id, note)
 
-    def _take_frame(self, payload_id: str, note: FrameNote) -> None:
+    def _take_frame(self, payload_id: str, note: FrameMessage) -> None:
         if payload := self._payload(payload_id):
             payload.frame(note)
 
-    def _take_estimate(self, payload_id: str, note: EstimateNote) -> None:
+    def _take_estimate(self, payload_id: str, note: EstimateMessage) -> None:
         if payload := self._payload(payload_id):
             payload.estimate(note)
             self._follow(payload_id, note.map)
 
-    def _take_status(self, payload_id: str, note: PayloadNote) -> None:
+    def _take_status(self, payload_id: str, note: PayloadMessage) -> None:
         if payload := self._payload(payload_id):
             payload.status(note)
 
-    def _take_event(self, payload_id: str, note: EventNote) -> None:
+    def _take_event(self, payload_id: str, note: EventMessage) -> None:
         if not checks.is_event(note):
             return
         time_ns = note.time_ns if checks.is_time(note.time_ns) else time.time_ns()
@@ -140,7 +140,7 @@ class Publishing:
         self._event.say(lambda: documents.event(payload_id, note), time_ns)
         self._log.say(lambda: drawing.log(payload_id, note, time_ns), time_ns)
 
-    def _take_recording(self, _: str, note: RecordingNote) -> None:
+    def _take_recording(self, _: str, note: RecordingMessage) -> None:
         self._recording = (note, time.time_ns())
         for make, log_ns in self._recalled():
             self._recorded.say(make, log_ns)
@@ -199,7 +199,7 @@ class Publishing:
     def _recalled(self) -> Iterator[tuple[Make, int]]:
         if self._recording is not None:
             note, log_ns = self._recording
-            yield functools.partial(notes.as_document, note), log_ns
+            yield functools.partial(bus_messages.as_document, note), log_ns
 
     # The map
 

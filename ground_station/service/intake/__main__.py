@@ -9,13 +9,13 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first imported
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import EstimateMessage, EventMessage
 from ground_station.service.cameras import camera_of
 from ground_station.service.ending import ending
 from ground_station.service.intake import resuming
 from ground_station.service.intake.process import Intake
-from ground_station.service.notes import EstimateNote, EventNote
 from ground_station.service.settings import load_run
 from pi_firmware.wire.errors import BlimpError
 
@@ -28,17 +28,17 @@ def serve(folder: Path, stop: threading.Event) -> None:
     camera = camera_of(settings.map, settings.map.folder)
     with (
         Bus(folder, "intake") as bus,
-        Intake(settings, bus.say, folder=folder, camera=camera) as intake,
+        Intake(settings, bus.publish, folder=folder, camera=camera) as intake,
     ):
         bus.serve("intake", intake.ask)
-        bus.hear(notes.ESTIMATE, EstimateNote, intake.estimated)
-        bus.hear(notes.EVENT, EventNote, intake.heard_event)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, intake.estimated)
+        bus.subscribe(bus_messages.EVENT, EventMessage, intake.heard_event)
         # A disk that hangs, or is full, does not hold up the video.
         about = (intake.recorder, settings.recording, intake.say)
         threading.Thread(target=resuming.begin, args=about, daemon=True).start()
         while not stop.wait(_STEP_S):
             intake.step()
-            bus.beat()
+            bus.heartbeat()
 
 
 def main() -> int:

@@ -16,8 +16,8 @@ from typing import Any
 
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import CAMERA_TABLE
-from ground_station.service import notes
-from ground_station.service.notes import EstimateNote
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage
 from pi_firmware.wire import annexb
 from pi_firmware.wire.recorder import run
 from pi_firmware.wire.recorder.file import RecordingFile
@@ -48,7 +48,7 @@ class Estimated:
     """A pose of one payload, or why there is none."""
 
     payload_id: str
-    note: EstimateNote
+    note: EstimateMessage
     log_ns: int
 
 
@@ -173,7 +173,7 @@ class GroundRun(run.Run):
                 log_ns=item.log_ns,
             )
             self._current.added(120)
-        document = notes.as_document(note)
+        document = bus_messages.as_document(note)
         del document["points_px"]  # they would be more than the video
         text = json.dumps(document, separators=(",", ":")).encode()
         topic = stream.prefix + ESTIMATE_STATE_TOPIC

@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import FrameMessage, Message, PayloadMessage
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.notes import FrameNote, Note, PayloadNote
 from ground_station.service.pictures import PictureWriter
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
@@ -22,7 +22,7 @@ from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import messages
 from pi_firmware.wire.clock_offset import Offset
 
-Say = Callable[[str, str, Note], None]
+Say = Callable[[str, str, Message], None]
 
 _WINDOW_S = 2.0
 _FRESH_S = 3.0
@@ -102,7 +102,7 @@ class Payload:
             self._dropped += 1
             return
         height, width = frame.image.shape[:2]
-        note = FrameNote(
+        note = FrameMessage(
             slot=slot,
             stamp=stamp,
             sequence=frame.sequence,
@@ -119,7 +119,7 @@ class Payload:
             sharpness=frame.sharpness,
             heartbeat=frame.heartbeat,
         )
-        self._say(notes.FRAME, self.id, note)
+        self._say(bus_messages.FRAME, self.id, note)
 
     @property
     def streaming(self) -> bool:
@@ -141,7 +141,7 @@ class Payload:
 
     def note(
         self, state: PayloadState | None, listener: TelemetryListener, *, encrypted: bool
-    ) -> PayloadNote:
+    ) -> PayloadMessage:
         """How it is, for all who want to know."""
         stream, now_s = self.stream, time.monotonic()
         counters = stream.counters if stream is not None else Counters()
@@ -152,7 +152,7 @@ class Payload:
             _, lost_share = self._account.add(stream.ssrc, counters, sent, now_s)
         offset = listener.clock(self.id)
         health = state.health if state is not None else None
-        return PayloadNote(
+        return PayloadMessage(
             alive=self.alive,
             seen_ns=self.seen_ns,
             ssrc=stream.ssrc if stream is not None else None,

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from ground_station.localization.estimate import State
-from ground_station.service.notes import EstimateNote
+from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.pose_feed import PoseFeed, told_covariance
 from pi_firmware.wire import messages
 
 
-def pose_message(note: EstimateNote, now_ns: int) -> messages.Pose:
-    """What a payload is told of a note, as `pose_feed.pose_message` tells an estimate.
+def pose_message(note: EstimateMessage, now_ns: int) -> messages.Pose:
+    """What a payload is told of a message, as `pose_feed.pose_message` tells an estimate.
 
-    Raises `ValueError` or `TypeError` for a note whose state or numbers are not as agreed.
+    Raises `ValueError` or `TypeError` for a message whose state or numbers are not as agreed.
     """
     state = State(note.state)
     position = quaternion = covariance = None
@@ -40,7 +40,7 @@ def pose_message(note: EstimateNote, now_ns: int) -> messages.Pose:
     )
 
 
-def publish(feed: PoseFeed, payload_id: str, note: EstimateNote) -> None:
+def publish(feed: PoseFeed, payload_id: str, note: EstimateMessage) -> None:
     """Sends one estimate; raises as `pose_message`."""
     feed.send(payload_id, pose_message(note, time.time_ns()))
 

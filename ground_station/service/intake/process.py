@@ -12,13 +12,13 @@ from typing import Any
 
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
-from ground_station.service import memory, notes
+from ground_station.service import bus_messages, memory
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, Message
 from ground_station.service.intake import poses, questions
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.intake.roster import NAMELESS, Roster
-from ground_station.service.notes import EstimateNote, EventNote, Note
 from ground_station.service.pose_feed import PoseFeed
 from ground_station.service.settings import StationSettings
 from ground_station.stream import commands
@@ -38,15 +38,15 @@ _TOLD = 256
 _EARLY, _EARLY_S = 64, 3.0
 
 _LEVELS = {
-    messages.EVENT_FAILED: notes.ALARM,
-    messages.EVENT_BATTERY_CRITICAL: notes.ALARM,
-    messages.EVENT_BATTERY_LOW: notes.WARNING,
-    messages.EVENT_GAUGE_FAILED: notes.WARNING,
-    messages.EVENT_CAMERA_RESTARTED: notes.WARNING,
-    messages.EVENT_ENCODER_RESTARTED: notes.WARNING,
-    messages.EVENT_RADIO_RESTARTED: notes.WARNING,
-    messages.EVENT_RADIO_FAILED: notes.WARNING,
-    messages.EVENT_SOURCE_CUT: notes.WARNING,
+    messages.EVENT_FAILED: bus_messages.ALARM,
+    messages.EVENT_BATTERY_CRITICAL: bus_messages.ALARM,
+    messages.EVENT_BATTERY_LOW: bus_messages.WARNING,
+    messages.EVENT_GAUGE_FAILED: bus_messages.WARNING,
+    messages.EVENT_CAMERA_RESTARTED: bus_messages.WARNING,
+    messages.EVENT_ENCODER_RESTARTED: bus_messages.WARNING,
+    messages.EVENT_RADIO_RESTARTED: bus_messages.WARNING,
+    messages.EVENT_RADIO_FAILED: bus_messages.WARNING,
+    messages.EVENT_SOURCE_CUT: bus_messages.WARNING,
 }
 _MESSAGES: dict[str, type[messages.Message]] = {
     keys.BATTERY: messages.Battery,
@@ -154,13 +154,13 @@ class Intake:
             self._follow()
         if now_s >= self._due_s["recording"]:
             self._due_s["recording"] = now_s + _RECORDING_S
-            self._say(notes.RECORDING, notes.STATION, self.recorder.state())
+            self._say(bus_messages.RECORDING, bus_messages.STATION, self.recorder.state())
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Answers a question of the bus; raises a `BlimpError` for what cannot be done."""
         return questions.answer(request, self.recorder, self._listener.session)
 
-    def estimated(self, payload_id: str, note: EstimateNote) -> None:
+    def estimated(self, payload_id: str, note: EstimateMessage) -> None:
         """Takes a pose: it goes to its payload, and into the recording."""
         with contextlib.suppress(ValueError, TypeError, BlimpError):
             poses.publish(self._feed, payload_id, note)
@@ -168,13 +168,13 @@ class Intake:
 
     def say(self, name: str, level: str, text: str) -> None:
         """Says an event of the recorder's."""
-        self._event("intake", level, name, text, notes.STATION)
+        self._event("intake", level, name, text, bus_messages.STATION)
         self._due_s["recording"] = 0.0
 
-    def heard_event(self, payload_id: str, note: EventNote) -> None:
+    def heard_event(self, payload_id: str, note: EventMessage) -> None:
         """Takes another process's event, for the recording."""
         if note.source not in ("intake", "payload"):
-            self.recorder.note(notes.EVENT, payload_id, note)
+            self.recorder.note(bus_messages.EVENT, payload_id, note)
 
     def _make(self, payload_id: str) -> Payload:
         payload = Payload(payload_id, self._folder, self._say, self.recorder)
@@ -216,7 +216,7 @@ class Intake:
             self._pass_on(payload_id, event)
 
     def _pass_on(self, payload_id: str, event: messages.Event) -> None:
-        level = _LEVELS.get(event.name, notes.INFO)
+        level = _LEVELS.get(event.name, bus_messages.INFO)
         payload = self._roster.get(payload_id)
         if payload is not None and event.name == messages.EVENT_STARTED:
             payload.started_ns = time.time_ns()
@@ -242,10 +242,10 @@ class Intake:
             was_alive, payload.alive = payload.alive, payload.id in living or payload.streaming
             if payload.alive and not was_alive:
                 text = f"{payload.id} is here"
-                self._event("intake", notes.INFO, "payload-appeared", text, payload.id)
+                self._event("intake", bus_messages.INFO, "payload-appeared", text, payload.id)
             elif was_alive and not payload.alive:
                 text = f"{payload.id} is gone"
-                self._event("intake", notes.WARNING, "payload-gone", text, payload.id)
+                self._event("intake", bus_messages.WARNING, "payload-gone", text, payload.id)
                 memory.give_back()
             payload.follow(self.video.stream_of(payload.id))
             stream = payload.stream
@@ -256,13 +256,13 @@ class Intake:
             note = payload.note(
                 self._listener.state(payload.id), self._listener, encrypted=self.video.encrypted
             )
-            self._say(notes.PAYLOAD, payload.id, note)
-            self.recorder.note(notes.PAYLOAD, payload.id, note)
+            self._say(bus_messages.PAYLOAD, payload.id, note)
+            self.recorder.note(bus_messages.PAYLOAD, payload.id, note)
             if payload.id.startswith(NAMELESS) and not payload.alive:
                 self._roster.forget(payload)
         refused = ", ".join(sorted(self._roster.refused))
         text = f"no place for {refused[:100]}: payloads.most" if refused else ""
-        self._tell(notes.STATION, "payloads-too-many", text)
+        self._tell(bus_messages.STATION, "payloads-too-many", text)
 
     def _tell(self, payload_id: str, name: str, problem: str) -> None:
         """Says a problem once, and once that it is over."""
@@ -273,15 +273,15 @@ class Intake:
         if len(self._told) >= _TOLD:  # of payloads that came and went
             self._told.clear()
         self._told[key] = problem
-        level = notes.WARNING if problem else notes.INFO
+        level = bus_messages.WARNING if problem else bus_messages.INFO
         self._event("intake", level, name, problem or "is over", payload_id)
 
     def _event(self, source: str, level: str, name: str, text: str, payload_id: str) -> None:
-        note = EventNote(time.time_ns(), source, level, name, text)
-        self._say(notes.EVENT, payload_id, note)
-        self.recorder.note(notes.EVENT, payload_id, note)
+        note = EventMessage(time.time_ns(), source, level, name, text)
+        self._say(bus_messages.EVENT, payload_id, note)
+        self.recorder.note(bus_messages.EVENT, payload_id, note)
 
-    def _say(self, kind: str, payload_id: str, note: Note) -> None:
+    def _say(self, kind: str, payload_id: str, note: Message) -> None:
         with contextlib.suppress(Exception):  # a bus that is gone comes back, or all end
             self._say_note(kind, payload_id, note)
 

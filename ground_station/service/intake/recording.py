@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ground_station.geometry.camera import Camera
-from ground_station.service import notes
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage, Message, RecordingMessage
 from ground_station.service.intake.files import Estimated, GroundRun, Said
-from ground_station.service.notes import EstimateNote, Note, RecordingNote
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire import keys, messages, sei
@@ -101,27 +101,27 @@ class GroundRecorder(Recorder):
             topic = "/" + keys.key(payload_id, kind)
             active.queue.put(Said(topic, message.SCHEMA, time.time_ns(), text), len(text))
 
-    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+    def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Records a pose, or that there is none."""
         active = self._run
         if active is not None:
             log_ns = note.done_ns if note.capture_ns is None else note.capture_ns
             active.queue.put(Estimated(payload_id, note, log_ns))
 
-    def note(self, kind: str, payload_id: str, note: Note) -> None:
+    def note(self, kind: str, payload_id: str, note: Message) -> None:
         """Records what the service says: events, and how it sees its payloads."""
         active = self._run
         if active is not None:
-            place = "" if payload_id == notes.STATION else f"/{payload_id}"
+            place = "" if payload_id == bus_messages.STATION else f"/{payload_id}"
             topic = f"{STATION_TOPIC}{place}/{kind}"
-            text = notes.encode(note)
+            text = bus_messages.encode(note)
             said = Said(topic, f"blimp.station.{kind}", time.time_ns(), text)
             active.queue.put(said, len(text))
 
-    def state(self) -> RecordingNote:
+    def state(self) -> RecordingMessage:
         """How it goes."""
         file = self.file
-        return RecordingNote(
+        return RecordingMessage(
             active=bool(file),
             file=file,
             size_MB=round(self.size_MB, 3),
@@ -138,7 +138,7 @@ class GroundRecorder(Recorder):
         super().close(limit_s)
 
     def _level(self) -> str:
-        return notes.ALARM if self.problem else notes.INFO
+        return bus_messages.ALARM if self.problem else bus_messages.INFO
 
     def _watch_disk(self) -> None:
         folder = Path(self._settings.folder).absolute()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
 from pi_firmware.wire.errors import BlimpError
@@ -68,9 +68,13 @@ def begin(recorder: GroundRecorder, settings: RecordingSettings, say: Say) -> No
         cut = None  # the first recording makes the folder
     except OSError as error:
         cut = None
-        say(CUT, notes.WARNING, f"recording.folder '{settings.folder}': {error.strerror or error}")
+        say(
+            CUT,
+            bus_messages.WARNING,
+            f"recording.folder '{settings.folder}': {error.strerror or error}",
+        )
     if cut is not None and not _goes_on(cut, settings, now_ns):
-        say(CUT, notes.INFO, f"{cut.file} was cut and does not go on (recording.resume_s)")
+        say(CUT, bus_messages.INFO, f"{cut.file} was cut and does not go on (recording.resume_s)")
         cut = None
     try:
         if cut is None:
@@ -91,7 +95,7 @@ def _resume(recorder: GroundRecorder, cut: Cut, say: Say) -> None:
     text = f"{cut.file} was cut and has no index; {file} goes on"
     if cut.until_ns is not None:
         text += f", {max(0.0, 1e-9 * (time.time_ns() - cut.until_ns)):.1f} s between them are lost"
-    say(notes.RECORDING_RESUMED, notes.WARNING, text)
+    say(bus_messages.RECORDING_RESUMED, bus_messages.WARNING, text)
     recorder.resumed = text
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ground_station.geometry.poses import to_quaternion
 from ground_station.localization.estimate import Observations, PoseEstimate, State
-from ground_station.service.notes import EstimateNote, FrameNote
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 
 Array = npt.NDArray[np.float64]
 
@@ -74,8 +74,8 @@ def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float
 
 
 def estimate_note(
-    frame: FrameNote, estimate: PoseEstimate, accounts: Accounts, map_name: str, done_ns: int
-) -> EstimateNote:
+    frame: FrameMessage, estimate: PoseEstimate, accounts: Accounts, map_name: str, done_ns: int
+) -> EstimateMessage:
     """An estimate as the other processes take it; `done_ns` is this machine's wall clock.
 
     What is not finite is not told: without a finite pose the frame counts as LOST.
@@ -92,7 +92,7 @@ def estimate_note(
         else:
             covariance = None
     velocity = world_velocity(wTc, estimate.twist)
-    return EstimateNote(
+    return EstimateMessage(
         sequence=frame.sequence,
         time_ns=frame.time_ns,
         clock_ns=frame.clock_ns,
@@ -122,17 +122,17 @@ def estimate_note(
 
 
 def unsolved_note(
-    frame: FrameNote,
+    frame: FrameMessage,
     state: State,
     reason: str,
     accounts: Accounts,
     map_name: str,
     done_ns: int,
     estimate: PoseEstimate | None = None,
-) -> EstimateNote:
+) -> EstimateMessage:
     """A frame without a pose, and why; `estimate` where the localizer saw it."""
     counts = None if estimate is None else estimate.counts
-    return EstimateNote(
+    return EstimateMessage(
         sequence=frame.sequence,
         time_ns=frame.time_ns,
         clock_ns=frame.clock_ns,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.recording.frames import plausible_exposure_s
-from ground_station.service.notes import FrameNote
+from ground_station.service.bus_messages import FrameMessage
 from ground_station.service.pictures import PictureReader
 
 GONE = "its picture was overwritten before it was read"
@@ -22,13 +22,13 @@ _WHOLE = (
 class Taken:
     """A frame with its picture (H, W) uint8; `exposure_s` is None where it cannot be."""
 
-    note: FrameNote
+    note: FrameMessage
     image: npt.NDArray[np.uint8]
     exposure_s: float | None
 
 
-def fault_of(note: FrameNote) -> str:
-    """What makes a note impossible, in words; "" when nothing does.
+def fault_of(note: FrameMessage) -> str:
+    """What makes a message impossible, in words; "" when nothing does.
 
     A note's constructor takes any JSON value for any field.
     """
@@ -42,8 +42,8 @@ def fault_of(note: FrameNote) -> str:
     return ""
 
 
-def take(pictures: PictureReader, note: FrameNote) -> Taken | str:
-    """The frame of a note, or why there is none, in words."""
+def take(pictures: PictureReader, note: FrameMessage) -> Taken | str:
+    """The frame of a message, or why there is none, in words."""
     if fault := fault_of(note):
         return fault
     image = pictures.read(note.slot, note.stamp)

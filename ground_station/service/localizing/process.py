@@ -14,14 +14,14 @@ from typing import Any
 from ground_station.errors import GroundStationError, MapError
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import EventMessage, FrameMessage
 from ground_station.service.localizing import derive, frames
 from ground_station.service.localizing.derive import Accounts
 from ground_station.service.localizing.frames import Taken
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.notes import EventNote, FrameNote
 from ground_station.service.overload import Overload
 from ground_station.service.pictures import PictureReader
 from ground_station.service.settings import StationSettings
@@ -56,8 +56,10 @@ class Localizing:
         self._failed = 0
         self._own, self._overload = Accounts(), Overload()
         self._told_s = 0.0
-        self._complain = RateLimitedLog(lambda name, text: self._event(notes.WARNING, name, text))
-        self._newest = bus.newest(notes.FRAME, FrameNote, payload_id)
+        self._complain = RateLimitedLog(
+            lambda name, text: self._event(bus_messages.WARNING, name, text)
+        )
+        self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id)
         self._loader.begin(Path(settings.map.folder))
         bus.serve(bus.process, self._do)
 
@@ -69,20 +71,20 @@ class Localizing:
     def run(self, stop: threading.Event) -> int:
         """Until `stop` is set: 0, or `RESTART` after too many failures in a row."""
         while not stop.is_set():
-            self._bus.beat()
+            self._bus.heartbeat()
             self._take_map()
             note = self._newest.take(_POLL_S)
             if note is not None:
                 self._frame(note)
             if self._failed >= _END_AFTER:
                 text = f"{self._failed} frames in a row failed; the localizer starts anew"
-                self._event(notes.ALARM, "localizer-failed", text)
+                self._event(bus_messages.ALARM, "localizer-failed", text)
                 return RESTART
         return 0
 
     # Frames
 
-    def _frame(self, note: FrameNote) -> None:
+    def _frame(self, note: FrameMessage) -> None:
         if self._localizer is None:
             self._skip()
             self._tell_waiting(note)
@@ -99,7 +101,7 @@ class Localizing:
     def _skip(self) -> None:
         self._own = replace(self._own, skipped=self._own.skipped + 1)
 
-    def _follow_stream(self, localizer: Localizer, note: FrameNote) -> None:
+    def _follow_stream(self, localizer: Localizer, note: FrameMessage) -> None:
         """Begins anew where another stream does: the payload was restarted, or its replay was."""
         last, self._stream = self._stream, (note.ssrc, note.time_ns)
         another = last is not None and (note.ssrc != last[0] or note.time_ns < last[1])
@@ -133,7 +135,7 @@ class Localizing:
         said = self._overload.watch(
             localizer, time.monotonic(), accounts.processed, accounts.skipped
         )
-        self._bus.say(notes.ESTIMATE, self._payload_id, replace(told, overload=said))
+        self._bus.publish(bus_messages.ESTIMATE, self._payload_id, replace(told, overload=said))
 
     def _fail(self, localizer: Localizer, reason: str) -> None:
         self._failed += 1
@@ -155,17 +157,17 @@ class Localizing:
             self._failed = 0
             count = len(loading.localizer.map.landmarks)
             text = f"the map '{loading.name}' is in use: {count} landmarks"
-            self._event(notes.INFO, "map-loaded", text)
+            self._event(bus_messages.INFO, "map-loaded", text)
         loading.taken.set()
 
     def _refuse(self, loading: Loading) -> None:
         kept = f"; '{self._map}' stays in use" if self._map else ""
         if not self._map:
             self._waiting = f"no map: {loading.refused}"
-        level = notes.WARNING if self._map else notes.ALARM
+        level = bus_messages.WARNING if self._map else bus_messages.ALARM
         self._event(level, "map-refused", f"{loading.refused}{kept}")
 
-    def _tell_waiting(self, note: FrameNote) -> None:
+    def _tell_waiting(self, note: FrameMessage) -> None:
         """Without a map a frame's state says so, each second: an event may have been missed."""
         now_s = time.monotonic()
         if now_s - self._told_s < _WAITING_EVERY_S or frames.fault_of(note):
@@ -173,7 +175,7 @@ class Localizing:
         self._told_s = now_s
         about = (self.accounts, "", time.time_ns())
         told = derive.unsolved_note(note, State.INITIALIZING, self._waiting, *about)
-        self._bus.say(notes.ESTIMATE, self._payload_id, told)
+        self._bus.publish(bus_messages.ESTIMATE, self._payload_id, told)
 
     # Questions, on a thread of the bus
 
@@ -183,7 +185,7 @@ class Localizing:
             if self._localizer is None:
                 raise LocalizingError(f"nothing to search: {self._waiting}")
             self._forget.set()
-            self._event(notes.INFO, "relocalize", "asked to forget the pose and to search")
+            self._event(bus_messages.INFO, "relocalize", "asked to forget the pose and to search")
             return {}
         if what == "map":
             return self._choose_map(request.get("name"))
@@ -198,5 +200,5 @@ class Localizing:
         return {"map": loading.name, "loading": False}
 
     def _event(self, level: str, name: str, text: str) -> None:
-        note = EventNote(time.time_ns(), "localizer", level, name, text)
-        self._bus.say(notes.EVENT, self._payload_id, note)
+        note = EventMessage(time.time_ns(), "localizer", level, name, text)
+        self._bus.publish(bus_messages.EVENT, self._payload_id, note)

@@ -66,7 +66,7 @@ async def _serve(folder: Path) -> None:
         if not is_loopback(http.host):
             print(f"web: {_EXPOSED.format(host=http.host)}", file=sys.stderr, flush=True)
         while not stop.is_set() and not task.done():
-            bus.beat()  # from this loop: one that hangs is silent
+            bus.heartbeat()  # from this loop: one that hangs is silent
             try:
                 async with asyncio.timeout(_BEAT_S):
                     await stop.wait()

@@ -17,9 +17,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from ground_station import __version__
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.notes import EstimateNote
+from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.settings import Run
 from ground_station.service.web import control, live, maps, pages, problems, recordings, state
 from ground_station.service.web.access import Access
@@ -96,7 +96,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loops[:] = [asyncio.get_running_loop()]
         snapshot.listen(bus)
-        bus.hear(notes.ESTIMATE, EstimateNote, snapshot.careful(metrics.estimate))
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, snapshot.careful(metrics.estimate))
         viewers.listen(bus, loops[0])
         ticking = asyncio.create_task(viewers.tick())
         try:

@@ -24,10 +24,10 @@ _TIMEOUT_S = 7.0
 INTAKE = "intake"
 
 
-class Asks(Protocol):
+class Queries(Protocol):
     """The bus, as far as it is needed here."""
 
-    def ask(
+    def query(
         self, name: str, request: Mapping[str, Any], timeout_s: float = ...
     ) -> Mapping[str, Any]: ...
 
@@ -35,7 +35,7 @@ class Asks(Protocol):
 class Control:
     """Asks the service's processes, a few at a time."""
 
-    def __init__(self, bus: Asks, snapshot: Snapshot) -> None:
+    def __init__(self, bus: Queries, snapshot: Snapshot) -> None:
         self._bus, self._snapshot = bus, snapshot
         self._free = threading.BoundedSemaphore(_AT_ONCE)
 
@@ -44,7 +44,7 @@ class Control:
         if not self._free.acquire(blocking=False):
             raise Busy(f"{_AT_ONCE} requests wait for an answer already")
         try:
-            answer = self._bus.ask(name, request, timeout_s=_TIMEOUT_S)
+            answer = self._bus.query(name, request, timeout_s=_TIMEOUT_S)
         finally:
             self._free.release()
         values = answer.get("values")

@@ -14,9 +14,14 @@ from typing import Any
 from fastapi import APIRouter, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
-from ground_station.service import alarms, notes
+from ground_station.service import alarms, bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.notes import EstimateNote, EventNote, FrameNote, RecordingNote
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    FrameMessage,
+    RecordingMessage,
+)
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.access import Buckets
 from ground_station.service.web.metrics import Metrics
@@ -69,7 +74,7 @@ class Live:
         self._viewers: set[_Viewer] = set()
         self._alarms: dict[str, alarms.Standing] = {}
         self._alive: frozenset[str] = frozenset()
-        self._say: Callable[[str, EventNote], None] = lambda *_: None
+        self._say: Callable[[str, EventMessage], None] = lambda *_: None
 
     # What the bus says
 
@@ -83,14 +88,14 @@ class Live:
 
             return hand_over
 
-        bus.hear(notes.ESTIMATE, EstimateNote, later(self.estimate))
-        bus.hear(notes.EVENT, EventNote, later(self.event))
-        bus.hear(notes.RECORDING, RecordingNote, later(self.recording))
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, later(self.estimate))
+        bus.subscribe(bus_messages.EVENT, EventMessage, later(self.event))
+        bus.subscribe(bus_messages.RECORDING, RecordingMessage, later(self.recording))
         if self.video is not None:
-            bus.hear(notes.FRAME, FrameNote, self.video.frame)
-        self._say = lambda payload_id, note: bus.say(notes.EVENT, payload_id, note)
+            bus.subscribe(bus_messages.FRAME, FrameMessage, self.video.frame)
+        self._say = lambda payload_id, note: bus.publish(bus_messages.EVENT, payload_id, note)
 
-    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+    def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Each viewer gets its own payload's at once, those of others now and then."""
         now_s = time.monotonic()
         texts: dict[bool, str] = {}
@@ -104,20 +109,20 @@ class Live:
             if len(viewer.due_s) > PAYLOADS:
                 viewer.due_s.clear()
             if own not in texts:
-                document = notes.as_document(note)
+                document = bus_messages.as_document(note)
                 document["points_px"] = document["points_px"][:600] if own else []
                 texts[own] = _text("estimate", payload=payload_id, estimate=document)
             viewer.outbox.replace(f"estimate/{payload_id}", texts[own])
 
-    def event(self, payload_id: str, note: EventNote) -> None:
+    def event(self, payload_id: str, note: EventMessage) -> None:
         """Everybody is told."""
-        document = notes.as_document(note)
+        document = bus_messages.as_document(note)
         document["text"] = str(document["text"])[:TEXT]
         self._tell(_text("event", event={**document, "payload": payload_id}))
 
-    def recording(self, _: str, note: RecordingNote) -> None:
+    def recording(self, _: str, note: RecordingMessage) -> None:
         """Everybody is told the newest."""
-        text = _text("recording", recording=notes.as_document(note))
+        text = _text("recording", recording=bus_messages.as_document(note))
         for viewer in self._viewers:
             viewer.outbox.replace("recording", text)
 
@@ -135,7 +140,7 @@ class Live:
         while True:
             try:
                 self.step()
-            except Exception:  # a note with values of other types than its own
+            except Exception:  # a message with values of other types than its own
                 if not complained:
                     traceback.print_exc(file=sys.stderr)
                 complained = True
@@ -167,11 +172,11 @@ class Live:
 
     def _alarm(self, alarm: alarms.Alarm, active: bool) -> None:
         self._tell(_text("alarm", active=active, alarm=vars(alarm)))
-        level, word = (alarm.level, "begins") if active else (notes.INFO, "is over")
+        level, word = (alarm.level, "begins") if active else (bus_messages.INFO, "is over")
         text = f"alarm {word}: {alarm.text}"
         name = "alarm-begins" if active else "alarm-over"
         with contextlib.suppress(Exception):  # the bus may be what fails
-            self._say(alarm.payload, EventNote(time.time_ns(), "web", level, name, text))
+            self._say(alarm.payload, EventMessage(time.time_ns(), "web", level, name, text))
 
     def _tell(self, text: str) -> None:
         for viewer in self._viewers:

@@ -24,7 +24,7 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_late
 from prometheus_client.registry import Collector
 
 from ground_station.localization.estimate import State
-from ground_station.service.notes import EstimateNote
+from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.web.snapshot import Snapshot
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
@@ -80,7 +80,7 @@ class Metrics:
         )
         self.registry.register(_Notes(self))
 
-    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+    def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Counts a pose's latency and the time of its stages."""
         if payload_id not in self._snapshot.payload_ids():
             return
@@ -144,7 +144,7 @@ class _Notes(Collector):
             "blimp_viewers", "Live connections.", value=float(self._metrics.viewers())
         )
         dropped = CounterMetricFamily(
-            "blimp_bus_dropped", "What this process heard on the bus that was no note."
+            "blimp_bus_dropped", "What this process heard on the bus that was no message."
         )
         dropped.add_metric([], self._metrics.bus_dropped())
         yield dropped

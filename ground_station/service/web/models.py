@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
-from ground_station.service.notes import EstimateNote, PayloadNote, RecordingNote
+from ground_station.service.bus_messages import EstimateMessage, PayloadMessage, RecordingMessage
 
 PAYLOAD_PATTERN = "^[a-z0-9][a-z0-9_-]{0,31}$"
 MAP_PATTERN = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
@@ -98,8 +98,8 @@ class ProcessModel(BaseModel):
 class PayloadModel(BaseModel):
     """A payload; what `stale` names is older than it may be to speak of now."""
 
-    payload: PayloadNote | None
-    estimate: EstimateNote | None
+    payload: PayloadMessage | None
+    estimate: EstimateMessage | None
     alive: bool
     alive_s: float | None
     gone_s: float | None
@@ -140,7 +140,7 @@ class StateModel(BaseModel):
     station: StationModel
     processes: list[ProcessModel]
     payloads: dict[str, PayloadModel]
-    recording: RecordingNote | None
+    recording: RecordingMessage | None
     recording_age_s: float | None
     events: list[EventModel]
     alarms: list[AlarmModel]

@@ -15,16 +15,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.notes import (
-    EstimateNote,
-    EventNote,
-    FrameNote,
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    FrameMessage,
     N,
-    PayloadNote,
-    ProcessNote,
-    RecordingNote,
+    PayloadMessage,
+    ProcessMessage,
+    RecordingMessage,
 )
 from ground_station.service.settings import Run
 from ground_station.service.web.trail import Trail
@@ -54,8 +54,8 @@ _ENDED = (messages.EVENT_STOPPED, messages.EVENT_END_OF_STREAM)
 
 @dataclass
 class _Payload:
-    payload: PayloadNote | None = None
-    estimate: EstimateNote | None = None
+    payload: PayloadMessage | None = None
+    estimate: EstimateMessage | None = None
     came_ns: dict[str, int] = field(default_factory=dict)
     message_ns: dict[str, Any] = field(default_factory=dict)
     state_ns: int = 0
@@ -68,7 +68,7 @@ class _Payload:
 
 @dataclass
 class _Process:
-    note: ProcessNote
+    note: ProcessMessage
     came_ns: int
     restarts: int = 0
     restarted_ns: int | None = None
@@ -88,7 +88,7 @@ class Snapshot:
         self._payloads: OrderedDict[str, _Payload] = OrderedDict()
         self._processes: dict[str, _Process] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
-        self._recording: RecordingNote | None = None
+        self._recording: RecordingMessage | None = None
         self._recording_ns = 0
         self._alarms: list[dict[str, Any]] = []
         self.dropped = 0
@@ -97,15 +97,15 @@ class Snapshot:
 
     def listen(self, bus: Bus) -> None:
         """Hears everything on the bus."""
-        bus.hear(notes.FRAME, FrameNote, self.careful(self.frame))
-        bus.hear(notes.ESTIMATE, EstimateNote, self.careful(self.estimate))
-        bus.hear(notes.PAYLOAD, PayloadNote, self.careful(self.payload))
-        bus.hear(notes.EVENT, EventNote, self.careful(self.event))
-        bus.hear(notes.RECORDING, RecordingNote, self.careful(self.recording))
-        bus.hear(notes.PROCESS, ProcessNote, self.careful(self.process))
+        bus.subscribe(bus_messages.FRAME, FrameMessage, self.careful(self.frame))
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self.careful(self.estimate))
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self.careful(self.payload))
+        bus.subscribe(bus_messages.EVENT, EventMessage, self.careful(self.event))
+        bus.subscribe(bus_messages.RECORDING, RecordingMessage, self.careful(self.recording))
+        bus.subscribe(bus_messages.PROCESS, ProcessMessage, self.careful(self.process))
 
     def careful(self, take: Callable[[str, N], None]) -> Callable[[str, N], None]:
-        """`take`, which drops and counts a note that it cannot use."""
+        """`take`, which drops and counts a message that it cannot use."""
 
         def taken(payload_id: str, note: N) -> None:
             try:
@@ -121,13 +121,13 @@ class Snapshot:
 
     # What comes
 
-    def frame(self, payload_id: str, _: FrameNote) -> None:
+    def frame(self, payload_id: str, _: FrameMessage) -> None:
         """A frame was received."""
         with self._lock:
             if (item := self._item(payload_id)) is not None:
                 item.came_ns["frame"] = self._clock_ns()
 
-    def estimate(self, payload_id: str, note: EstimateNote) -> None:
+    def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """A frame was localized, or not."""
         with self._lock:
             item = self._item(payload_id)
@@ -143,7 +143,7 @@ class Snapshot:
             if note.position_m and note.state in ("TRACKING", "DEGRADED"):
                 item.trail.add(now_ns, note.position_m, begins=note.relocalized)
 
-    def payload(self, payload_id: str, note: PayloadNote) -> None:
+    def payload(self, payload_id: str, note: PayloadMessage) -> None:
         """How a payload is."""
         with self._lock:
             item = self._item(payload_id)
@@ -169,30 +169,34 @@ class Snapshot:
             item.came_ns["payload"] = now_ns
             item.payload = note
 
-    def event(self, payload_id: str, note: EventNote) -> None:
+    def event(self, payload_id: str, note: EventMessage) -> None:
         """Something happened."""
         note = dataclasses.replace(note, text=str(note.text)[:TEXT], name=str(note.name)[:64])
         with self._lock:
-            self._events.append({**notes.as_document(note), "payload": payload_id})
+            self._events.append({**bus_messages.as_document(note), "payload": payload_id})
             if note.source == "payload" and note.name in _ENDED and payload_id in self._payloads:
                 self._payloads[payload_id].ended = True
 
-    def recording(self, _: str, note: RecordingNote) -> None:
+    def recording(self, _: str, note: RecordingMessage) -> None:
         """How the recording is."""
         with self._lock:
             if self._recording is None and note.resumed:
                 self._catch_up(note)
             self._recording, self._recording_ns = note, self._clock_ns()
 
-    def _catch_up(self, note: RecordingNote) -> None:
+    def _catch_up(self, note: RecordingMessage) -> None:
         """The event that was said before this process listened; call with the lock held."""
         text = str(note.resumed)[:TEXT]
         if all(event["text"] != text for event in self._events):
             time_ns = time.time_ns() - int(1e9 * note.duration_s)
-            event = EventNote(time_ns, "intake", notes.WARNING, notes.RECORDING_RESUMED, text)
-            self._events.append({**notes.as_document(event), "payload": notes.STATION})
+            event = EventMessage(
+                time_ns, "intake", bus_messages.WARNING, bus_messages.RECORDING_RESUMED, text
+            )
+            self._events.append(
+                {**bus_messages.as_document(event), "payload": bus_messages.STATION}
+            )
 
-    def process(self, _: str, note: ProcessNote) -> None:
+    def process(self, _: str, note: ProcessMessage) -> None:
         """A process lives. One with another id than before was started again."""
         now_ns = self._clock_ns()
         with self._lock:
@@ -231,7 +235,7 @@ class Snapshot:
         with self._lock:
             return list(self._events)[-EVENTS_SHOWN:]
 
-    def recording_note(self) -> RecordingNote | None:
+    def recording_note(self) -> RecordingMessage | None:
         """The newest word on the recording."""
         with self._lock:
             return self._recording
@@ -256,7 +260,9 @@ class Snapshot:
                 },
                 "processes": [
                     {
-                        **notes.as_document(dataclasses.replace(item.note, restarts=item.restarts)),
+                        **bus_messages.as_document(
+                            dataclasses.replace(item.note, restarts=item.restarts)
+                        ),
                         "age_s": _age_s(now_ns, item.came_ns),
                         "restarted_s": _age_s(now_ns, item.restarted_ns),
                     }
@@ -266,7 +272,7 @@ class Snapshot:
                     name: self._payload_document(item, now_ns, full)
                     for name, item in self._payloads.items()
                 },
-                "recording": None if recording is None else notes.as_document(recording),
+                "recording": None if recording is None else bus_messages.as_document(recording),
                 "recording_age_s": _age_s(now_ns, self._recording_ns if recording else None),
                 "alarms": list(self._alarms),
             }
@@ -281,8 +287,8 @@ class Snapshot:
             estimate = dataclasses.replace(estimate, points_px=[])
         alive = self._alive(item, now_ns)
         result: dict[str, Any] = {
-            "payload": None if item.payload is None else notes.as_document(item.payload),
-            "estimate": None if estimate is None else notes.as_document(estimate),
+            "payload": None if item.payload is None else bus_messages.as_document(item.payload),
+            "estimate": None if estimate is None else bus_messages.as_document(estimate),
             "alive": alive,
             "alive_s": _age_s(now_ns, item.alive_ns) if alive else None,
             "gone_s": None if alive else _age_s(now_ns, item.heard_ns),

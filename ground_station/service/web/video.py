@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from ground_station.service.notes import FrameNote
+from ground_station.service.bus_messages import FrameMessage
 from ground_station.service.pictures import PictureReader
 
 _LENGTH = struct.Struct(">I")
@@ -22,7 +22,7 @@ _EARLY = 0.25
 Take = Callable[[str, bytes], None]
 
 
-def message(payload_id: str, note: FrameNote, jpeg: bytes) -> bytes:
+def message(payload_id: str, note: FrameMessage, jpeg: bytes) -> bytes:
     """A video message: the header's length (4 bytes, big-endian), the header in JSON, the JPEG."""
     header = {
         "type": "video",
@@ -49,7 +49,7 @@ class Video:
         self.encoded = self.skipped = self.gone = self.failed = 0
         self._there = threading.Condition()
         self._wanted: frozenset[str] = frozenset()
-        self._newest: dict[str, FrameNote] = {}
+        self._newest: dict[str, FrameMessage] = {}
         self._due_s: dict[str, float] = {}
         self._readers: dict[str, PictureReader] = {}
         self._closing = False
@@ -61,7 +61,7 @@ class Video:
         with self._there:
             self._wanted = payload_ids
 
-    def frame(self, payload_id: str, note: FrameNote) -> None:
+    def frame(self, payload_id: str, note: FrameMessage) -> None:
         """A frame was received; returns at once."""
         if payload_id not in self._wanted:
             return
@@ -100,7 +100,7 @@ class Video:
         for reader in self._readers.values():
             reader.close()
 
-    def _encode(self, payload_id: str, note: FrameNote) -> None:
+    def _encode(self, payload_id: str, note: FrameMessage) -> None:
         import cv2
 
         try:

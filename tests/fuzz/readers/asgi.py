@@ -11,7 +11,7 @@ from typing import Any
 
 from pieces import scratch
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.settings import (
     HttpSettings,
     MapSettings,
@@ -34,14 +34,14 @@ class Bus:
     def __init__(self) -> None:
         self.takes: dict[str, list[Callable[[str, Any], None]]] = {}
 
-    def hear(self, kind: str, _: type, take: Callable[[str, Any], None]) -> None:
+    def subscribe(self, kind: str, _: type, take: Callable[[str, Any], None]) -> None:
         """Who listens to a kind."""
         self.takes.setdefault(kind, []).append(take)
 
-    def say(self, *_: object) -> None:
+    def publish(self, *_: object) -> None:
         """To nobody."""
 
-    def ask(self, *_: object, **__: object) -> Mapping[str, Any]:
+    def query(self, *_: object, **__: object) -> Mapping[str, Any]:
         """Whatever it was."""
         return {"done": True, "reason": ""}
 
@@ -62,7 +62,7 @@ def application() -> Web:
     )
     web = build(Run(station, started_ns=time.time_ns()), folder, Bus(), None)  # type: ignore[arg-type]
     web.access.posts = Buckets(1e9, 10**9)
-    web.snapshot.payload("blimp-1", notes.PayloadNote(True, time.time_ns(), 7))
+    web.snapshot.payload("blimp-1", bus_messages.PayloadMessage(True, time.time_ns(), 7))
     return web
 
 

@@ -1,4 +1,4 @@
-"""`ground_station.service.notes`, and what the web process keeps and shows of them."""
+"""`ground_station.service.bus_messages`, and what the web process keeps and shows of them."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import json
 
 from pieces import Picker, as_json, changed, refusing, stretch
 
-from ground_station.service import notes
+from ground_station.service import bus_messages
 from ground_station.service.settings import Run
 from ground_station.service.web.metrics import Metrics
 from ground_station.service.web.snapshot import Snapshot
 
 _EXAMPLES = (
-    notes.FrameNote(0, 2, 1, 2, 3, 4, 640, 480, 7),
-    notes.EstimateNote(
+    bus_messages.FrameMessage(0, 2, 1, 2, 3, 4, 640, 480, 7),
+    bus_messages.EstimateMessage(
         1, 2, 3, 4, "TRACKING", 5, "", [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0], [0.1] * 36, [0.1] * 9,
         points_px=[1.0, 2.0], stage_ms={"pose": 2.0},
     ),
-    notes.PayloadNote(
+    bus_messages.PayloadMessage(
         True, 1, 7, frames={"captured": 3}, stream={"packets": 4}, clock={"offset_ns": 5},
         battery={"time_ns": 1, "voltage": 3.9}, health={"time_ns": 1}, autopilot=None,
     ),
-    notes.EventNote(1, "station", notes.INFO, "hello", "a text"),
-    notes.RecordingNote(True, "flight-1.mcap"),
-    notes.ProcessNote("intake", 100),
+    bus_messages.EventMessage(1, "station", bus_messages.INFO, "hello", "a text"),
+    bus_messages.RecordingMessage(True, "flight-1.mcap"),
+    bus_messages.ProcessMessage("intake", 100),
 )  # fmt: skip
 
 
@@ -48,8 +48,8 @@ def fuzz(data: bytes) -> None:
             text = picker.rest()
         else:
             text = as_json(changed(picker, dataclasses.asdict(example)))
-        with refusing(notes.NoteError):
-            note = notes.decode(type(example), text)
+        with refusing(bus_messages.MessageError):
+            note = bus_messages.decode(type(example), text)
             takes[number]("blimp-1", note)
             if number == 1:
                 snapshot.careful(metrics.estimate)("blimp-1", note)

@@ -1,7 +1,8 @@
 """What the service's processes say to one another: JSON objects on the local bus.
 
-All of them run the same version, so a note has no schema of its own; what does not fit is dropped.
-Times are int nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine's wall clock.
+All of them run the same version, so a message has no schema of its own; what does not fit is
+dropped. Times are int nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine's
+wall clock.
 """
 
 from __future__ import annotations
@@ -18,28 +19,28 @@ FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
 EVENT, RECORDING, PROCESS = "event", "recording", "process"
 KINDS = (FRAME, ESTIMATE, PAYLOAD, EVENT, RECORDING, PROCESS)
 STATION = "-"
-"""Stands for a payload's id where a note is of none."""
+"""Stands for a payload's id where a message is of none."""
 
 INFO, WARNING, ALARM = "info", "warning", "alarm"
 RECORDING_RESUMED = "recording-resumed"
 """An event: a recording that was cut goes on in another file."""
 
-N = TypeVar("N", bound="Note")
+N = TypeVar("N", bound="Message")
 
 _DEEPEST, _FLAT_BRACKETS = 32, 32
 
 
-class NoteError(GroundStationError):
-    """Bytes on the bus that are no note of the kind."""
+class MessageError(GroundStationError):
+    """Bytes on the bus that are no message of the kind."""
 
 
 @dataclass(frozen=True)
-class Note:
-    """Base of all notes."""
+class Message:
+    """Base of all messages."""
 
 
 @dataclass(frozen=True)
-class FrameNote(Note):
+class FrameMessage(Message):
     """A received frame, whose picture lies in the ring at `slot` while `stamp` still holds."""
 
     slot: int
@@ -60,7 +61,7 @@ class FrameNote(Note):
 
 
 @dataclass(frozen=True)
-class EstimateNote(Note):
+class EstimateMessage(Message):
     """A frame's pose, or why there is none.
 
     `quaternion_xyzw` and `position_m` are wTc, `covariance` (36, row by row) is of the right
@@ -99,7 +100,7 @@ class EstimateNote(Note):
 
 
 @dataclass(frozen=True)
-class PayloadNote(Note):
+class PayloadMessage(Message):
     """A payload as the intake sees it, twice a second.
 
     `frames` by fate: captured, gated, sent, discarded (the payload's own account), received, lost,
@@ -125,7 +126,7 @@ class PayloadNote(Note):
 
 
 @dataclass(frozen=True)
-class EventNote(Note):
+class EventMessage(Message):
     """Something that happened; `source` is payload, intake, localizer, web or station."""
 
     time_ns: int
@@ -136,7 +137,7 @@ class EventNote(Note):
 
 
 @dataclass(frozen=True)
-class RecordingNote(Note):
+class RecordingMessage(Message):
     """The ground's own recording, each second."""
 
     active: bool
@@ -150,20 +151,20 @@ class RecordingNote(Note):
 
 
 @dataclass(frozen=True)
-class ProcessNote(Note):
+class ProcessMessage(Message):
     """A process of the service says that it lives."""
 
     name: str
     pid: int
     memory_MB: float = 0.0
-    cpu: float = 0.0  # of one core, since the last note
+    cpu: float = 0.0  # of one core, since the last message
     uptime_s: float = 0.0
     restarts: int = 0
 
 
-def encode(note: Note) -> bytes:
-    """A note as JSON; numbers that are not finite become null, which JSON can say."""
-    document = {item.name: getattr(note, item.name) for item in dataclasses.fields(note)}
+def encode(message: Message) -> bytes:
+    """A message as JSON; numbers that are not finite become null, which JSON can say."""
+    document = {item.name: getattr(message, item.name) for item in dataclasses.fields(message)}
     try:
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     except ValueError:
@@ -171,15 +172,15 @@ def encode(note: Note) -> bytes:
 
 
 def decode(kind: type[N], data: bytes) -> N:
-    """A note of a kind; raises `NoteError` with one line."""
+    """A message of a kind; raises `MessageError` with one line."""
     try:
         document = json.loads(data)
-        # No note of ours has so many; one that nests without end could be read and not be written.
+        # None of ours has so many; one that nests without end could be read and not be written.
         if data.count(b"[") + data.count(b"{") > _FLAT_BRACKETS and _depth(document) > _DEEPEST:
             raise ValueError(f"it nests deeper than {_DEEPEST}")
         return kind(**document)
     except (ValueError, TypeError, RecursionError) as error:
-        raise NoteError(f"{kind.__name__}: {str(error)[:120]}") from None
+        raise MessageError(f"{kind.__name__}: {str(error)[:120]}") from None
 
 
 def _depth(value: Any) -> int:
@@ -192,8 +193,8 @@ def _depth(value: Any) -> int:
     return depth
 
 
-def as_document(note: Note) -> dict[str, Any]:
-    """A note as plain JSON values."""
-    document = {item.name: getattr(note, item.name) for item in dataclasses.fields(note)}
+def as_document(message: Message) -> dict[str, Any]:
+    """A message as plain JSON values."""
+    document = {item.name: getattr(message, item.name) for item in dataclasses.fields(message)}
     told: dict[str, Any] = finite(document)
     return told
