@@ -159,6 +159,13 @@ def test_the_pyramid_is_as_high_as_the_predictions_doubt(doubt_px, levels, monke
     assert len(found.point) > 0.95 * found.sought
 
 
+def test_a_bump_that_no_prediction_doubted_is_followed_all_the_same():
+    wall = Wall()
+    image = wall.picture(poses.pose(np.eye(3), [0.08, 0.0, 0.0]))  # 10 px
+    found = track(wall.keyframe(np.eye(4)), image, np.eye(4), wall.camera, TrackingSettings(), 0.5)
+    assert len(found.point) > 0.95 * found.sought
+
+
 def test_a_predictions_doubt_is_of_the_keyframes_own_points():
     wall = Wall()
     matcher = Matcher(wall.map(), wall.camera, load_preset("default"))
