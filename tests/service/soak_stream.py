@@ -44,9 +44,9 @@ NAME = "localizer"
 RATE_HZ = 30
 STRETCH = FrameRange(0, 450)
 """Of the sample's flight: 15 s there and 15 s back."""
-COVERED_EVERY, COVERED = 600 * RATE_HZ, 2 * RATE_HZ
+COVERED_EVERY, COVERED = 60 * RATE_HZ, 2 * RATE_HZ
 """Frames from one covering of the lens to the next, and how many show nothing."""
-SAMPLE_EVERY = 10 * RATE_HZ
+SAMPLE_EVERY, SAY_EVERY = 10 * RATE_HZ, 600 * RATE_HZ
 SETTLED_S = 300.0
 """Until then buffers, caches and pools may grow; of a short run a sixth."""
 # What would matter, an hour: as of the service's soak, for the same reasons.
@@ -95,15 +95,17 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
             hidden = k >= COVERED_EVERY and k % COVERED_EVERY < COVERED
             told.show(covered if hidden else image, k, round(k * 1e9 / RATE_HZ))
             note = said.get(timeout=LIMIT_S)
+            if note.state == State.LOST.value:
+                time.sleep(1.0 / RATE_HZ)  # frames of no work outrun the search for the camera
             told.estimates.clear()  # or this program would grow
             flown.states[note.state] += 1
             flown.shown, flown.skipped = k + 1, note.skipped
-            flown.lost += hidden and not lost and note.state == State.LOST.value
+            flown.lost += not lost and note.state == State.LOST.value
             flown.found_again += lost and note.state == State.TRACKING.value
-            lost = (lost or hidden) and note.state != State.TRACKING.value
+            lost = note.state == State.LOST.value or (lost and note.state != State.TRACKING.value)
             if k % SAMPLE_EVERY == 0:
                 flown.watch.sample(k / RATE_HZ, {NAME: process.pid})
-            if k % COVERED_EVERY == 0:
+            if k % SAY_EVERY == 0:
                 memory = flown.watch.last_MB()[NAME]
                 print(f"{k / RATE_HZ / 60:5.1f} min {memory:7.1f} MB {k} frames", flush=True)
         flown.took_s = time.monotonic() - start_s
