@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +18,9 @@ _FULL_RANGE = 2  # av.video.reformatter.ColorRange.JPEG
 MAX_PIXELS = 8192 * 4320
 """Parameter sets that claim more are refused: they could ask for gigabytes."""
 
-_LIMITED_TO_FULL = np.clip(np.round((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+_LIMITED_TO_FULL = bytes(
+    np.clip(np.round((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8).tolist()
+)
 """Luma of 16 to 235 (ITU-R BT.601, 2.5.3) to grey of 0 to 255."""
 
 
@@ -52,7 +53,9 @@ def grey(frame: av.VideoFrame) -> npt.NDArray[np.uint8]:
     full = name in _FULL_RANGE_8_BIT or name == "gray" or int(frame.color_range) == _FULL_RANGE
     if full:
         return luma.copy()
-    return np.asarray(cv2.LUT(luma, _LIMITED_TO_FULL))
+    # The intake, which decodes, starts sooner without OpenCV's table.
+    stretched = bytearray(luma.tobytes()).translate(_LIMITED_TO_FULL)
+    return np.frombuffer(stretched, np.uint8).reshape(luma.shape)
 
 
 class Decoder:
