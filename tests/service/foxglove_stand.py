@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -150,12 +150,13 @@ class Client:
     def subscribe(self, *topics: str) -> None:
         """Waits until they are told of, and subscribes."""
         self.until(lambda: all(topic in self.channels for topic in topics), f"{topics}")
-        asked = []
-        for topic in topics:
-            number = self.channels[topic]["id"]
-            self._topics[number] = topic
-            self.received[topic] = []
-            asked.append({"id": number, "channelId": number})
+        self.received |= {topic: [] for topic in topics}
+        self._ask(topics)
+
+    def _ask(self, topics: Iterable[str]) -> None:
+        numbers = {self.channels[topic]["id"]: topic for topic in topics}
+        self._topics |= numbers
+        asked = [{"id": number, "channelId": number} for number in numbers]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
 
     def until(
@@ -195,7 +196,12 @@ class Client:
         if said["op"] == "serverInfo":
             self.info = said
         elif said["op"] == "advertise":
-            self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+            told = {channel["topic"]: channel for channel in said["channels"]}
+            self.channels |= told
+            # A payload that went and came has another channel, as Foxglove itself knows.
+            wanted = told.keys() & self.received.keys()
+            if new := [topic for topic in wanted if told[topic]["id"] not in self._topics]:
+                self._ask(new)
         return True
 
     def _decode(self, topic: str, data: bytes) -> Any:
