@@ -89,6 +89,7 @@ class Localizer:
         self._denied = 0
         self._followed: Followed | None = None
         self._located: Located | None = None
+        self._refused = ""
         self._recent: deque[tuple[int, Image]] = deque(maxlen=following.REMEMBERED)
         self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
         self._seen: npt.NDArray[np.intp] | None = None
@@ -274,7 +275,7 @@ class Localizer:
     def _follow(self, attempt: Attempt, image: Image) -> PoseEstimate:
         relocalized = self._land(attempt)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
-        reason = "searching"
+        reason = f"searching; last refused: {self._refused}" if self._refused else "searching"
         if self._keyframe is not None and attempt.predicted is not None:
             followed = following.follow(
                 self._keyframe, attempt, image, attempt.predicted, self._matcher, self._estimator
@@ -337,6 +338,8 @@ class Localizer:
         attempt.watch.lap("wait")
         attempt.watch.stage_ms["background"] = landed.background_ms
         landed.found.teach(self._matcher.thresholds)
+        if landed.searched:
+            self._refused = landed.reason if landed.keyframe is None else ""
         if landed.keyframe is None:
             self._denied += not landed.searched
             return False

@@ -76,3 +76,14 @@ def test_who_asks_for_smoothed_poses_gets_each_once(room):
     smoothed = [*localizer.smoothed(), *localizer.finish()]
     times = [state.time_ns for state in smoothed]
     assert times == sorted(set(times)) and len(times) >= ROUND - 14
+
+
+def test_a_frame_that_is_sought_says_why_the_last_search_was_refused(room):
+    camera = Standing(room, room.path(1)[1][0])
+    localizer = Localizer(room.map, room.camera, camera, load_preset("default"))
+    other = np.random.default_rng(4).permutation(camera.seen.descriptors)  # of another building
+    camera.seen = Features(camera.seen.keypoints_px, camera.seen.scores, other)
+    reasons = [localizer.process(k * FRAME_NS, camera.image.copy(), k).reason for k in range(ROUND)]
+    assert reasons[1] == "searching"  # the first frame had time for itself; this one waits
+    assert reasons[-1].startswith("searching; last refused: ")
+    assert any(word in reasons[-1] for word in ("matches", "inliers", "alike"))
