@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tomllib
 
 import pytest
 
@@ -66,7 +67,10 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
     shutil.rmtree(flown / "out" / "maps")
     shutil.rmtree(flown / "out" / "runs")
     again, second, said = run(flown, capfd)
-    assert "features of 14 of 14 images" in said  # of the build that was lost
+    (file,) = (flown / "out" / "maps").glob("*/map.toml")
+    cache = tomllib.loads(file.read_text())["built"]["cache"]
+    # By the build that was lost.
+    assert (cache["features_found"], cache["features_made"]) == (14, 0)
     assert again == status and "experiments, jobs: 5" in said
     for one, other in zip(_runs(first), _runs(second), strict=True):
         assert one["localized"] == other["localized"]
