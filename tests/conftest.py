@@ -5,6 +5,7 @@ and those marked `alone`, which measure or need the machine, one by one.
 """
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from browsing import browser, launch  # noqa: F401 - fixtures
 from hypothesis import settings
 
+sys.path.append(str(Path(__file__).with_name("stream")))  # for `receiving`, which many rooms need
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")

@@ -11,10 +11,13 @@ from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import Frame
 from ground_station.recording.video import frame_name
-from ground_station.stream.receiver import Receiver
+from ground_station.stream.assembly import ReceivedFrame
+from ground_station.stream.multi_stream import MultiStreamReceiver
+from ground_station.stream.newest import Newest
 from pi_firmware.wire.video import PORT
 
 SCHEME = "udp:"
+_QUEUE_FRAMES = 4
 _URI = re.compile(r"udp:(?://(?P<host>\[[0-9A-Fa-f:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)?/?")
 
 
@@ -47,11 +50,18 @@ class LiveFrames:
         return None
 
     def __iter__(self) -> Iterator[Frame]:
-        with Receiver(self._port, self._host) as receiver:
+        newest: Newest[ReceivedFrame] = Newest(_QUEUE_FRAMES)
+        with MultiStreamReceiver(
+            self._port,
+            self._host,
+            owner=_whoever_comes,
+            on_frame=lambda _, frame: newest.put(frame),
+            max_streams=1,
+        ):
             until_s = time.monotonic() + self._seconds
             given = 0
             while (left_s := until_s - time.monotonic()) > 0:
-                received = receiver.get(min(left_s, 0.5))
+                received = newest.take(min(left_s, 0.5))
                 if received is None:
                     continue
                 if not given:
@@ -60,11 +70,17 @@ class LiveFrames:
                     given, frame_name(given), received.time_ns, received.image, received.exposure_s
                 )
                 given += 1
-            lost = receiver.counters.dropped
         if not given:
             raise InputError(f"{self._uri}: no video came within {self._seconds:g} s")
-        if lost:
-            self.notes.append(f"{self._uri}: {lost} frames skipped while others were looked at")
+        if newest.skipped:
+            self.notes.append(
+                f"{self._uri}: {newest.skipped} frames skipped while others were looked at"
+            )
+
+
+def _whoever_comes(ssrc: int, key_owner: str | None, age_s: float) -> str | None:
+    """The one payload before the board: no telemetry says whose a stream is."""
+    return "payload" if age_s > 0 else None
 
 
 def check_seconds(seconds: float) -> float:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib import resources
+from pathlib import Path
 
 from ground_station.features.settings import FeatureSettings
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
-PRESETS = ("default", "thesis")
+_FOLDER = Path(__file__).with_name("presets")
+PRESETS = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
+"""By name; each is a file of its own."""
 
 
 @dataclass(frozen=True)
@@ -410,12 +412,17 @@ class LocalizerSettings:
 
 
 def load_preset(name: str) -> LocalizerSettings:
-    """The preset of that name; raises `ConfigError` naming the known ones."""
-    if name not in PRESETS:
-        raise ConfigError(f"preset: there is no '{name}' (known: {', '.join(PRESETS)})")
-    file = resources.files("ground_station.localization") / "presets" / f"{name}.toml"
-    with resources.as_file(file) as path:
-        return config.load(path, LocalizerSettings)
+    """The preset of that name, or a file of one's own; raises `ConfigError`."""
+    return config.load(preset_file(name), LocalizerSettings)
+
+
+def preset_file(name: str) -> Path:
+    """Where a preset's settings are; raises `ConfigError` naming the known ones."""
+    path = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
+    if name not in PRESETS and (path.parent == _FOLDER or not path.is_file()):
+        known = ", ".join(PRESETS)
+        raise ConfigError(f"preset: there is no '{name:.80}' (known: {known}, or a .toml file)")
+    return path
 
 
 def in_units(settings: LocalizerSettings, per_metre: float) -> LocalizerSettings:

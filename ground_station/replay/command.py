@@ -38,8 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="results.json, report.html and outcome/, every frame, go here (default: out/replay)",
     )  # fmt: skip
     parser.add_argument(
-        "--preset", choices=("default", "thesis"), default="default", help="default: default"
-    )
+        "--preset", default="default", metavar="NAME|FILE.toml",
+        help="the localizer's settings: default (the default), thesis, or a file",
+    )  # fmt: skip
     parser.add_argument(
         "--init", metavar="truth|none|TUM.txt",
         help="the first frame's pose: found from the map alone (none, the default), the "
@@ -89,14 +90,11 @@ def run(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     from ground_station.evaluation.report import summary_table, write_report
     from ground_station.files import write_json
-    from ground_station.localization.settings import load_preset
     from ground_station.map import store
     from ground_station.replay import flight_report
-    from ground_station.replay.cases.observed import Observed
     from ground_station.replay.cases.outcome import write_outcome
     from ground_station.replay.cases.taken import outcome_of
     from ground_station.replay.replay import replay, settings_for
-    from ground_station.replay.rig import LOOPBACK
     from pi_firmware.wire.recording import RecordingReader
 
     settings = settings_for(
@@ -113,8 +111,7 @@ def _replay(args: argparse.Namespace) -> int:
     map_ = store.load(args.map)
     args.out.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
-    with Observed(LOOPBACK) as observed:
-        result = replay(map_, load_preset(args.preset), settings, observed.stand)
+    result = replay(map_, settings)
     plan = args.map / "floorplan.yaml"
     data = flight_report.report_data(
         f"Replay of {args.recording.name}",
@@ -128,15 +125,7 @@ def _replay(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, result.document())
     write_report(args.out / "report.html", data)
-    outcome = outcome_of(
-        result,
-        map_,
-        seconds=time.monotonic() - began_s,
-        health=observed.health,
-        refused=observed.refused,
-        payload_side=observed.payload_side,
-        ground_side=observed.ground_side,
-    )
+    outcome = outcome_of(result, map_, seconds=time.monotonic() - began_s)
     write_outcome(args.out / OUTCOME, outcome)
     print(summary_table(data))
     print(f"\n{args.out / 'report.html'}")

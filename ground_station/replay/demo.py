@@ -10,7 +10,6 @@ from pathlib import Path
 from ground_station.errors import InputError
 from ground_station.evaluation.report import summary_table, write_report
 from ground_station.files import write_json
-from ground_station.localization.settings import load_preset
 from ground_station.map.store import Map
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import open_inputs
@@ -22,9 +21,6 @@ from ground_station.replay.replay import replay, settings_for
 from ground_station.service.serve import SAMPLE
 from pi_firmware.wire.recording import RecordingReader
 
-QUEUE_FRAMES = 1024
-"""More than the flight has: a machine that cannot keep up shows a longer latency, and every frame
-still counts."""
 LIMITS = {
     flight_report.GATED: 5.0,
     flight_report.LOCALIZED: 95.0,
@@ -47,11 +43,11 @@ def run(
     start_s = time.monotonic()
     map_ = build(mapping, sample, out / "map")
     map_s = time.monotonic() - start_s
-    settings = settings_for(preset, flight, rate_hz=rate_hz, init=init, queue_frames=QUEUE_FRAMES)
+    settings = settings_for(preset, flight, rate_hz=rate_hz, init=init)
     print(
         f"2 of 3: the other flight, streamed by the firmware at {settings.rate_hz:g} Hz", flush=True
     )
-    result = replay(map_, load_preset(preset), settings)
+    result = replay(map_, settings)
     print("3 of 3: the report\n", flush=True)
     seeds = {
         "mapping flight": _seed(mapping),

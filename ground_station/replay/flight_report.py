@@ -12,8 +12,9 @@ import numpy as np
 from ground_station.evaluation.report import Bound, MatchPicture, ReportData, draw_matches
 from ground_station.geometry import poses
 from ground_station.map.store import Map
-from ground_station.replay.live import LiveFrame
 from ground_station.replay.replay import ReplayResult
+from ground_station.service.bus_messages import EstimateMessage
+from ground_station.service.localizing.derive import estimate_of
 
 
 def report_data(
@@ -58,7 +59,7 @@ def report_data(
         position_limit_m=limits.get(POSITION),
         rotation_limit_deg=limits.get(ROTATION),
         floorplan=floorplan,
-        pictures=[_picture(image, frame, result, map_) for image, frame in result.live.pictures],
+        pictures=[_picture(image, note, result, map_) for image, note in result.live.pictures],
         settings={
             "replay": {k: str(v) for k, v in asdict(result.settings).items() if k != "recording"}
             | {"recording": result.settings.recording.name},
@@ -79,7 +80,8 @@ def report_data(
 POSITION = "position error, unaligned, RMSE"
 ROTATION = "rotation error, unaligned, RMSE"
 GATED = "frames gated, of those captured"
-LOCALIZED = "frames localized, of those not gated"
+LOCALIZED = "frames localized, of those taken"
+"""Taken: neither gated nor overtaken by a newer frame, as they are where a machine is too slow."""
 
 
 def notes(result: ReplayResult) -> list[str]:
@@ -87,11 +89,16 @@ def notes(result: ReplayResult) -> list[str]:
     lines = []
     if result.settings.init == "truth":
         lines.append("The first frame's pose was given, as the thesis needs it: the true one.")
-    clock = result.live.clock_offset()
+    clock = result.live.clock
     if clock is None:
         lines.append("The payload's clock never answered: latencies take both clocks for one.")
     else:
         lines.append(f"Latencies are exact to {clock['uncertainty_ns'] / 1e6:.2f} ms.")
+    if dropped := result.live.accounts()["dropped"]:
+        lines.append(
+            f"{dropped} frames were skipped for newer ones: this computer was too slow for"
+            f" {result.settings.rate_hz:g} Hz, by itself or because of what else it did."
+        )
     if not result.live.complete:
         lines.append("The payload's final counts did not arrive: frames sent is what was received.")
     return lines
@@ -102,10 +109,10 @@ def judge(result: ReplayResult, limits: dict[str, float]) -> list[Bound]:
     accounts = result.live.accounts()
     captured, gated = accounts["captured"], accounts["gated"]
     rmse = result.evaluation.errors["none"].rmse() if result.evaluation else {}
-    open_frames = captured - gated
+    taken = captured - gated - accounts["dropped"]
     values = {
         GATED: (100 * gated / captured if captured else None, "%", True),
-        LOCALIZED: (100 * accounts["localized"] / open_frames if open_frames else None, "%", False),
+        LOCALIZED: (100 * accounts["localized"] / taken if taken else None, "%", False),
         POSITION: (rmse.get("position_m"), "m", True),
         ROTATION: (rmse.get("rotation_deg"), "°", True),
     }
@@ -124,15 +131,16 @@ def _within(result: ReplayResult) -> Any:
     return type(truth)(truth.time_ns[keep], truth.position_m[keep], truth.quaternion_xyzw[keep])
 
 
-def _picture(image: Any, frame: LiveFrame, result: ReplayResult, map_: Map) -> MatchPicture:
-    estimate = frame.estimate
-    seen = estimate.observations
-    projected = np.empty((0, 2))
-    if estimate.wTc is not None and len(seen):
-        points = map_.landmarks.position_m[seen.landmark]
-        projected = result.camera.project(poses.transform(poses.inverse(estimate.wTc), points))
-    caption = f"frame {frame.sequence}: {estimate.state.value}"
-    if estimate.reason:
-        caption += f" ({estimate.reason})"
-    caption += f", {estimate.counts.inliers} inliers of {estimate.counts.associated} pairs"
-    return MatchPicture(draw_matches(image, seen.pixel_px, projected, seen.residual_px), caption)
+def _picture(image: Any, note: EstimateMessage, result: ReplayResult, map_: Map) -> MatchPicture:
+    wTc = estimate_of(note, 0).wTc
+    pixel_px = projected = np.empty((0, 2))
+    if wTc is not None:
+        pixel_px = np.array(note.points_px).reshape(-1, 2)
+        points = map_.landmarks.position_m[note.landmarks]
+        projected = result.camera.project(poses.transform(poses.inverse(wTc), points))
+    caption = f"frame {note.sequence}: {note.state}"
+    if note.reason:
+        caption += f" ({note.reason})"
+    caption += f", {note.inliers} inliers of {note.expected} landmarks in view"
+    residual_px = np.linalg.norm(pixel_px - projected, axis=1)
+    return MatchPicture(draw_matches(image, pixel_px, projected, residual_px), caption)

@@ -5,26 +5,28 @@ from __future__ import annotations
 import contextlib
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
+import tomli_w
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.trajectory import Trajectory
+from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
 from ground_station.localization import results
-from ground_station.localization.extraction import extractor_for
-from ground_station.localization.localizer import Localizer
-from ground_station.localization.settings import LocalizerSettings, for_live
+from ground_station.localization.settings import LocalizerSettings
 from ground_station.map import store
 from ground_station.progress import Progress
 from ground_station.recording.flight import camera_of, trajectory_of
 from ground_station.replay import live
+from ground_station.replay.resources import Side, Watch
 from ground_station.replay.rig import LOOPBACK, Rig
+from ground_station.replay.station import station
+from ground_station.service.localizing.maps import settings_of
+from ground_station.service.settings import Run, StationSettings
 from pi_firmware.wire import config
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
 
@@ -47,13 +49,11 @@ class ReplaySettings:
     gate_min_entropy_bits: float | None = None
     """None: the payload's own default."""
     bitrate_kbps: int = 2000
-    queue_frames: int = 4
-    """Frames that may wait for the localizer before the oldest is dropped and counted."""
     pictures: int = 4
     """How many frames are kept with their matches, for the report."""
     stepped: bool = False
     """Each frame as soon as there is room, and no clock decides what becomes of it: the same poses,
-    bit for bit, however fast the machine. False: in real time."""
+    bit for bit, however fast the machine. False: in real time, where the newest frame wins."""
     payload: tuple[str, ...] = ()
     """More of the firmware's settings, each "key=value" as `--set` takes them."""
 
@@ -71,7 +71,7 @@ def settings_for(preset: str, recording: Path, **options: Any) -> ReplaySettings
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """The session, and its errors against the recording's truth when it has one."""
+    """The flight, what it took, and its errors against the recording's truth when it has one."""
 
     settings: ReplaySettings
     localizer: LocalizerSettings
@@ -79,6 +79,9 @@ class ReplayResult:
     live: live.LiveResult
     truth: Trajectory | None
     evaluation: ate.Evaluation | None
+    ground_side: Side
+    payload_side: Side | None
+    """None where the firmware ran on another machine."""
 
     @property
     def estimate(self) -> Trajectory:
@@ -108,92 +111,95 @@ class ReplayResult:
             "ate": self.evaluation.ate() if self.evaluation else None,
             "shares": within,
             "latency_ms": results.percentiles(latency.tolist()),
-            "clock_offset": self.live.clock_offset(),
+            "clock_offset": self.live.clock,
             "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,
-            "stream": asdict(self.live.stream),
+            "stream": self.live.payload.stream,
         }
 
 
-def replay(
-    map_: store.Map,
-    localizer_settings: LocalizerSettings,
-    settings: ReplaySettings,
-    stand: Rig = LOOPBACK,
-) -> ReplayResult:
-    """Starts the firmware on the recording as its own process and localizes what it streams.
+def replay(map_: store.Map, settings: ReplaySettings, rig: Rig = LOOPBACK) -> ReplayResult:
+    """Starts the firmware on the recording, and the service's intake and localizer on its stream.
 
-    Raises a `BlimpError` with one line for a recording without a camera, a map
-    of other features, a firmware that fails, or a stream that does not come.
+    All are processes of their own. The map is read from its folder. Raises a `BlimpError` with one
+    line for a recording without a camera, a map that is not registered or of other features, a
+    firmware that fails, or a stream that does not come.
     """
     reader = RecordingReader(settings.recording)
     camera = camera_of(reader)
     if camera is None:
         raise InputError(f"{settings.recording}: it carries no camera calibration")
-    extract = extractor_for(map_.info, localizer_settings.features)
-    if not settings.stepped:
-        localizer_settings = for_live(localizer_settings)
-    localizer = Localizer(map_, camera, extract, localizer_settings)
-    truth = None
-    if TRUTH_TOPIC in reader.topics():
-        truth = trajectory_of(settings.recording)
+    truth = trajectory_of(settings.recording) if TRUTH_TOPIC in reader.topics() else None
     start = first_pose(settings.init, truth)
     expected = _expected_frames(reader, settings)
     every = max(1, expected // settings.pictures)
-
-    def set_start(time_ns: int) -> None:
-        if start is not None:
-            localizer.set_initial_pose(start.at(time_ns), time_ns)
-
-    with (
-        _threads_as_in_the_service(),
-        tempfile.TemporaryDirectory(prefix="blimp-replay-") as folder,
-        stand.receiver(_AHEAD + 2 if settings.stepped else settings.queue_frames) as receiver,
-        stand.telemetry() as telemetry,
-        stand.link(receiver.port) as port,
-        stand.payload(
-            _payload_config(settings, camera, port, telemetry.endpoints, stand.payload_id),
-            Path(folder),
-        ) as firmware,
-        Progress("live, frames", expected) as progress,
-    ):
+    payload_side = None
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="blimp-replay-")))
+        run = _run(settings, rig, map_, camera, start, folder)
+        ground = stack.enter_context(station(run, rig.payload_id))
+        inbox = live.Inbox(ground, rig.payload_id, lambda k: k % every == every // 2)
+        port = stack.enter_context(rig.link(ground.video_port))
+        config = _payload_config(settings, camera, port, ground.endpoints, rig.payload_id)
+        firmware = stack.enter_context(rig.payload(config, folder))
+        pid = firmware.pid()
+        watch = None if pid is None else stack.enter_context(Watch(pid))
+        progress = stack.enter_context(Progress("live, frames", expected))
         result = live.run(
-            receiver,
-            telemetry,
-            stand.payload_id,
-            localizer,
-            check=firmware.check,
-            running=firmware.running,
-            start_timeout_s=stand.start_timeout_s,
-            on_start=set_start,
-            keep_picture=lambda frame: frame.sequence % every == every // 2,
-            on_frame=lambda frame: progress.step(),
-            repeat=settings.stepped,
+            ground,
+            inbox,
+            firmware,
+            start_timeout_s=rig.start_timeout_s,
+            on_first_frame=rig.on_first_frame,
+            on_frame=lambda: progress.step(),
         )
+        ground_side, payload_side = ground.side(), watch.side() if watch else None
     for event in result.events:
-        if event.name not in ("started", "end-of-stream"):
+        if event.source == "payload" and event.name not in ("started", "end-of-stream"):
             print(f"payload: {event.text}", file=sys.stderr)
-    done = ReplayResult(settings, localizer_settings, camera, result, truth, None)
+    estimate = results.trajectory([frame.estimate for frame in result.frames])
     evaluation = None
-    if truth is not None and map_.info.registered and len(done.estimate):
-        evaluation = ate.evaluate(done.estimate, truth)
-    return ReplayResult(settings, localizer_settings, camera, result, truth, evaluation)
+    if truth is not None and len(estimate):
+        evaluation = ate.evaluate(estimate, truth)
+    return ReplayResult(
+        settings, settings_of(run), camera, result, truth, evaluation, ground_side, payload_side
+    )
 
 
-@contextlib.contextmanager
-def _threads_as_in_the_service() -> Iterator[None]:
-    """OpenCV's own threads would wait for the core on which the keyframes are described."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
+def _run(
+    settings: ReplaySettings,
+    rig: Rig,
+    map_: store.Map,
+    camera: Camera,
+    start: Trajectory | None,
+    folder: Path,
+) -> Run:
+    """The service's settings for this flight; what it reads lies in `folder`."""
+    if map_.folder is None:
+        raise InputError(f"{map_.info.name}: the map lies in no folder that a process could read")
+    camera_file, start_file = folder / "camera.toml", folder / "start.txt"
+    camera_file.write_bytes(tomli_w.dumps(camera.as_dict()).encode())
+    if start is not None:
+        write_tum(start_file, start)
+    # A replay writes no recording of the ground's: the flight is one already.
+    station_ = {
+        "map": {"folder": str(map_.folder.resolve()), "camera": str(camera_file)},
+        "payloads": {"ids": [rig.payload_id]},
+        "video": asdict(rig.video),
+        "telemetry": asdict(rig.telemetry),
+        "localizer": {"preset": settings.preset},
+        "recording": {"folder": str(folder / "recordings")},
+    }
+    return Run(
+        config.from_mapping(station_, StationSettings, where="replay"),
+        started_ns=time.time_ns(),
+        stepped=settings.stepped,
+        start=str(start_file) if start is not None else "",
+        landmarks=True,
+    )
 
 
 def first_pose(init: str, truth: Trajectory | None) -> Trajectory | None:
     """Where the first frame's pose comes from; None for `none`. Raises `InputError`."""
-    from ground_station.geometry.trajectory import read_tum
-
     if init == "none":
         return None
     if init != "truth":

@@ -1,17 +1,16 @@
-"""Where a flight takes place: who opens the ground's ends, what flies, and what lies between."""
+"""Where a flight takes place: where the ground listens, what flies, and what lies between."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from ground_station.replay.firmware import FirmwareProcess
-from ground_station.stream.receiver import Receiver
-from ground_station.stream.telemetry import TelemetryListener
+from ground_station.service.settings import TelemetrySettings, VideoSettings
 
 
 class Running(Protocol):
@@ -32,28 +31,27 @@ class Running(Protocol):
 
 @dataclass(frozen=True)
 class Rig:
-    """Makes a flight's parties, each a context manager that ends what it began.
+    """What `replay` flies on; any part may be another's.
 
-    `receiver` takes how many frames may wait for the localizer. `link` takes the receiver's UDP
-    port and gives the one that the payload sends to. `payload` takes the firmware's configuration,
-    as its payload.toml has it, and a folder for its files; it may change what another machine needs
-    differently: addresses, certificates, where the recording lies.
+    `video` and `telemetry` are where the ground listens, as in `station.toml`; a port of 0 is any
+    free one. `link` takes the ground's video port and gives the one that the payload sends to.
+    `payload` takes the firmware's configuration, as its payload.toml has it, and a folder for its
+    files; it may change what another machine needs differently: addresses, certificates, where the
+    recording lies. `on_first_frame` is called when the first frame is there.
     """
 
-    receiver: Callable[[int], Receiver]
-    telemetry: Callable[[], TelemetryListener]
-    link: Callable[[int], AbstractContextManager[int]]
     payload: Callable[[dict[str, Any], Path], AbstractContextManager[Running]]
+    link: Callable[[int], AbstractContextManager[int]] = contextlib.nullcontext
+    video: VideoSettings = field(default_factory=lambda: VideoSettings(port=0))
+    telemetry: TelemetrySettings = field(
+        default_factory=lambda: TelemetrySettings(listen=["tcp/127.0.0.1:0"])
+    )
     payload_id: str = "replay"
     """The payload's name in telemetry; a card's certificate has one of its own."""
     start_timeout_s: float = 30.0
     """From the started firmware to its first frame; more where the processor is emulated."""
+    on_first_frame: Callable[[], None] = lambda: None
 
 
-LOOPBACK = Rig(
-    receiver=lambda queue_frames: Receiver(port=0, queue_frames=queue_frames),
-    telemetry=lambda: TelemetryListener(["tcp/127.0.0.1:0"]),
-    link=contextlib.nullcontext,
-    payload=FirmwareProcess,
-)
+LOOPBACK = Rig(FirmwareProcess)
 """The firmware as a process of this machine, with ports of its own."""

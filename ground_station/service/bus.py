@@ -10,22 +10,21 @@ import contextlib
 import json
 import os
 import resource
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from ground_station.errors import GroundStationError
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import Message, N, ProcessMessage
+from ground_station.stream.newest import Newest
 from pi_firmware.wire.errors import BlimpError
 
 _SOCKET = "bus"
 _OPEN_LIMIT_S = 10.0
 
 Do = Callable[[Mapping[str, Any]], Mapping[str, Any]]
-T = TypeVar("T", bound=Message)
 
 
 class BusError(GroundStationError):
@@ -66,40 +65,20 @@ class Router:
         self._session.close()
 
 
-class Newest(Generic[T]):
-    """Keeps the newest message only, from any thread; `skipped` counts those that nobody took."""
-
-    def __init__(self) -> None:
-        self.skipped = 0
-        self._note: T | None = None
-        self._there = threading.Condition()
-
-    def put(self, message: T) -> None:
-        """Takes a message in place of the one before."""
-        with self._there:
-            self.skipped += self._note is not None
-            self._note = message
-            self._there.notify()
-
-    def take(self, timeout_s: float) -> T | None:
-        """The newest message that was not taken yet; None when none comes in time."""
-        with self._there:
-            self._there.wait_for(lambda: self._note is not None, timeout_s)
-            message, self._note = self._note, None
-            return message
-
-
 class Bus:
     """A process's place on the bus; a context manager.
 
     Handlers run on a thread of the session and must return soon. `dropped` counts what was no
-    message. Raises `BusError` when there is no bus in the folder.
+    message. A process that is too slow to hear a message loses it, or with `lossless` is waited
+    for. Raises `BusError` when there is no bus in the folder.
     """
 
-    def __init__(self, folder: Path, process: str) -> None:
+    def __init__(self, folder: Path, process: str, *, lossless: bool = False) -> None:
         import zenoh
 
         self.process = process
+        control = zenoh.CongestionControl
+        self._congestion = control.BLOCK if lossless else control.DROP
         self.dropped = 0
         self._started_s = time.monotonic()
         self._beat_s, self._cpu_s = self._started_s, _cpu_s()
@@ -120,8 +99,12 @@ class Bus:
         self._session.close()
 
     def publish(self, kind: str, payload_id: str, message: Message) -> None:
-        """Tells all processes; one that is too slow to hear loses it."""
-        self._session.put(f"station/{kind}/{payload_id}", bus_messages.encode(message))
+        """Tells all processes."""
+        self._session.put(
+            f"station/{kind}/{payload_id}",
+            bus_messages.encode(message),
+            congestion_control=self._congestion,
+        )
 
     def subscribe(
         self, kind: str, of: type[N], take: Callable[[str, N], None], payload_id: str = "*"
@@ -139,9 +122,9 @@ class Bus:
         key = f"station/{kind}/{payload_id}"
         self._declared.append(self._session.declare_subscriber(key, received))
 
-    def newest(self, kind: str, of: type[N], payload_id: str = "*") -> Newest[N]:
-        """Where the newest message of a kind lies."""
-        newest: Newest[N] = Newest()
+    def newest(self, kind: str, of: type[N], payload_id: str = "*", most: int = 1) -> Newest[N]:
+        """Where the newest messages of a kind lie, `most` of them."""
+        newest: Newest[N] = Newest(most)
         self.subscribe(kind, of, lambda _, message: newest.put(message), payload_id)
         return newest
 

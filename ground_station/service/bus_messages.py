@@ -66,7 +66,8 @@ class EstimateMessage(Message):
 
     `quaternion_xyzw` and `position_m` are wTc, `covariance` (36, row by row) is of the right
     tangent in the camera's axes, rotation before translation; `position_sigma_m` (9) is the
-    position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns.
+    position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns,
+    `landmarks` their indices in the map, which only a replay asks for.
     `processed`, `localized` and `skipped` count this payload's frames since the localizer's start.
     `overload` says in words that the processor is too slow for them; "" while it is not.
     """
@@ -91,6 +92,7 @@ class EstimateMessage(Message):
     inliers: int = 0
     expected: int = 0
     points_px: list[float] = field(default_factory=list)
+    landmarks: list[int] = field(default_factory=list)
     stage_ms: dict[str, float] = field(default_factory=dict)
     map: str = ""
     processed: int = 0
@@ -105,7 +107,8 @@ class PayloadMessage(Message):
 
     `frames` by fate: captured, gated, sent, discarded (the payload's own account), received, lost,
     withheld, dropped. `stream` has the receiver's counters. `battery`, `health` and `autopilot` are
-    the newest messages as they came.
+    the newest messages as they came; `refused` counts those that were not as agreed. `ended`: it
+    said that its stream is over, and its own account is final.
     """
 
     alive: bool
@@ -117,12 +120,14 @@ class PayloadMessage(Message):
     rate_hz: float = 0.0
     bitrate_kbps: float = 0.0  # as received
     lost_share: float = 0.0  # of late
-    clock: dict[str, int] | None = None  # offset_ns, uncertainty_ns
+    clock: dict[str, int] | None = None  # offset_ns, uncertainty_ns, steps
     round_trip_s: float | None = None
     battery: dict[str, Any] | None = None
     health: dict[str, Any] | None = None
     autopilot: dict[str, Any] | None = None
     recording: str = ""  # the file on the payload's own card
+    refused: int = 0
+    ended: bool = False
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,11 @@ class Children:
             if said := child.step():
                 self._report(said)
 
+    def pids(self) -> dict[str, int]:
+        """The process ids of those that run."""
+        running = {name: child.pid for name, child in list(self._children.items())}
+        return {name: pid for name, pid in running.items() if pid is not None}
+
     def restarts(self) -> dict[str, int]:
         """How often each was started anew."""
         return {name: child.restarts for name, child in list(self._children.items())}
@@ -224,16 +229,18 @@ def table(folder: Path, *, foxglove: bool, demo: Path | None) -> tuple[Spec, ...
     `demo` is the configuration of the payload that is played.
     """
     run = str(folder)
-    specs = [
-        Spec(INTAKE, "ground_station.service.intake", (run,)),
-        Spec(WEB, "ground_station.service.web", (run,)),
-    ]
+    specs = [intake(folder), Spec(WEB, "ground_station.service.web", (run,))]
     if foxglove:
         module = "ground_station.service.foxglove"
         specs.append(Spec(FOXGLOVE, module, (run,), needed=False, later=True))
     if demo is not None:
         specs.append(Spec(PAYLOAD, "pi_firmware", ("--config", str(demo)), beats=False))
     return tuple(specs)
+
+
+def intake(folder: Path) -> Spec:
+    """The intake."""
+    return Spec(INTAKE, "ground_station.service.intake", (str(folder),))
 
 
 def localizer(folder: Path, payload_id: str) -> Spec:

@@ -36,7 +36,7 @@ def serve(settings: StationSettings, stop: threading.Event, *, demo: Path | None
     """
     _check_map(Path(settings.map.folder))
     notifier = Notifier()
-    with _run_folder() as folder:
+    with run_folder() as folder:
         write_run(folder, Run(settings, demo=demo is not None, started_ns=time.time_ns()))
         payload = _demo_config(folder, settings, demo) if demo else None
         router = Router(folder)
@@ -112,7 +112,7 @@ class _Parent:
 
 
 @contextlib.contextmanager
-def _run_folder() -> Iterator[Path]:
+def run_folder() -> Iterator[Path]:
     """A private folder in memory, gone with the service; systemd's own where it gives one."""
     for place in (
         os.environ.get("RUNTIME_DIRECTORY"),

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ground_station.localization.settings import preset_file
 from pi_firmware.wire import video
 from pi_firmware.wire.config import apply_override, from_mapping, key, read, table
 from pi_firmware.wire.errors import ConfigError, TelemetryError
@@ -40,7 +41,7 @@ class VideoSettings:
     """Where the video comes in."""
 
     host: str = key("127.0.0.1", "address that is listened on; 0.0.0.0: all")
-    port: int = key(video.PORT, "UDP port", low=1, high=65535)
+    port: int = key(video.PORT, "UDP port; 0: any free one", low=0, high=65535)
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,13 @@ class TelemetrySettings:
 class LocalizerSettings:
     """How poses are found."""
 
-    preset: str = key("default", "the localizer's settings", choices=("default", "thesis"))
+    preset: str = key("default", "the localizer's settings: default, thesis or a .toml file")
+
+    def __post_init__(self) -> None:
+        try:
+            preset_file(self.preset)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
 
 
 @dataclass(frozen=True)
@@ -136,11 +143,14 @@ class StationSettings:
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the service as its processes read it: settings, and whether it is the demo."""
+    """One run of the service as its processes read it: settings, and what is replayed with it."""
 
     station: StationSettings = table(StationSettings)
     demo: bool = key(False, "the sample flight is played")
     started_ns: int = key(0, "wall clock", unit="ns")
+    stepped: bool = key(False, "the payload waits for poses: each frame in its turn, none skipped")
+    start: str = key("", "TUM file with the first frame's pose; empty: found in the whole map")
+    landmarks: bool = key(False, "estimates tell which landmarks they were solved from")
 
 
 def load(path: Path | None, overrides: Iterable[str] = ()) -> StationSettings:

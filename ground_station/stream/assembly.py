@@ -29,10 +29,9 @@ class ReceivedFrame:
     """One frame as captured.
 
     `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
-    machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is uint8,
-    gray (H, W) or, from a receiver with `color`, BGR (H, W, 3). `exposure_s` is None where the
-    payload does not tell it or what it tells cannot be. `access_unit` is what it was decoded from,
-    Annex B with its SEI.
+    machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is gray
+    (H, W) uint8. `exposure_s` is None where the payload does not tell it or what it tells cannot
+    be. `access_unit` is what it was decoded from, Annex B with its SEI.
     """
 
     image: NDArray[np.uint8]
@@ -61,12 +60,9 @@ class Assembly:
         ssrc: int,
         counters: Counters,
         *,
-        payload_id: str | None = None,
-        color: bool = False,
         sets_timeout_s: float = SETS_TIMEOUT_S,
     ) -> None:
         self.ssrc = ssrc
-        self.payload_id = payload_id
         self.last_arrival_ns = 0
         """Monotonic, of the newest packet."""
         self.arrivals = Arrivals()
@@ -74,7 +70,7 @@ class Assembly:
         self._counters = counters
         self._reorderer = rtp.Reorderer(counters)
         self._depacketizer = rtp.Depacketizer(counters)
-        self._decoder = Decoder(counters, color=color)
+        self._decoder = Decoder(counters)
         self._sets_timeout_ns = int(sets_timeout_s * 1e9)
         self._first_arrival_ns: int | None = None
 

@@ -13,7 +13,7 @@ class Counters:
     for, also `refused` (not authentic) or `replayed` (authentic, but not for the first time).
     Every access unit of which anything arrived is one of `decoded`, `withheld` (damaged, or after
     a loss and before the next IDR), `failed` (the decoder refused it) or `unstamped` (without
-    capture time). Of the decoded ones `dropped` left the full queue before anyone took them.
+    capture time).
     `overrun` packets were thrown away unread because those before them took too long to decode;
     they come to be lost.
     """
@@ -31,5 +31,4 @@ class Counters:
     withheld: int = 0
     failed: int = 0
     unstamped: int = 0
-    dropped: int = 0
     overrun: int = 0

@@ -22,15 +22,14 @@ class Decoder:
     unit, nor one that refers to it.
     """
 
-    def __init__(self, counters: Counters, *, color: bool = False) -> None:
+    def __init__(self, counters: Counters) -> None:
         self.saw_parameter_sets = False
         self._counters = counters
-        self._color = color
         self._trusted = False
         self._codec = _open()
 
     def decode(self, unit: AccessUnit) -> NDArray[np.uint8] | None:
-        """The picture: gray (H, W) or BGR (H, W, 3), uint8, full range; None when withheld."""
+        """The picture, gray (H, W) uint8 of full range; None when withheld."""
         if unit.follows_gap or not unit.complete:
             self._trusted = False
         if unit.complete:
@@ -44,8 +43,6 @@ class Decoder:
             return None
         try:
             (frame,) = self._codec.decode(av.Packet(unit.data))
-            if self._color:
-                return frame.to_ndarray(format="bgr24").astype(np.uint8, copy=False)
             return grey(frame)
         except (av.FFmpegError, ValueError):  # ValueError: not exactly one picture
             self._counters.failed += 1

@@ -61,7 +61,7 @@ class Stream:
         """Why its frames are not taken any more, in words."""
         self.began_ns = self.last_ns = time.monotonic_ns()
         self._counters = counters
-        self._assembly = Assembly(ssrc, counters, payload_id=payload_id)
+        self._assembly = Assembly(ssrc, counters)
         self._on_frame = on_frame
         self._waiting: deque[rtp.Packet] = deque()
         self._there = threading.Condition()

@@ -75,6 +75,12 @@ class PayloadState:
         return FrameCounts(g.captured, g.gated, g.heartbeats, g.sent, g.discarded)
 
     @property
+    def ended(self) -> bool:
+        """Whether it said that its stream is over."""
+        ends = (messages.EVENT_END_OF_STREAM, messages.EVENT_STOPPED)
+        return any(event.name in ends for event in self.events)
+
+    @property
     def ssrc(self) -> int | None:
         """The SSRC of the payload's video, which it announces; None before it did."""
         if self.gate is not None:

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from numbered_flight import number_in
+from receiving import Receiver
 
-from ground_station.stream.receiver import Receiver
 from ground_station.stream.telemetry import TelemetryListener
 
 _QUEUE_FRAMES = 1024

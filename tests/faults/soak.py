@@ -33,9 +33,12 @@ from soaking.processes import Watch
 from soaking.table import Row, show
 from soaking.trend import trend
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "stream"))
+
+from receiving import Receiver
+
 from ground_station.errors import GroundStationError
 from ground_station.stream.feedback import Feedback
-from ground_station.stream.receiver import Receiver
 from ground_station.stream.telemetry import TelemetryListener
 
 RATE_HZ = 30.0

@@ -14,11 +14,9 @@ from links.loopback import LoopbackLink
 from links.namespace import NamespaceLink
 from links.proxy import ProxyLink
 
-from ground_station.localization.settings import load_preset
 from ground_station.map import store
 from ground_station.replay.cases.case import LOOPBACK, NAMESPACE, Case
 from ground_station.replay.cases.judge import Judged, judged
-from ground_station.replay.cases.observed import Observed
 from ground_station.replay.cases.outcome import Outcome, write_outcome
 from ground_station.replay.cases.source import check_case
 from ground_station.replay.cases.taken import outcome_of
@@ -97,9 +95,7 @@ def _flown(case: Case, payload: Payload, folder: Path) -> Outcome:
     began_s = time.monotonic()
     with contextlib.ExitStack() as stack:
         link = _link(case, payload, stack)
-        stand = _stand(payload, tuple(flown.settings), link, folder)
-        observed = stack.enter_context(Observed(stand))
-        result = replay(map_, load_preset(case.preset), settings, observed.stand)
+        result = replay(map_, settings, _stand(payload, tuple(flown.settings), link, folder))
         outcome = outcome_of(
             result,
             map_,
@@ -110,10 +106,6 @@ def _flown(case: Case, payload: Payload, folder: Path) -> Outcome:
             seconds=time.monotonic() - began_s,
             outages=link.outages(),
             link_counts=link.counts(),
-            health=observed.health,
-            refused=observed.refused,
-            payload_side=observed.payload_side,
-            ground_side=observed.ground_side,
             notes=[payload.describe(), f"injected: {link.injected()}", *source.notes],
         )
     write_outcome(folder, outcome)

@@ -15,7 +15,6 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -49,7 +48,7 @@ class Trial:
     video_port: int = 0
     link_port: int = 0
     payloads: int = 0
-    """0: one flight in `replay`'s own loop."""
+    """0: one flight, as `blimp replay` flies it."""
 
 
 @dataclass(frozen=True)
@@ -92,44 +91,22 @@ def due(captured: int, clock_ns: list[int], rate_hz: float) -> int:
 
 
 def fly(trial: Trial) -> Outcome:
-    """One flight in `replay`'s loop. Raises a `BlimpError` when it cannot be flown."""
-    from ground_station.localization.settings import load_preset
+    """One flight, as `blimp replay` flies it. Raises a `BlimpError` when it cannot be flown."""
     from ground_station.map import store
-    from ground_station.replay.cases.resources import Watch
     from ground_station.replay.replay import replay, settings_for
     from ground_station.replay.rig import LOOPBACK, Rig, Running
-    from ground_station.stream.receiver import Receiver
+    from ground_station.service.settings import VideoSettings
 
-    receivers: list[Receiver] = []
-    watches: list[Watch] = []
-
-    def receiver(queue_frames: int) -> Receiver:
-        receivers.append(Receiver(port=trial.video_port, queue_frames=queue_frames))
-        return receivers[-1]
+    flown: list[Running] = []
 
     @contextlib.contextmanager
     def payload(config: dict[str, Any], folder: Path) -> Iterator[Running]:
-        ended = threading.Event()
-
-        def tell(pid: int | None) -> None:
-            while not ended.wait(0.02):
-                if receivers[0].counters.decoded:
-                    say("flying", payload=pid)
-                    return
-
         with LOOPBACK.payload(config, folder) as running:
-            pid = running.pid()
-            assert pid is not None
-            watches.extend((Watch(os.getpid()), Watch(pid)))
-            with watches[0], watches[1]:
-                thread = threading.Thread(target=tell, args=(pid,), daemon=True)
-                thread.start()
-                try:
-                    yield running
-                finally:
-                    ended.set()
-                    thread.join()
-                    say("landed")
+            flown.append(running)
+            try:
+                yield running
+            finally:
+                say("landed")
 
     settings = settings_for(
         "default",
@@ -139,13 +116,14 @@ def fly(trial: Trial) -> Outcome:
         payload=tuple(trial.payload),
         pictures=1,
     )
-    stand = Rig(
-        receiver=receiver,
-        telemetry=LOOPBACK.telemetry,
-        link=lambda port: contextlib.nullcontext(trial.link_port or port),
+    rig = Rig(
         payload=payload,
+        link=lambda port: contextlib.nullcontext(trial.link_port or port),
+        video=VideoSettings(port=trial.video_port),
+        on_first_frame=lambda: say("flying", payload=flown[0].pid()),
     )
-    live = replay(store.load(Path(trial.map)), load_preset("default"), settings, stand).live
+    result = replay(store.load(Path(trial.map)), settings, rig)
+    live = result.live
     latency = live.latency_ms()
     p50, p99 = np.quantile(latency, (0.5, 0.99)) if len(latency) else (None, None)
     captured, frames = live.accounts()["captured"], since_found(live.frames)
@@ -157,8 +135,8 @@ def fly(trial: Trial) -> Outcome:
         latency_p50_ms=None if p50 is None else float(p50),
         latency_p99_ms=None if p99 is None else float(p99),
         received=live.accounts()["received"],
-        ground_cores=watches[0].side().cpu,
-        payload_cores=watches[1].side().cpu,
+        ground_cores=result.ground_side.cpu,
+        payload_cores=result.payload_side.cpu if result.payload_side else None,
     )
 
 

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from receiving import Receiver
 
 from ground_station.keys import certificates
 from ground_station.keys.authority import Authority
-from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 

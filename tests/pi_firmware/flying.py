@@ -13,7 +13,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from ground_station.stream.receiver import Receiver
+from receiving import Receiver
+
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 
 LIMIT_S = 30.0

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from receiving import Receiver
 
-from ground_station.stream.receiver import Receiver
 from pi_firmware import clocks, gstreamer, uri
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources import libcamera, open_source

@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+from receiving import Receiver
 
-from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.sources.pacing import RealTime, Stepped
 from pi_firmware.wire.recording import RecordingReader
 
@@ -72,7 +73,7 @@ def fly(*settings: str, options: str = "") -> list[ReceivedFrame]:
         out, err = process.communicate(timeout=30)
         assert process.returncode == 0, err
         assert f"{len(frames)} sent" in out
-        assert receiver.counters.packets_lost == receiver.counters.dropped == 0
+        assert receiver.counters.packets_lost == receiver.dropped == 0
     return frames
 
 

@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 import pytest
+from receiving import Receiver
 
-from ground_station.stream.receiver import Receiver
 from pi_firmware.settings import CameraSettings, load
 from pi_firmware.sources import clock, v4l2
 

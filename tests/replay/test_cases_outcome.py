@@ -26,8 +26,8 @@ from ground_station.replay.cases.outcome import (
     read_outcome,
     write_outcome,
 )
-from ground_station.replay.cases.resources import Watch
 from ground_station.replay.cases.same import first_difference
+from ground_station.replay.resources import Watch
 from pi_firmware.wire.errors import BlimpError
 
 ROWS = [

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import tomli_w
+from receiving import Receiver
 
 from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
@@ -27,7 +28,7 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.pictures import PictureWriter
 from ground_station.service.settings import Run
-from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire.config import from_mapping
 
 ROOT = Path(__file__).parents[2]
@@ -52,7 +53,7 @@ class Station:
         chosen = {"folder": str(SAMPLE), "shelf": str(SAMPLE.parent), **map_settings}
         run = from_mapping({"station": {"map": chosen}}, Run, where="test")
         settings.write_run(run_folder, run)
-        self.settings = run.station
+        self.run = run
         self.router = Router(run_folder)
         self.bus = Bus(run_folder, "station")
         self.estimates: list[EstimateMessage] = []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import queue
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -11,13 +13,21 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.localization.estimate import PoseEstimate, State
-from ground_station.service import pose_feed
+from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage
-from ground_station.service.intake.poses import pose_message
+from ground_station.service.intake.poses import PoseFeed, pose_message
 from ground_station.service.localizing.derive import Accounts, estimate_note
+from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware.autopilot.frames import rotation
+from pi_firmware.autopilot.poses import PoseGate
+from pi_firmware.settings import AutopilotSettings, TelemetrySettings
+from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import messages
 
 NOW_NS = 77
+LIMIT_S = 20.0
+# A camera that looks along the map's x axis, upright: right is -y, down is -z, forward is x.
+AHEAD = poses.pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [1.0, 2.0, 3.0])
 FRAME = FrameMessage(0, 2, 9, 5, 6, 7, 640, 480, 1)
 ESTIMATE = PoseEstimate(
     time_ns=5,
@@ -30,33 +40,63 @@ ESTIMATE = PoseEstimate(
 NOTE = estimate_note(FRAME, ESTIMATE, Accounts(), "atrium", 8)
 
 
-@pytest.mark.parametrize("wTc", [ESTIMATE.wTc, None])
-def test_a_note_is_told_as_its_estimate(wTc: Any) -> None:
-    estimate = replace(ESTIMATE, wTc=wTc, relocalized=wTc is not None)
+def told(estimate: PoseEstimate) -> messages.Pose:
+    """An estimate on the whole way from the localizer to the payload."""
     note = estimate_note(FRAME, estimate, Accounts(), "atrium", 8)
-    told = pose_message(note, NOW_NS)
-    expected = pose_feed.pose_message(
-        estimate, capture_ns=FRAME.clock_ns, sequence=FRAME.sequence, now_ns=NOW_NS
-    )
-    assert replace(told, quaternion_xyzw=None) == replace(expected, quaternion_xyzw=None)
-    if wTc is not None:
-        assert told.quaternion_xyzw == pytest.approx(expected.quaternion_xyzw, abs=1e-12)
-    assert messages.decode(messages.Pose, messages.encode(told)) == told
+    note = bus_messages.decode(EstimateMessage, bus_messages.encode(note))
+    return messages.decode(messages.Pose, messages.encode(pose_message(note, NOW_NS)))
+
+
+def test_a_solved_frame_is_where_the_autopilot_takes_it() -> None:
+    # Standard deviations about and along the camera's right, down and forward.
+    deviations = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+    message = told(replace(ESTIMATE, wTc=AHEAD, covariance=np.diag(deviations**2)))
+    assert (message.time_ns, message.capture_ns, message.sequence) == (NOW_NS, 6, 9)
+    assert message.relocalized
+    gate = PoseGate(AutopilotSettings(uri="off:"))
+    taken = gate.take(message, FRAME.clock_ns + 10**7)
+    assert taken is not None and gate.counts.passed == 1
+    np.testing.assert_allclose(taken.position_m, [1, -2, -3], atol=1e-12)  # north, east, down
+    np.testing.assert_allclose(rotation(*taken.angles_rad), np.eye(3), atol=1e-12)
+    # Ahead is north: forward is north, right is east, down is down; turns likewise.
+    assert taken.covariance is not None
+    expected = np.diag([0.3, 0.1, 0.2, 0.03, 0.01, 0.02]) ** 2
+    np.testing.assert_allclose(taken.covariance, expected, atol=1e-12)
+
+
+def test_a_tangent_step_of_the_estimate_is_one_of_the_message() -> None:
+    """The covariance's order and side: a step that the estimate calls x is the message's x."""
+    step = np.array([0.0, 0.02, 0.0, 0.3, 0.0, 0.0])
+    message = told(replace(ESTIMATE, wTc=AHEAD, covariance=np.outer(step, step)))
+    assert message.covariance is not None
+    found = poses.inverse(AHEAD) @ AHEAD @ poses.exp(step)
+    deviation = np.sqrt(np.diag(np.array(message.covariance).reshape(6, 6)))
+    # About the camera's y by 0.02 rad, and along its x by 0.3 m to the first order.
+    assert deviation == pytest.approx([0, 0.02, 0, 0.3, 0, 0])
+    assert found[0, 3] == pytest.approx(0.3, abs=1e-3) and found[0, 2] == pytest.approx(0.02, 1e-3)
+
+
+@pytest.mark.parametrize("state", [State.LOST, State.INITIALIZING, State.DEGRADED])
+def test_a_frame_that_was_not_solved_has_no_pose(state: State) -> None:
+    message = told(replace(ESTIMATE, state=state, wTc=None, relocalized=False))
+    assert message.state == state.value
+    assert message.position_m is message.quaternion_xyzw is message.covariance is None
+    assert PoseGate(AutopilotSettings(uri="off:")).take(message, 1) is None
 
 
 def test_a_quaternion_is_told_of_length_one_and_with_w_from_zero() -> None:
     assert NOTE.quaternion_xyzw is not None
     turned = [-2.0 * value for value in NOTE.quaternion_xyzw]
-    told = pose_message(replace(NOTE, quaternion_xyzw=turned), NOW_NS)
-    assert told.quaternion_xyzw == pytest.approx(NOTE.quaternion_xyzw)
+    message = pose_message(replace(NOTE, quaternion_xyzw=turned), NOW_NS)
+    assert message.quaternion_xyzw == pytest.approx(NOTE.quaternion_xyzw)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_what_is_not_finite_is_told_as_lost_or_left_out(value: float) -> None:
-    told = pose_message(replace(NOTE, position_m=[0.0, value, 0.0]), NOW_NS)
-    assert told.state == "LOST" and told.position_m is told.covariance is None
-    told = pose_message(replace(NOTE, covariance=[value] * 36), NOW_NS)
-    assert told.state == "TRACKING" and told.position_m and told.covariance is None
+    message = pose_message(replace(NOTE, position_m=[0.0, value, 0.0]), NOW_NS)
+    assert message.state == "LOST" and message.position_m is message.covariance is None
+    message = pose_message(replace(NOTE, covariance=[value] * 36), NOW_NS)
+    assert message.state == "TRACKING" and message.position_m and message.covariance is None
 
 
 @pytest.mark.parametrize(
@@ -74,3 +114,28 @@ def test_a_note_that_is_not_as_agreed_is_refused(wrong: dict[str, Any]) -> None:
     note: EstimateMessage = replace(NOTE, **wrong)
     with pytest.raises((ValueError, TypeError)):
         pose_message(note, NOW_NS)
+
+
+def test_poses_reach_the_payload_they_are_of() -> None:
+    heard: dict[str, queue.Queue[messages.Pose]] = {"one": queue.Queue(), "two": queue.Queue()}
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+        settings = TelemetrySettings(connect=list(listener.endpoints))
+        payloads = {name: Telemetry(name, settings) for name in heard}
+        for name, telemetry in payloads.items():
+            telemetry.on_pose(heard[name].put)
+        feed = PoseFeed(listener.session)
+        deadline = time.monotonic() + LIMIT_S
+        sequence = 0
+        # What is said before the payload subscribed is lost, as it should be.
+        while heard["one"].empty() and time.monotonic() < deadline:
+            feed.send("one", pose_message(replace(NOTE, sequence=sequence), NOW_NS))
+            sequence += 1
+            time.sleep(0.05)
+        said = heard["one"].get(timeout=LIMIT_S).sequence
+        while said < sequence - 1:  # all that was said before has come
+            said = heard["one"].get(timeout=LIMIT_S).sequence
+        feed.again()  # a payload that waits for it may have missed it
+        assert heard["one"].get(timeout=LIMIT_S).sequence == said
+        assert heard["two"].empty()  # to whom nothing was said yet
+        for telemetry in payloads.values():
+            telemetry.close()

@@ -12,10 +12,10 @@ from localizing_stand import SAMPLE, copy_map, until
 from ground_station.errors import MapError
 from ground_station.localization.settings import load_preset
 from ground_station.service.localizing import maps
-from ground_station.service.localizing.maps import Loader, folder_of, prepare
-from ground_station.service.settings import StationSettings
+from ground_station.service.localizing.maps import Loader, folder_of, prepare, settings_of
+from ground_station.service.settings import Run, StationSettings
 from pi_firmware.wire.config import from_mapping
-from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.errors import BlimpError, ConfigError
 
 
 def station(folder: Path, shelf: Path, **values: Any) -> StationSettings:
@@ -58,10 +58,28 @@ def test_a_service_finds_its_first_pose_itself_whatever_the_preset(shelf: Path) 
     """The thesis's preset is told one elsewhere; nobody tells a service."""
     assert not load_preset("thesis").recovery.relocalize
     chosen = station(SAMPLE, shelf, localizer={"preset": "thesis"})
-    localizer = prepare(SAMPLE, chosen)
+    localizer = prepare(SAMPLE, Run(chosen))
     assert localizer.settings.recovery.relocalize
     assert localizer.settings.tracking.features_lag_s == 0
     assert localizer.camera == localizer.map.info.camera
+
+
+def test_a_replay_may_tell_the_first_pose_and_no_clock_decides_where_it_is_stepped() -> None:
+    thesis, default = (
+        from_mapping({"localizer": {"preset": name}}, StationSettings, where="test")
+        for name in ("thesis", "default")
+    )
+    assert not settings_of(Run(thesis, start="start.txt")).recovery.relocalize
+    assert settings_of(Run(default, stepped=True)) == load_preset("default")
+
+
+def test_a_preset_is_one_that_ships_or_a_file(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("seed = 7\n")
+    settings = from_mapping({"localizer": {"preset": str(own)}}, StationSettings, where="test")
+    assert settings_of(Run(settings)).seed == 7
+    with pytest.raises(ConfigError, match=r"known: default, thesis, or a \.toml file"):
+        from_mapping({"localizer": {"preset": "fast"}}, StationSettings, where="test")
 
 
 def test_a_camera_of_the_settings_comes_before_the_maps(shelf: Path, tmp_path: Path) -> None:
@@ -72,7 +90,7 @@ def test_a_camera_of_the_settings_comes_before_the_maps(shelf: Path, tmp_path: P
     settings = from_mapping(
         {"map": {"folder": str(SAMPLE), "camera": str(file)}}, StationSettings, where="test"
     )
-    assert prepare(SAMPLE, settings).camera.width_px == 320
+    assert prepare(SAMPLE, Run(settings)).camera.width_px == 320
 
 
 @pytest.mark.parametrize(
@@ -88,19 +106,19 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(
 ) -> None:
     folder = copy_map(tmp_path / "other", **{key: value})
     with pytest.raises(BlimpError, match=reason) as refused:
-        prepare(folder, station(folder, tmp_path))
+        prepare(folder, Run(station(folder, tmp_path)))
     assert "\n" not in str(refused.value)
 
 
 def test_one_map_is_loaded_at_a_time(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
 
-    def slow(folder: Path, settings: StationSettings) -> Any:
+    def slow(folder: Path, run: Run) -> Any:
         release.wait(60)
         raise MemoryError("no room")
 
     monkeypatch.setattr(maps, "prepare", slow)
-    loader = Loader(station(SAMPLE, shelf))
+    loader = Loader(Run(station(SAMPLE, shelf)))
     loading = loader.begin(shelf / "hall")
     with pytest.raises(MapError, match="the map 'hall' is being loaded"):
         loader.begin(SAMPLE)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 from numbered_flight import GOP, capture_ns, encoded, number_in, stamped, start_payload
+from receiving import Receiver
 
 from ground_station.keys.authority import Authority
 from ground_station.stream import rtp, srtp
-from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.srtp import Unprotector
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.link import Link, load_key

@@ -21,10 +21,11 @@ from numbered_flight import (
     start_payload,
     write_flight,
 )
+from receiving import Receiver
 
 from ground_station.stream import rtp
+from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
-from ground_station.stream.receiver import ReceivedFrame, Receiver
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import annexb, messages, sei
 from pi_firmware.wire.recording import RecordingWriter

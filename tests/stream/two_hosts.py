@@ -14,8 +14,9 @@ import threading
 import time
 from pathlib import Path
 
+from receiving import Receiver
+
 from ground_station.stream.feedback import Feedback
-from ground_station.stream.receiver import Receiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import __main__ as firmware

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import InputError
+from ground_station.localization.settings import PRESETS
 from ground_station.replay.cases.limits import Bounds, Limits
 from pi_firmware.wire import config
 from pi_firmware.wire.config import key, table
@@ -21,7 +22,6 @@ LOOPBACK, PROXY, NAMESPACE = "loopback", "proxy", "namespace"
 LINKS = (LOOPBACK, PROXY, NAMESPACE)
 RECORDING, SURVEY, GOLDEN, NONE = "recording", "survey", "golden", "none"
 TRUTHS = (RECORDING, SURVEY, GOLDEN, NONE)
-PRESETS = ("default", "thesis")
 MAX_RATE_HZ, MAX_SPAN_S = 120.0, 1e6
 """What the firmware's `replay:` takes."""
 _SETTING = re.compile(r"([a-z]\w*(?:\.[a-z]\w*)+)=.*", re.DOTALL | re.ASCII)

@@ -24,7 +24,7 @@ from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.store import Map
 from ground_station.replay.cases.frames import Frames, read_csv, write_csv
-from ground_station.replay.cases.resources import Side
+from ground_station.replay.resources import Side
 from pi_firmware.wire import config
 from pi_firmware.wire.config import key, table
 

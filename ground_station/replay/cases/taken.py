@@ -14,10 +14,9 @@ from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.store import Map
 from ground_station.replay.cases import frames, program
 from ground_station.replay.cases.outcome import Accounts, Outage, Outcome, Run, map_sha256
-from ground_station.replay.cases.resources import Side
 from ground_station.replay.live import LiveResult
 from ground_station.replay.replay import ReplayResult
-from pi_firmware.wire import messages
+from ground_station.replay.resources import Side
 
 
 def outcome_of(
@@ -31,22 +30,18 @@ def outcome_of(
     seconds: float = 0.0,
     outages: Sequence[Outage] = (),
     link_counts: dict[str, int] | None = None,
-    health: messages.Health | None = None,
-    refused: int | None = None,
-    payload_side: Side | None = None,
-    ground_side: Side | None = None,
     truth: Trajectory | None = None,
     notes: Sequence[str] = (),
 ) -> Outcome:
     """What a replay found, ready to be written, judged and compared.
 
-    `health` and `refused` are what the telemetry listener knows of the payload at the end; `truth`
-    stands in place of the recording's own. `outages` are by this machine's wall clock. Of a payload
-    elsewhere whose resources nobody measured, its health message tells.
+    `truth` stands in place of the recording's own. `outages` are by this machine's wall clock. Of a
+    payload elsewhere whose resources nobody measured, its health message tells.
     """
     settings, live = result.settings, result.live
+    payload_side, health = result.payload_side, live.payload.health
     if payload_side is None and health is not None:
-        payload_side = Side(health.memory_MB, health.cpu, "its health message")
+        payload_side = Side(health["memory_MB"], health["cpu"], "its health message")
     truth = result.truth if truth is None else truth
     table = table_of(live)
     run = Run(
@@ -66,15 +61,15 @@ def outcome_of(
         seconds=seconds,
         complete=live.complete,
         accounts=Accounts(**live.accounts()),
-        stream=dataclasses.asdict(live.stream),
+        stream=live.payload.stream,
         link_counts=dict(link_counts or {}),
-        clock_offset=live.clock_offset(),
+        clock_offset=live.clock,
         outages=[dataclasses.asdict(outage) for outage in outages],
-        battery=None if live.battery is None else dataclasses.asdict(live.battery),
-        health=None if health is None else dataclasses.asdict(health),
-        refused=refused,
+        battery=live.payload.battery,
+        health=health,
+        refused=live.payload.refused,
         payload_side=dataclasses.asdict(payload_side or Side()),
-        ground_side=dataclasses.asdict(ground_side or Side()),
+        ground_side=dataclasses.asdict(result.ground_side),
         versions=program.versions() | _told(health),
         settings={
             "replay": _plain(dataclasses.asdict(settings), without=("recording", "pictures")),
@@ -88,7 +83,7 @@ def outcome_of(
 
 def table_of(live: LiveResult) -> frames.Frames:
     """The frames of a live session as a table."""
-    known = live.clock_offset() is not None
+    known = live.clock is not None
     rows = [
         frames.FrameRow(
             sequence=frame.sequence,
@@ -122,11 +117,11 @@ def floorplan_of(map_: Map) -> FloorPlan | None:
     return load_floorplan(path) if path is not None and path.is_file() else None
 
 
-def _told(health: messages.Health | None) -> dict[str, str]:
-    if health is None or not health.version:
+def _told(health: dict[str, Any] | None) -> dict[str, str]:
+    if health is None or not health["version"]:
         return {}
-    how = f" ({health.release})" if health.release else ""
-    return {"pi_firmware": f"{health.version}{how}"}
+    how = f" ({health['release']})" if health["release"] else ""
+    return {"pi_firmware": f"{health['version']}{how}"}
 
 
 def _plain(settings: dict[str, Any], without: tuple[str, ...]) -> dict[str, Any]:

@@ -24,11 +24,12 @@ _STEP_S = 0.1
 
 def serve(folder: Path, stop: threading.Event) -> None:
     """Runs until `stop` is set; raises a `BlimpError` with one line when it cannot."""
-    settings = load_run(folder).station
+    run = load_run(folder)
+    settings = run.station
     camera = camera_of(settings.map, settings.map.folder)
     with (
-        Bus(folder, "intake") as bus,
-        Intake(settings, bus.publish, folder=folder, camera=camera) as intake,
+        Bus(folder, "intake", lossless=run.stepped) as bus,
+        Intake(settings, bus.publish, folder=folder, camera=camera, stepped=run.stepped) as intake,
     ):
         bus.serve("intake", intake.ask)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, intake.estimated)

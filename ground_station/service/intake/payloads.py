@@ -162,14 +162,14 @@ class Payload:
             rate_hz=round(rate_hz, 2),
             bitrate_kbps=round(kbps, 1),
             lost_share=lost_share,
-            clock=None
-            if offset is None
-            else {"offset_ns": offset.offset_ns, "uncertainty_ns": offset.uncertainty_ns},
+            clock=None if offset is None else dataclasses.asdict(offset),
             round_trip_s=listener.round_trip_s(self.id),
             battery=_document(state.battery if state else None),
             health=_document(health),
             autopilot=_document(state.autopilot if state else None),
             recording=health.recording if health is not None else "",
+            refused=state.refused if state is not None else 0,
+            ended=state is not None and state.ended,
         )
 
     def close(self) -> None:

@@ -1,23 +1,26 @@
-"""Poses from the bus on their way to the payload, whose autopilot flies by them."""
+"""Poses from the bus on their way back to the payload, whose autopilot flies by them."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-import time
 from collections.abc import Sequence
-
-import numpy as np
+from typing import Any
 
 from ground_station.localization.estimate import State
 from ground_station.service.bus_messages import EstimateMessage
-from ground_station.service.pose_feed import PoseFeed, told_covariance
-from pi_firmware.wire import messages
+from pi_firmware.wire import keys, messages
+from pi_firmware.wire.telemetry import Session
 
 
 def pose_message(note: EstimateMessage, now_ns: int) -> messages.Pose:
-    """What a payload is told of a message, as `pose_feed.pose_message` tells an estimate.
+    """An estimate as the payload takes it; `now_ns` is the ground's clock.
 
-    Raises `ValueError` or `TypeError` for a message whose state or numbers are not as agreed.
+    Its capture time is the payload's clock at capture and not the estimate's own time: a payload
+    that replays a flight has recorded times there, and the autopilot's side judges a pose's age by
+    the payload's clock. The covariance is of the right tangent, rotation first, row by row. What is
+    not finite is not told: without a finite pose the frame counts as LOST. Raises `ValueError` or
+    `TypeError` for a message whose state or numbers are not as agreed.
     """
     state = State(note.state)
     position = quaternion = covariance = None
@@ -27,7 +30,9 @@ def pose_message(note: EstimateMessage, now_ns: int) -> messages.Pose:
         if not all(map(math.isfinite, (*position, *quaternion))):
             position, quaternion, state = None, None, State.LOST
     if position is not None and note.covariance is not None:
-        covariance = told_covariance(np.array(_numbers(note.covariance, 36)).reshape(6, 6))
+        covariance = _numbers(note.covariance, 36)
+        if not all(map(math.isfinite, covariance)):
+            covariance = None
     return messages.Pose(
         time_ns=now_ns,
         capture_ns=note.clock_ns,
@@ -40,9 +45,33 @@ def pose_message(note: EstimateMessage, now_ns: int) -> messages.Pose:
     )
 
 
-def publish(feed: PoseFeed, payload_id: str, note: EstimateMessage) -> None:
-    """Sends one estimate; raises as `pose_message`."""
-    feed.send(payload_id, pose_message(note, time.time_ns()))
+class PoseFeed:
+    """Publishes poses to the payloads whose frames they are of, over an open session."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._publishers: dict[str, Any] = {}
+        self._newest: dict[str, messages.Pose] = {}
+
+    def send(self, payload_id: str, message: messages.Pose) -> None:
+        """Sends a pose, solved or not. One that cannot go is dropped."""
+        import zenoh
+
+        self._newest[payload_id] = message
+        if payload_id not in self._publishers:
+            # At once, or not at all: the next frame has a newer one.
+            self._publishers[payload_id] = self._session.zenoh.declare_publisher(
+                keys.key(payload_id, keys.POSE),
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=True,
+            )
+        with contextlib.suppress(zenoh.ZError):
+            self._publishers[payload_id].put(messages.encode(message))
+
+    def again(self) -> None:
+        """Sends each payload its newest once more: one that waits for it may not have had it."""
+        for payload_id, message in list(self._newest.items()):
+            self.send(payload_id, message)
 
 
 def _numbers(values: Sequence[float], count: int) -> list[float]:

@@ -19,7 +19,6 @@ from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.intake.roster import NAMELESS, Roster
-from ground_station.service.pose_feed import PoseFeed
 from ground_station.service.settings import StationSettings
 from ground_station.stream import commands
 from ground_station.stream.assembly import ReceivedFrame
@@ -66,7 +65,8 @@ class IntakeError(GroundStationError):
 class Intake:
     """Takes up payloads from its start until `close`; `step` it several times a second.
 
-    `say` tells all processes, `folder` is where pictures go (None: none are shown). Raises a
+    `say` tells all processes, `folder` is where pictures go (None: none are shown). `stepped` is
+    for payloads that wait for poses: they are told the newest again at each step. Raises a
     `BlimpError` with one line when a port is in use or a folder of certificates is not one.
     """
 
@@ -77,8 +77,9 @@ class Intake:
         *,
         folder: Path | None = None,
         camera: Camera | None = None,
+        stepped: bool = False,
     ) -> None:
-        self._say_note, self._folder = say, folder
+        self._say_note, self._folder, self._stepped = say, folder, stepped
         self._announced = Announced()
         self._roster = Roster(settings.payloads, self._announced, self._make)
         self._told: dict[str, str] = {}
@@ -106,7 +107,7 @@ class Intake:
             on_event=self._payload_said,
         )
         self._stack.callback(self._listener.close)
-        self._feed = PoseFeed(self._listener.session)
+        self._feed = poses.PoseFeed(self._listener.session)
         self._subscriber = self._listener.session.zenoh.declare_subscriber(
             keys.every_payload("*"), self._heard
         )
@@ -148,6 +149,8 @@ class Intake:
         """
         if self.video.failure:
             raise IntakeError(self.video.failure)
+        if self._stepped:
+            self._feed.again()
         now_s = time.monotonic()
         if now_s >= self._due_s["payloads"]:
             self._due_s["payloads"] = now_s + _PAYLOADS_S
@@ -158,12 +161,14 @@ class Intake:
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Answers a question of the bus; raises a `BlimpError` for what cannot be done."""
+        if request.get("do") == "endpoints":
+            return {"video_port": self.video.port, "telemetry": list(self.endpoints)}
         return questions.answer(request, self.recorder, self._listener.session)
 
     def estimated(self, payload_id: str, note: EstimateMessage) -> None:
         """Takes a pose: it goes to its payload, and into the recording."""
         with contextlib.suppress(ValueError, TypeError, BlimpError):
-            poses.publish(self._feed, payload_id, note)
+            self._feed.send(payload_id, poses.pose_message(note, time.time_ns()))
         self.recorder.estimate(payload_id, note)
 
     def say(self, name: str, level: str, text: str) -> None:

@@ -34,8 +34,9 @@ def main(arguments: list[str]) -> int:
     try:
         check_payload_id(payload_id)
         run = settings.load_run(folder)
-        with Bus(folder, f"{processes.LOCALIZER}/{payload_id}") as bus:
-            return Localizing(bus, folder, payload_id, run.station).run(stop)
+        name = f"{processes.LOCALIZER}/{payload_id}"
+        with Bus(folder, name, lossless=run.stepped) as bus:
+            return Localizing(bus, folder, payload_id, run).run(stop)
     except BlimpError as error:
         print(f"localizer {payload_id}: {error}", file=sys.stderr, flush=True)
         return _BAD_INPUT

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.geometry.poses import to_quaternion
-from ground_station.localization.estimate import Observations, PoseEstimate, State
+from ground_station.geometry.poses import from_quaternion, to_quaternion
+from ground_station.localization.estimate import Counts, Observations, PoseEstimate, State
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 
 Array = npt.NDArray[np.float64]
@@ -61,14 +61,17 @@ def heading_deg(wTc: Array) -> float | None:
     return float(np.rad2deg(np.arctan2(y, x)))
 
 
-def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float]:
-    """The inliers' pixels in the frame as it was taken (distorted), u, v by turns.
+def shown(observations: Observations, most: int = MOST_POINTS) -> npt.NDArray[np.intp]:
+    """Which observations are told: the inliers, at most `most`, evenly chosen in their order."""
+    inliers = np.flatnonzero(observations.inlier)
+    if len(inliers) > most:
+        inliers = inliers[np.arange(most) * len(inliers) // most]
+    return inliers
 
-    At most `most` of them, evenly chosen in the order of the observations; to a tenth of a pixel.
-    """
-    pixels = observations.pixel_px[observations.inlier]
-    if len(pixels) > most:
-        pixels = pixels[np.arange(most) * len(pixels) // most]
+
+def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float]:
+    """Their pixels in the frame as it was taken (distorted), u, v by turns, to a tenth."""
+    pixels = observations.pixel_px[shown(observations, most)]
     rounded: list[float] = np.round(pixels.astype(np.float64), 1).ravel().tolist()
     return rounded
 
@@ -118,6 +121,27 @@ def estimate_note(
         processed=accounts.processed,
         localized=accounts.localized,
         skipped=accounts.skipped,
+    )
+
+
+def estimate_of(note: EstimateMessage, index: int) -> PoseEstimate:
+    """The estimate that was told: without its observations, and but for what a frame adds to it."""
+    wTc = covariance = None
+    if note.position_m is not None and note.quaternion_xyzw is not None:
+        wTc = from_quaternion(note.position_m, note.quaternion_xyzw)
+    if note.covariance is not None:
+        covariance = np.array(note.covariance).reshape(6, 6)
+    return PoseEstimate(
+        time_ns=note.time_ns,
+        index=index,
+        state=State(note.state),
+        reason=note.reason,
+        wTc=wTc,
+        covariance=covariance,
+        counts=Counts(projected=note.expected, inliers=note.inliers),
+        stage_ms=note.stage_ms,
+        relocalized=note.relocalized,
+        tracked=note.tracked,
     )
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from ground_station.errors import MapError
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.localizer import Localizer
-from ground_station.localization.settings import for_live, load_preset
+from ground_station.localization.settings import LocalizerSettings, for_live, load_preset
 from ground_station.map import store
 from ground_station.service.cameras import camera_of
-from ground_station.service.settings import StationSettings
+from ground_station.service.settings import Run, StationSettings
 from pi_firmware.wire.errors import BlimpError
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -36,19 +36,30 @@ def folder_of(settings: StationSettings, name: object) -> Path:
     raise MapError(f"map {name!r}: there is none of that name in {shelf}")
 
 
-def prepare(folder: Path, settings: StationSettings) -> Localizer:
-    """A localizer in a map, for live frames.
+def settings_of(run: Run) -> LocalizerSettings:
+    """The localizer's settings in a run: the preset's, for live frames.
 
-    It finds its first pose in the whole map whatever the preset says: nobody tells a service one.
+    It finds its first pose in the whole map whatever the preset says, where nobody tells it one;
+    and where a payload waits for poses it describes keyframes in their turn, so that no clock
+    decides anything. Raises `ConfigError` for a preset that is not there.
+    """
+    chosen = load_preset(run.station.localizer.preset)
+    if not run.start:
+        chosen = replace(chosen, recovery=replace(chosen.recovery, relocalize=True))
+    return chosen if run.stepped else for_live(chosen)
+
+
+def prepare(folder: Path, run: Run) -> Localizer:
+    """A localizer in a map.
+
     Raises a `BlimpError` with one line: a map that is broken, not registered or of other features.
     """
-    chosen = load_preset(settings.localizer.preset)
-    live = for_live(replace(chosen, recovery=replace(chosen.recovery, relocalize=True)))
+    settings = settings_of(run)
     map_ = store.load(folder)
     if not map_.info.registered:
         raise MapError(f"{folder}: it is not registered, so its poses are not in metres")
-    camera = camera_of(settings.map, map_.info)
-    return Localizer(map_, camera, extractor_for(map_.info, live.features), live)
+    camera = camera_of(run.station.map, map_.info)
+    return Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
 
 
 @dataclass
@@ -73,8 +84,8 @@ class Loading:
 class Loader:
     """Loads one map at a time, on a thread of its own; safe from any thread."""
 
-    def __init__(self, settings: StationSettings) -> None:
-        self._settings = settings
+    def __init__(self, run: Run) -> None:
+        self._run = run
         self._lock = threading.Lock()
         self._loading: Loading | None = None
 
@@ -98,7 +109,7 @@ class Loader:
 
     def _load(self, loading: Loading) -> None:
         try:
-            loading.localizer = prepare(loading.folder, self._settings)
+            loading.localizer = prepare(loading.folder, self._run)
         except BlimpError as error:
             loading.refused = str(error)
         except Exception as error:  # as too little memory: the map in use stays

@@ -1,4 +1,7 @@
-"""The localizer process's loop: the newest frame wins, and what is not taken is counted."""
+"""The localizer process's loop: the newest frame wins, and what is not taken is counted.
+
+Of a payload that waits for poses (`Run.stepped`) each frame is taken in its turn.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import GroundStationError, MapError
+from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.service import bus_messages
@@ -21,10 +25,10 @@ from ground_station.service.localizing import derive, frames
 from ground_station.service.localizing.derive import Accounts
 from ground_station.service.localizing.frames import Taken
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
+from ground_station.service.localizing.overload import Overload
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.overload import Overload
-from ground_station.service.pictures import PictureReader
-from ground_station.service.settings import StationSettings
+from ground_station.service.pictures import SLOTS, PictureReader
+from ground_station.service.settings import Run
 from pi_firmware.wire.errors import BlimpError
 
 RESTART = 3
@@ -45,10 +49,11 @@ class LocalizingError(GroundStationError):
 class Localizing:
     """One payload's frames to poses, on the bus."""
 
-    def __init__(self, bus: Bus, folder: Path, payload_id: str, settings: StationSettings) -> None:
-        self._bus, self._payload_id, self._settings = bus, payload_id, settings
+    def __init__(self, bus: Bus, folder: Path, payload_id: str, run: Run) -> None:
+        self._bus, self._payload_id, self._run = bus, payload_id, run
+        self._start = read_tum(run.start) if run.start else None
         self._pictures = PictureReader(folder, payload_id)
-        self._loader = Loader(settings)
+        self._loader = Loader(run)
         self._localizer: Localizer | None = None
         self._map, self._waiting = "", "the map is being loaded"
         self._forget = threading.Event()
@@ -59,8 +64,10 @@ class Localizing:
         self._complain = RateLimitedLog(
             lambda name, text: self._event(bus_messages.WARNING, name, text)
         )
-        self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id)
-        self._loader.begin(Path(settings.map.folder))
+        # A payload that waits for poses has fewer frames on their way than the ring has slots.
+        most = SLOTS if run.stepped else 1
+        self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, most)
+        self._loader.begin(Path(run.station.map.folder))
         bus.serve(bus.process, self._do)
 
     @property
@@ -108,6 +115,9 @@ class Localizing:
         if another or self._forget.is_set():
             self._forget.clear()
             localizer.reset()
+        if self._start is not None:
+            localizer.set_initial_pose(self._start.at(note.time_ns), note.time_ns)
+            self._start = None
 
     def _localize(self, localizer: Localizer, taken: Taken) -> None:
         note = taken.note
@@ -127,6 +137,9 @@ class Localizing:
         about = (self.accounts, self._map, time.time_ns())
         if estimate is not None:
             told = derive.estimate_note(note, estimate, *about)
+            if self._run.landmarks:
+                seen = estimate.observations
+                told = replace(told, landmarks=seen.landmark[derive.shown(seen)].tolist())
         else:
             fresh = localizer.state is State.INITIALIZING
             state = State.INITIALIZING if fresh else State.LOST
@@ -192,7 +205,7 @@ class Localizing:
         raise LocalizingError(f"do: {what!r:.40} is not known (known: relocalize, map)")
 
     def _choose_map(self, name: object) -> Mapping[str, Any]:
-        loading = self._loader.begin(folder_of(self._settings, name))
+        loading = self._loader.begin(folder_of(self._run.station, name))
         if not loading.taken.wait(_ANSWER_S):
             return {"map": loading.name, "loading": True}
         if loading.refused:

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from card_stand import CHECKOUT, MADE, NEW, NOW, Card, lay, release_json
 from manager import Manager, environment
+from receiving import Receiver
 
 from deploy.board.releases import watch
 from deploy.update import bundle as bundles
 from ground_station.stream.feedback import Feedback
-from ground_station.stream.receiver import Receiver
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import __version__
 

@@ -16,11 +16,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).resolve().parents[2] / "stream"))
+
+from receiving import Receiver
+
 from deploy.emulator import card, gauge
 from deploy.emulator.machine import HOST, Machine
 from deploy.errors import DeployError
 from deploy.run import run
-from ground_station.stream.receiver import ReceivedFrame, Receiver
+from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 
@@ -85,7 +89,7 @@ class Ground:
         folder = keys / "ground" / "main"
         self._closed = False
         self.telemetry = TelemetryListener(["tls/127.0.0.1:7447"], certificates=folder)
-        self.video = Receiver(5600, queue_frames=8, color=False, srtp_keys=load_keys(folder))
+        self.video = Receiver(5600, queue_frames=8, srtp_keys=load_keys(folder))
 
     def __enter__(self) -> Ground:
         return self

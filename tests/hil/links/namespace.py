@@ -26,9 +26,7 @@ from ground_station.keys.authority import Authority
 from ground_station.replay.cases.case import Link
 from ground_station.replay.cases.outcome import Outage
 from ground_station.replay.rig import LOOPBACK, Rig
-from ground_station.stream.receiver import Receiver
-from ground_station.stream.srtp import load_keys
-from ground_station.stream.telemetry import TelemetryListener
+from ground_station.service.settings import TelemetrySettings, VideoSettings
 
 _TOOLS = ("ip", "tc", "unshare", "nsenter")
 _LIMIT_S = 30.0
@@ -50,7 +48,7 @@ class NamespaceLink:
         self._link = link
         self._stack = contextlib.ExitStack()
         self._outages: list[Outage] = []
-        self._receiver: Receiver | None = None
+        self._flying = threading.Event()
         self._firmware: _Firmware | None = None
 
     def lacks(self) -> str:
@@ -96,7 +94,14 @@ class NamespaceLink:
 
     def stand(self) -> Rig:
         """The ground's ends on the cable, and the firmware in its namespace."""
-        return Rig(self._open, self._listen, self, self._fly)
+        host = f"{self._address}1"
+        return Rig(
+            payload=self._fly,
+            link=self,
+            video=VideoSettings(host=host, port=0),
+            telemetry=TelemetrySettings(listen=[f"tls/{host}:0"], certificates=str(self._ground)),
+            on_first_frame=self._flying.set,
+        )
 
     @contextlib.contextmanager
     def __call__(self, receiver_port: int) -> Iterator[int]:
@@ -125,15 +130,6 @@ class NamespaceLink:
         """When the cable was pulled, on this machine's wall clock."""
         return list(self._outages)
 
-    def _open(self, queue_frames: int) -> Receiver:
-        host = f"{self._address}1"
-        keys = load_keys(self._ground)
-        self._receiver = Receiver(0, host, queue_frames=queue_frames, srtp_keys=keys)
-        return self._receiver
-
-    def _listen(self) -> TelemetryListener:
-        return TelemetryListener([f"tls/{self._address}1:0"], certificates=self._ground)
-
     @contextlib.contextmanager
     def _fly(self, config: dict[str, Any], folder: Path) -> Iterator[_Firmware]:
         config = {
@@ -149,9 +145,9 @@ class NamespaceLink:
             firmware.end()
 
     def _pull(self, ended: threading.Event) -> None:
-        """Pulls the cable at the case's times from the first packet on."""
-        while self._receiver is None or self._receiver.counters.packets == 0:
-            if ended.wait(0.01):
+        """Pulls the cable at the case's times from the first frame on."""
+        while not self._flying.wait(0.01):
+            if ended.is_set():
                 return
         first_s = time.monotonic()
         for at_s, for_s in self._link.outages:

@@ -21,9 +21,8 @@ from payloads.distant import Flight
 from payloads.target import SshError, Target, parsed, reason
 
 from ground_station.replay.rig import Rig
-from ground_station.stream.receiver import Receiver
+from ground_station.service.settings import TelemetrySettings, VideoSettings
 from ground_station.stream.srtp import load_keys
-from ground_station.stream.telemetry import TelemetryListener
 
 BOARD = Path(__file__).with_name("board.py")
 _TAKE = (
@@ -136,34 +135,21 @@ class SshPayload:
 
     def stand(self, settings: tuple[str, ...], link: Any) -> Rig:
         """For one flight: `settings` are the firmware's, `link` the suite's."""
-        behind = link.kind != "loopback"
-        made = Rig(
-            receiver=lambda queue_frames: self._receiver(queue_frames, behind),
-            telemetry=self._telemetry,
-            link=link,
-            payload=lambda config, folder: self.payload(config, folder, settings),
-        )
-        return _of(made, self.payload_id) if self.is_card else made
-
-    def _receiver(self, queue_frames: int, behind_link: bool) -> Receiver:
-        """The ground's video end: SRTP of this payload, or plain RTP on loopback."""
-        if self.certificates is None:
-            return Receiver(0, queue_frames=queue_frames)
-        keys = load_keys(self.certificates)
-        if self.payload_id not in keys:
+        made = Rig(payload=lambda config, folder: self.payload(config, folder, settings), link=link)
+        if self.certificates is None:  # plain, on loopback
+            return made
+        if self.payload_id not in load_keys(self.certificates):
             raise SshError(f"{self.certificates}: no SRTP key of '{self.payload_id}'")
-        own = {self.payload_id: keys[self.payload_id]}
-        if behind_link:
-            return Receiver(0, queue_frames=queue_frames, srtp_keys=own)
-        port = self._video_port
-        return Receiver(port, self._bind, queue_frames=queue_frames, srtp_keys=own)
-
-    def _telemetry(self) -> TelemetryListener:
-        """The ground's telemetry end: mutual TLS, or plain on loopback."""
-        if self.certificates is None:
-            return TelemetryListener(["tcp/127.0.0.1:0"])
-        endpoint = f"tls/{self._bind}:{self._telemetry_port}"
-        return TelemetryListener([endpoint], certificates=self.certificates)
+        video = VideoSettings(host=self._bind, port=self._video_port)
+        return dataclasses.replace(
+            made,
+            video=video if link.kind == "loopback" else made.video,
+            telemetry=TelemetrySettings(
+                listen=[f"tls/{self._bind}:{self._telemetry_port}"],
+                certificates=str(self.certificates),
+            ),
+            payload_id=self.payload_id,
+        )
 
     def send(self, recording: Path) -> str:
         """Brings a recording there unless it is there already; its name on the board."""
@@ -279,13 +265,6 @@ class SshPayload:
         if self.is_card if root is None else root:
             words = ["sudo", "-n", *words]
         return [*self.target.words(), shlex.join(words)]
-
-
-def _of(stand: Rig, payload_id: str | None) -> Rig:
-    """The stand of a payload whose certificate has a name of its own."""
-    if "payload_id" not in {field.name for field in dataclasses.fields(Rig)}:
-        raise SshError(f"'{payload_id}': this ground station replays payloads called 'replay' only")
-    return dataclasses.replace(stand, **{"payload_id": payload_id})
 
 
 def _text(value: Any) -> str:

@@ -28,9 +28,6 @@ from pi_firmware.wire.recording import RecordingReader
 
 Array = npt.NDArray[np.float64]
 
-QUEUE_FRAMES = 4
-"""As the live receiver's: a late localizer loses the oldest frame of a full queue."""
-
 
 @dataclass
 class Flight:
@@ -150,7 +147,7 @@ def feed_paced(
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Run:
-    """Gives each frame at its time; what piles up is queued, and lost as a receiver loses it."""
+    """Gives each frame at its time; of those that pile up the newest wins, as in the service."""
     run, queue = Run(), deque[tuple[float, Frame]]()
     ahead = iter(frames)
     upcoming = next(ahead, None)
@@ -161,7 +158,7 @@ def feed_paced(
         while upcoming is not None and (upcoming.time_ns - first_ns) / 1e9 <= now_s:
             queue.append(((upcoming.time_ns - first_ns) / 1e9, upcoming))
             upcoming = next(ahead, None)
-        while len(queue) > QUEUE_FRAMES:
+        while len(queue) > 1:
             queue.popleft()
             run.dropped += 1
         if queue:
