@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ground_station.service.bus_messages import ALARM, INFO, STATION, WARNING
+from ground_station.service.bus_messages import ALARM, INFO, STATION, WARNING, Level
 from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
 
 HOLD_S = 3.0
@@ -35,7 +35,7 @@ class Alarm:
     """One alarm; `id` is the same as long as it stands, `payload` is "-" where it is of none."""
 
     id: str
-    level: str
+    level: Level
     payload: str
     text: str
     since_ns: int = 0

@@ -1,19 +1,21 @@
 """What the service's processes say to one another: JSON objects on the local bus.
 
-All of them run the same version, so a message has no schema of its own; what does not fit is
-dropped. Times are int nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine's
-wall clock.
+All of them run the same version, so a message has no schema of its own. It is checked once, as it
+is decoded: what is not of these types and ranges is no message, and who takes one may trust it.
+Times are nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine's wall clock.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import functools
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 from ground_station.errors import GroundStationError
-from ground_station.files import finite
+from pi_firmware.wire import messages
 
 FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
 EVENT, RECORDING, PROCESS = "event", "recording", "process"
@@ -21,38 +23,48 @@ KINDS = (FRAME, ESTIMATE, PAYLOAD, EVENT, RECORDING, PROCESS)
 STATION = "-"
 """Stands for a payload's id where a message is of none."""
 
-INFO, WARNING, ALARM = "info", "warning", "alarm"
+Level = Literal["info", "warning", "alarm"]
+INFO: Level = "info"
+WARNING: Level = "warning"
+ALARM: Level = "alarm"
 RECORDING_RESUMED = "recording-resumed"
 """An event: a recording that was cut goes on in another file."""
 
 N = TypeVar("N", bound="Message")
 
-_DEEPEST, _FLAT_BRACKETS = 32, 32
+Count = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+Time = Count
+WallTime = Annotated[int, Meta(ge=0, lt=(1 << 32) * 1_000_000_000)]
+"""Of this machine: until 2106, which is as far as Foxglove's stamps go."""
+Vector3 = Annotated[list[float], Meta(min_length=3, max_length=3)]
+Quaternion = Annotated[list[float], Meta(min_length=4, max_length=4)]
+Matrix3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
+Matrix6 = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 
 class MessageError(GroundStationError):
     """Bytes on the bus that are no message of the kind."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Message:
     """Base of all messages."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FrameMessage(Message):
     """A received frame, whose picture lies in the ring at `slot` while `stamp` still holds."""
 
-    slot: int
-    stamp: int
-    sequence: int
-    time_ns: int  # the camera's
-    clock_ns: int  # the payload's clock at capture
-    arrival_ns: int
-    width_px: int
-    height_px: int
-    ssrc: int
-    capture_ns: int | None = None  # None while the payload's clock is not known
+    slot: Count
+    stamp: Count
+    sequence: Count
+    time_ns: Time  # the camera's
+    clock_ns: Time  # the payload's clock at capture
+    arrival_ns: WallTime
+    width_px: Count
+    height_px: Count
+    ssrc: Count
+    capture_ns: WallTime | None = None  # None while the payload's clock is not known
     exposure_s: float | None = None
     gain: float | None = None
     entropy_bits: float = 0.0
@@ -60,7 +72,7 @@ class FrameMessage(Message):
     heartbeat: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class EstimateMessage(Message):
     """A frame's pose, or why there is none.
 
@@ -72,18 +84,18 @@ class EstimateMessage(Message):
     `overload` says in words that the processor is too slow for them; "" while it is not.
     """
 
-    sequence: int
-    time_ns: int
-    clock_ns: int
-    done_ns: int
-    state: str
-    capture_ns: int | None = None
+    sequence: Count
+    time_ns: Time
+    clock_ns: Time
+    done_ns: WallTime
+    state: Literal["INITIALIZING", "TRACKING", "DEGRADED", "LOST"]
+    capture_ns: WallTime | None = None
     reason: str = ""
-    position_m: list[float] | None = None
-    quaternion_xyzw: list[float] | None = None
-    covariance: list[float] | None = None
-    position_sigma_m: list[float] | None = None
-    velocity_mps: list[float] | None = None  # world axes
+    position_m: Vector3 | None = None
+    quaternion_xyzw: Quaternion | None = None
+    covariance: Matrix6 | None = None
+    position_sigma_m: Matrix3 | None = None
+    velocity_mps: Vector3 | None = None  # world axes
     heading_deg: float | None = None  # of the view, from the map's x axis towards y
     speed_mps: float | None = None
     height_m: float | None = None
@@ -101,7 +113,7 @@ class EstimateMessage(Message):
     overload: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PayloadMessage(Message):
     """A payload as the intake sees it, twice a second.
 
@@ -122,26 +134,26 @@ class PayloadMessage(Message):
     lost_share: float = 0.0  # of late
     clock: dict[str, int] | None = None  # offset_ns, uncertainty_ns, steps
     round_trip_s: float | None = None
-    battery: dict[str, Any] | None = None
-    health: dict[str, Any] | None = None
-    autopilot: dict[str, Any] | None = None
+    battery: messages.Battery | None = None
+    health: messages.Health | None = None
+    autopilot: messages.Autopilot | None = None
     recording: str = ""  # the file on the payload's own card
     refused: int = 0
     ended: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class EventMessage(Message):
     """Something that happened; `source` is payload, intake, localizer, web or station."""
 
-    time_ns: int
+    time_ns: WallTime
     source: str
-    level: str
+    level: Level
     name: str
     text: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class RecordingMessage(Message):
     """The ground's own recording, each second."""
 
@@ -155,7 +167,7 @@ class RecordingMessage(Message):
     resumed: str = ""  # where it goes on from one that was cut: both files, and what is lost
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ProcessMessage(Message):
     """A process of the service says that it lives."""
 
@@ -169,37 +181,23 @@ class ProcessMessage(Message):
 
 def encode(message: Message) -> bytes:
     """A message as JSON; numbers that are not finite become null, which JSON can say."""
-    document = {item.name: getattr(message, item.name) for item in dataclasses.fields(message)}
-    try:
-        return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    except ValueError:
-        return json.dumps(finite(document), separators=(",", ":"), allow_nan=False).encode()
+    return msgspec.json.encode(message)
+
+
+@functools.cache
+def _decoder(kind: type[N]) -> msgspec.json.Decoder[N]:
+    return msgspec.json.Decoder(kind)
 
 
 def decode(kind: type[N], data: bytes) -> N:
     """A message of a kind; raises `MessageError` with one line."""
     try:
-        document = json.loads(data)
-        # None of ours has so many; one that nests without end could be read and not be written.
-        if data.count(b"[") + data.count(b"{") > _FLAT_BRACKETS and _depth(document) > _DEEPEST:
-            raise ValueError(f"it nests deeper than {_DEEPEST}")
-        return kind(**document)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise MessageError(f"{kind.__name__}: {str(error)[:120]}") from None
-
-
-def _depth(value: Any) -> int:
-    """How deep a document nests, as far as it matters."""
-    level, depth = [value], 0
-    while level and depth <= _DEEPEST:
-        depth += 1
-        inner = [list(i.values()) if isinstance(i, dict) else i for i in level]
-        level = [v for i in inner if isinstance(i, list) for v in i if isinstance(v, dict | list)]
-    return depth
+        return _decoder(kind).decode(data)  # type: ignore[arg-type]  # a class is hashable
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+        raise MessageError(f"{kind.__name__}: {str(error)[:120]!r}") from None
 
 
 def as_document(message: Message) -> dict[str, Any]:
     """A message as plain JSON values."""
-    document = {item.name: getattr(message, item.name) for item in dataclasses.fields(message)}
-    told: dict[str, Any] = finite(document)
-    return told
+    document: dict[str, Any] = msgspec.to_builtins(message)
+    return document

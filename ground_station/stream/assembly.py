@@ -114,7 +114,7 @@ class Assembly:
             if image is None:
                 continue
             info = sei.find(unit.data)
-            if info is None:
+            if info is None or min(info.time_ns, info.clock_ns) < 0:
                 self._counters.unstamped += 1
                 continue
             self._counters.decoded += 1

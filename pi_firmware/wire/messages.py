@@ -326,6 +326,8 @@ def _value(value: Any, kind: Any, what: str) -> Any:
         value = float(value) if abs(value) < 2**1000 else math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise TelemetryError(f"{what} must be {kind.__name__}, not {str(value)[:60]!r}")
+    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+        raise TelemetryError(f"{what} holds half a character, which no text can")
     if isinstance(value, float) and not math.isfinite(value):
         raise TelemetryError(f"{what} must be finite, not {value}")
     return value

@@ -77,5 +77,5 @@ def test_poses_of_the_localizer_reach_the_autopilot(monkeypatch: pytest.MonkeyPa
         np.testing.assert_allclose([message.x, -message.y, -message.z], at, atol=0.3)
         assert not np.isnan(message.covariance[0]) and message.covariance[0] > 0
     health = result.live.payload.health
-    assert health is not None and health["round_trip_s"] < 10
-    assert health["lost"] in (None, 0.0)
+    assert health is not None and health.round_trip_s is not None and health.round_trip_s < 10
+    assert health.lost in (None, 0.0)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -82,38 +80,6 @@ def test_a_frame_that_was_not_solved_has_no_pose(state: State) -> None:
     assert message.state == state.value
     assert message.position_m is message.quaternion_xyzw is message.covariance is None
     assert PoseGate(AutopilotSettings(uri="off:")).take(message, 1) is None
-
-
-def test_a_quaternion_is_told_of_length_one_and_with_w_from_zero() -> None:
-    assert NOTE.quaternion_xyzw is not None
-    turned = [-2.0 * value for value in NOTE.quaternion_xyzw]
-    message = pose_message(replace(NOTE, quaternion_xyzw=turned), NOW_NS)
-    assert message.quaternion_xyzw == pytest.approx(NOTE.quaternion_xyzw)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_not_finite_is_told_as_lost_or_left_out(value: float) -> None:
-    message = pose_message(replace(NOTE, position_m=[0.0, value, 0.0]), NOW_NS)
-    assert message.state == "LOST" and message.position_m is message.covariance is None
-    message = pose_message(replace(NOTE, covariance=[value] * 36), NOW_NS)
-    assert message.state == "TRACKING" and message.position_m and message.covariance is None
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"state": "FINE"},
-        {"position_m": [1.0, 2.0]},
-        {"position_m": 3},
-        {"position_m": ["a", 1.0, 2.0]},
-        {"quaternion_xyzw": [0.0] * 4},
-        {"covariance": [1.0] * 35},
-    ],
-)
-def test_a_note_that_is_not_as_agreed_is_refused(wrong: dict[str, Any]) -> None:
-    note: EstimateMessage = replace(NOTE, **wrong)
-    with pytest.raises((ValueError, TypeError)):
-        pose_message(note, NOW_NS)
 
 
 def test_poses_reach_the_payload_they_are_of() -> None:

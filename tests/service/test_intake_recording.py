@@ -347,7 +347,7 @@ def test_blimp_record_records_without_the_service(tmp_path: Path) -> None:
     "arguments",
     [
         ["--seconds", "-1"],
-        ["--port", "0"],
+        ["--port", "70000"],
         ["--camera", "/nowhere/camera.toml"],
         ["--out", "/proc/nothing/here"],
         ["--set", "video.host=192.0.2.1"],

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import numpy as np
 import pytest
 import web_station as station
 
-from ground_station.service import bus_messages
 from ground_station.service.web import trail
 from ground_station.service.web.snapshot import EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
 
@@ -107,24 +105,6 @@ def test_a_process_that_ended_is_forgotten_and_one_with_another_pid_was_restarte
     assert snapshot.document()["processes"] == []
 
 
-def test_numbers_that_json_cannot_say_become_null(snapshot):
-    nan = float("nan")
-    snapshot.estimate(P, station.estimate(position_m=[nan, 0.0, 0.0], speed_mps=nan))
-    snapshot.payload(P, station.payload(battery={"time_ns": 1, "voltage": float("inf")}))
-    text = json.dumps(snapshot.document(), allow_nan=False)
-    view = json.loads(text)["payloads"][P]
-    assert view["estimate"]["speed_mps"] is None and view["trail"] == []
-
-
-def test_a_note_of_other_types_is_dropped_and_counted(snapshot):
-    for bad in ("x", [["a"]], 7, ["x", "y", "z"]):
-        snapshot.careful(snapshot.estimate)(P, station.estimate(position_m=bad))
-    snapshot.careful(snapshot.process)("-", station.process(restarts="many"))
-    snapshot.careful(snapshot.process)("-", station.process(restarts="more", pid=5))
-    assert snapshot.dropped >= 4
-    json.dumps(snapshot.document(), allow_nan=False)
-
-
 def test_the_short_document_lacks_what_is_long(snapshot):
     snapshot.estimate(P, station.estimate())
     short = snapshot.document(full=False)
@@ -167,11 +147,3 @@ def test_standing_still_is_no_gap_and_takes_no_room():
     walked.add(30 * S, [1.0, 0.0, 0.0])
     points, breaks = walked.document()
     assert len(points) == 2 and breaks == []
-
-
-def test_a_count_without_end_is_no_number_of_the_document(snapshot):
-    for restarts in (1, float("inf")):
-        snapshot.process("", bus_messages.ProcessMessage("intake", 100, restarts=restarts))
-    document = snapshot.document()
-    json.dumps(document, allow_nan=False)
-    assert [item["restarts"] for item in document["processes"]] == [None]

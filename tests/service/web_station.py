@@ -32,6 +32,7 @@ from ground_station.service.settings import (
     Run,
     StationSettings,
 )
+from pi_firmware.wire import messages
 
 with warnings.catch_warnings():  # of a client that starlette would rather have
     warnings.simplefilter("ignore")
@@ -60,6 +61,12 @@ class SilentBus:
         self.said.append((kind, payload_id, note))
 
     def put(self, kind: str, payload_id: str, note: bus_messages.Message) -> None:
+        """As over the bus: what is no message is dropped and counted."""
+        try:
+            note = bus_messages.decode(type(note), bus_messages.encode(note))
+        except bus_messages.MessageError:
+            self.dropped += 1
+            return
         for take in self._takes.get(kind, ()):
             take(payload_id, note)
 
@@ -100,16 +107,30 @@ def estimate(sequence: int = 1, **values: Any) -> EstimateMessage:
     return replace(note, **values)
 
 
+_REQUIRED = {"battery": {"voltage": 3.9}, "health": {"uptime_s": 60.0}}
+
+
 def payload(**values: Any) -> PayloadMessage:
     now_ns = time.time_ns()
     note = PayloadMessage(
         alive=True, seen_ns=now_ns, ssrc=7, frames={"captured": 100, "received": 90, "lost": 1},
         stream={"packets": 1000, "packets_lost": 10}, rate_hz=29.9, bitrate_kbps=1500.0,
         clock={"offset_ns": 5, "uncertainty_ns": 100_000}, round_trip_s=0.01,
-        battery={"time_ns": now_ns, "voltage": 3.9, "percentage": 0.8, "current": -0.4,
-                 "time_left_s": 900.0, "alarm": ""},
-        health={"time_ns": now_ns, "temperature_C": 51.0, "cpu": 0.4, "wifi_signal_dBm": -55.0},
+        battery=messages.Battery(
+            now_ns, 3.9, percentage=0.8, current=-0.4, time_left_s=900.0, alarm=""
+        ),
+        health=messages.Health(
+            now_ns, uptime_s=60.0, temperature_C=51.0, cpu=0.4, wifi_signal_dBm=-55.0
+        ),
     )  # fmt: skip
+    kinds = {
+        "battery": messages.Battery,
+        "health": messages.Health,
+        "autopilot": messages.Autopilot,
+    }
+    for name, kind in kinds.items():
+        if isinstance(fields := values.get(name), dict):
+            values[name] = kind(**{"time_ns": now_ns, **_REQUIRED.get(name, {}), **fields})
     return replace(note, **values)
 
 

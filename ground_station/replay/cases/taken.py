@@ -17,6 +17,7 @@ from ground_station.replay.cases.outcome import Accounts, Outage, Outcome, Run, 
 from ground_station.replay.live import LiveResult
 from ground_station.replay.replay import ReplayResult
 from ground_station.replay.resources import Side
+from pi_firmware.wire import messages
 
 
 def outcome_of(
@@ -41,7 +42,7 @@ def outcome_of(
     settings, live = result.settings, result.live
     payload_side, health = result.payload_side, live.payload.health
     if payload_side is None and health is not None:
-        payload_side = Side(health["memory_MB"], health["cpu"], "its health message")
+        payload_side = Side(health.memory_MB, health.cpu, "its health message")
     truth = result.truth if truth is None else truth
     table = table_of(live)
     run = Run(
@@ -65,8 +66,8 @@ def outcome_of(
         link_counts=dict(link_counts or {}),
         clock_offset=live.clock,
         outages=[dataclasses.asdict(outage) for outage in outages],
-        battery=live.payload.battery,
-        health=health,
+        battery=_document(live.payload.battery),
+        health=_document(health),
         refused=live.payload.refused,
         payload_side=dataclasses.asdict(payload_side or Side()),
         ground_side=dataclasses.asdict(result.ground_side),
@@ -117,11 +118,15 @@ def floorplan_of(map_: Map) -> FloorPlan | None:
     return load_floorplan(path) if path is not None and path.is_file() else None
 
 
-def _told(health: dict[str, Any] | None) -> dict[str, str]:
-    if health is None or not health["version"]:
+def _document(message: messages.Message | None) -> dict[str, Any] | None:
+    return None if message is None else dataclasses.asdict(message)
+
+
+def _told(health: messages.Health | None) -> dict[str, str]:
+    if health is None or not health.version:
         return {}
-    how = f" ({health['release']})" if health["release"] else ""
-    return {"pi_firmware": f"{health['version']}{how}"}
+    how = f" ({health.release})" if health.release else ""
+    return {"pi_firmware": f"{health.version}{how}"}
 
 
 def _plain(settings: dict[str, Any], without: tuple[str, ...]) -> dict[str, Any]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry import poses
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 
 Array = npt.NDArray[np.float64]
 
@@ -17,6 +20,42 @@ ELLIPSOID_SIGMAS = 2.7955
 """An ellipsoid of so many standard deviations holds 95 % of a normal distribution in space: the
 square root of chi-square's quantile at 0.95 with three degrees of freedom, 7.8147."""
 _LEAST_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A pose as it goes out: `wTc` (4, 4) of the body axes; `covariance` (6, 6) in ROS's order."""
+
+    wTc: Array
+    covariance: Array | None
+
+    @property
+    def position_m(self) -> list[float]:
+        """x, y, z."""
+        values: list[float] = self.wTc[:3, 3].tolist()
+        return values
+
+    @property
+    def quaternion_xyzw(self) -> list[float]:
+        """x, y, z, w."""
+        values: list[float] = poses.to_quaternion(self.wTc).tolist()
+        return values
+
+
+def solved(note: EstimateMessage) -> Solved | None:
+    """A message's pose; None when it has none."""
+    if note.position_m is None or note.quaternion_xyzw is None:
+        return None
+    wTo = poses.from_quaternion(note.position_m, note.quaternion_xyzw)
+    covariance = None if note.covariance is None else ros_covariance(wTo, note.covariance)
+    return Solved(body_pose(wTo), covariance)
+
+
+def stamp_ns(note: FrameMessage | EstimateMessage) -> int:
+    """When its picture was taken, on this machine's clock; arrival or solution while unknown."""
+    if note.capture_ns is not None:
+        return note.capture_ns
+    return note.arrival_ns if isinstance(note, FrameMessage) else note.done_ns
 
 
 def camera_frame(payload_id: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from typing import Any
+from typing import Any, Literal
 
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import (
@@ -15,7 +15,7 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.foxglove import conversion
-from ground_station.service.foxglove.checks import Solved, stamp_ns
+from ground_station.service.foxglove.conversion import Solved, stamp_ns
 from pi_firmware.wire import messages
 
 _TYPES = {int: "integer", float: "number", str: "string", bool: "boolean", dict: "object"}
@@ -124,10 +124,11 @@ def _properties(of: type, leave: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def _property(hint: Any) -> dict[str, Any]:
-    if isinstance(hint, types.UnionType):
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
         hint = next(item for item in typing.get_args(hint) if item is not type(None))
     origin = typing.get_origin(hint)
     if origin is list:
         return {"type": "array", "items": _property(typing.get_args(hint)[0])}
-    name = _TYPES.get(origin or hint)
-    return {"type": name} if name else {}
+    if origin is Literal:
+        return {"type": "string"}
+    return {"type": "object" if dataclasses.is_dataclass(hint) else _TYPES[origin or hint]}

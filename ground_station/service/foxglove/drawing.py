@@ -41,7 +41,7 @@ from ground_station.localization.estimate import State
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EventMessage
 from ground_station.service.foxglove import conversion
-from ground_station.service.foxglove.checks import Solved
+from ground_station.service.foxglove.conversion import Solved
 
 MARKER, ELLIPSOID, TRAIL = "marker", "ellipsoid", "trail"
 _LENGTH_M = 0.5

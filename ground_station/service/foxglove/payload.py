@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from foxglove import Context
 from foxglove.channels import (
     CameraCalibrationChannel,
@@ -17,11 +19,11 @@ from foxglove.channels import (
 )
 
 from ground_station.geometry.camera import Camera
+from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage, PayloadMessage
-from ground_station.service.foxglove import checks, documents, drawing
-from ground_station.service.foxglove.checks import Solved
+from ground_station.service.foxglove import conversion, documents, drawing
+from ground_station.service.foxglove.conversion import Solved
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
-from ground_station.service.localizing import frames
 from ground_station.service.pictures import PictureReader
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.trail import Trail
@@ -96,26 +98,27 @@ class Payload:
         now_s = time.monotonic()
         if not self._image.wanted or now_s < self._due_s - _EARLY * self._period_s:
             return
-        taken = frames.take(self._pictures, note)
-        if isinstance(taken, str):  # overwritten meanwhile: the next one comes
+        image = self._pictures.read(note.slot, note.stamp)
+        if image is None:  # overwritten meanwhile: the next one comes
             return
         self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s
-        time_ns = checks.stamp_ns(note)
-        self._image.say(lambda: self._encoded(taken, time_ns), time_ns)
+        time_ns = conversion.stamp_ns(note)
+        self._image.say(lambda: self._encoded(image, time_ns), time_ns)
 
     def estimate(self, note: EstimateMessage) -> None:
         """A frame's pose, or why there is none."""
-        time_ns, pose = checks.stamp_ns(note), checks.solved(note)
-        self._state, self._alive = str(note.state)[:32], True
+        time_ns, pose = conversion.stamp_ns(note), conversion.solved(note)
+        self._state, self._alive = note.state, True
         if pose is not None:
-            begins = not self._was_solved or note.relocalized is True
+            begins = not self._was_solved or note.relocalized
             self._trail.add(time_ns, pose.position_m, begins=begins)
             self._last = (pose, time_ns)
             self._pose.say(lambda: drawing.pose_in_map(pose, time_ns), time_ns)
             self._tf.say(lambda: drawing.transforms(self._id, pose, time_ns), time_ns)
         self._was_solved = pose is not None
         self._estimate.say(lambda: documents.estimate(self._id, note, pose), time_ns)
-        self._points.say(lambda: drawing.tracked(checks.points(note), time_ns), time_ns)
+        points = list(zip(note.points_px[::2], note.points_px[1::2], strict=True))
+        self._points.say(lambda: drawing.tracked(points, time_ns), time_ns)
         if self._last is not None:
             self._scene.say(lambda: self._marker(time_ns), time_ns)
             now_s = time.monotonic()
@@ -126,16 +129,18 @@ class Payload:
     def status(self, note: PayloadMessage) -> None:
         """What the intake says of it; its messages when they are new."""
         now_ns = time.time_ns()
-        told = {"battery": note.battery, "health": note.health, "status": documents.status(note)}
+        document = bus_messages.as_document(note)
+        told = {**{name: document[name] for name in ("battery", "health")},
+                "status": documents.status(note)}  # fmt: skip
         for name, document in told.items():
-            if isinstance(document, dict) and document != self._told.get(name, ({}, 0))[0]:
+            if document is not None and document != self._told.get(name, ({}, 0))[0]:
                 self._told[name] = (document, now_ns)
                 for make, log_ns in self._recall(name):
                     self._messages[name].say(make, log_ns)
-        if self._alive and note.alive is False:
+        if self._alive and not note.alive:
             self._scene.say(lambda: drawing.gone(now_ns), now_ns)
             self._was_solved = False
-        self._alive = note.alive is True
+        self._alive = note.alive
 
     def _recall(self, name: str) -> Iterator[tuple[Make, int]]:
         if name in self._told:
@@ -164,9 +169,9 @@ class Payload:
     def _line(self, time_ns: int) -> Any:
         return drawing.trail(*self._trail.document(), time_ns)
 
-    def _encoded(self, taken: frames.Taken, time_ns: int) -> Any:
+    def _encoded(self, image: npt.NDArray[np.uint8], time_ns: int) -> Any:
         import cv2
 
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._quality]
-        _, jpeg = cv2.imencode(".jpg", taken.image, quality)
+        _, jpeg = cv2.imencode(".jpg", image, quality)
         return drawing.picture(self._id, jpeg.tobytes(), time_ns)

@@ -28,7 +28,7 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.cameras import camera_of
-from ground_station.service.foxglove import checks, documents, drawing, log, world
+from ground_station.service.foxglove import documents, drawing, log, world
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.payload import Payload
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
@@ -133,9 +133,7 @@ class Publishing:
             payload.status(note)
 
     def _take_event(self, payload_id: str, note: EventMessage) -> None:
-        if not checks.is_event(note):
-            return
-        time_ns = note.time_ns if checks.is_time(note.time_ns) else time.time_ns()
+        time_ns = note.time_ns
         self._events.append((payload_id, note, time_ns))
         self._event.say(lambda: documents.event(payload_id, note), time_ns)
         self._log.say(lambda: drawing.log(payload_id, note, time_ns), time_ns)

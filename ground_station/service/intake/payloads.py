@@ -164,9 +164,9 @@ class Payload:
             lost_share=lost_share,
             clock=None if offset is None else dataclasses.asdict(offset),
             round_trip_s=listener.round_trip_s(self.id),
-            battery=_document(state.battery if state else None),
-            health=_document(health),
-            autopilot=_document(state.autopilot if state else None),
+            battery=state.battery if state else None,
+            health=health,
+            autopilot=state.autopilot if state else None,
             recording=health.recording if health is not None else "",
             refused=state.refused if state is not None else 0,
             ended=state is not None and state.ended,
@@ -233,7 +233,3 @@ class Payload:
 def _withheld(counters: Counters) -> int:
     """Frames that came and cannot be shown."""
     return counters.withheld + counters.failed + counters.unstamped
-
-
-def _document(message: messages.Message | None) -> dict[str, object] | None:
-    return None if message is None else dataclasses.asdict(message)

@@ -13,7 +13,7 @@ from typing import Any
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages, memory
-from ground_station.service.bus_messages import EstimateMessage, EventMessage, Message
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, Level, Message
 from ground_station.service.intake import poses, questions
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
@@ -27,7 +27,7 @@ from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import keys, messages
-from pi_firmware.wire.errors import BlimpError, TelemetryError
+from pi_firmware.wire.errors import TelemetryError
 
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
@@ -36,7 +36,7 @@ _NAME_LENGTH, _TEXT_LENGTH = 64, 500
 _TOLD = 256
 _EARLY, _EARLY_S = 64, 3.0
 
-_LEVELS = {
+_LEVELS: dict[str, Level] = {
     messages.EVENT_FAILED: bus_messages.ALARM,
     messages.EVENT_BATTERY_CRITICAL: bus_messages.ALARM,
     messages.EVENT_BATTERY_LOW: bus_messages.WARNING,
@@ -167,11 +167,10 @@ class Intake:
 
     def estimated(self, payload_id: str, note: EstimateMessage) -> None:
         """Takes a pose: it goes to its payload, and into the recording."""
-        with contextlib.suppress(ValueError, TypeError, BlimpError):
-            self._feed.send(payload_id, poses.pose_message(note, time.time_ns()))
+        self._feed.send(payload_id, poses.pose_message(note, time.time_ns()))
         self.recorder.estimate(payload_id, note)
 
-    def say(self, name: str, level: str, text: str) -> None:
+    def say(self, name: str, level: Level, text: str) -> None:
         """Says an event of the recorder's."""
         self._event("intake", level, name, text, bus_messages.STATION)
         self._due_s["recording"] = 0.0
@@ -281,7 +280,7 @@ class Intake:
         level = bus_messages.WARNING if problem else bus_messages.INFO
         self._event("intake", level, name, problem or "is over", payload_id)
 
-    def _event(self, source: str, level: str, name: str, text: str, payload_id: str) -> None:
+    def _event(self, source: str, level: Level, name: str, text: str, payload_id: str) -> None:
         note = EventMessage(time.time_ns(), source, level, name, text)
         self._say(bus_messages.EVENT, payload_id, note)
         self.recorder.note(bus_messages.EVENT, payload_id, note)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
-from ground_station.service.bus_messages import EstimateMessage, Message, RecordingMessage
+from ground_station.service.bus_messages import EstimateMessage, Level, Message, RecordingMessage
 from ground_station.service.intake.files import Estimated, GroundRun, Said
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
@@ -32,7 +32,7 @@ class GroundRecorder(Recorder):
     def __init__(
         self,
         settings: RecordingSettings,
-        announce: Callable[[str, str, str], None],
+        announce: Callable[[str, Level, str], None],
         *,
         camera: Camera | None = None,
         force_idr: Callable[[], object] = lambda: None,
@@ -137,7 +137,7 @@ class GroundRecorder(Recorder):
         self._free.set()
         super().close(limit_s)
 
-    def _level(self) -> str:
+    def _level(self) -> Level:
         return bus_messages.ALARM if self.problem else bus_messages.INFO
 
     def _watch_disk(self) -> None:

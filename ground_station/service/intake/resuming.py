@@ -16,6 +16,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from ground_station.service import bus_messages
+from ground_station.service.bus_messages import Level
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
 from pi_firmware.wire.errors import BlimpError
@@ -29,7 +30,7 @@ _RECORD = struct.Struct("<BQ")
 _TIMES = struct.Struct("<QQ")
 _MOST_RECORDS = 1_000_000
 
-Say = Callable[[str, str, str], object]
+Say = Callable[[str, Level, str], object]
 """(name, level, text) of an event."""
 
 

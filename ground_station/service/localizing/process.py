@@ -14,6 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from ground_station.errors import GroundStationError, MapError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
@@ -21,9 +24,8 @@ from ground_station.localization.localizer import Localizer
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
-from ground_station.service.localizing import derive, frames
+from ground_station.service.localizing import derive
 from ground_station.service.localizing.derive import Accounts
-from ground_station.service.localizing.frames import Taken
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
 from ground_station.service.localizing.overload import Overload
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
@@ -96,14 +98,12 @@ class Localizing:
             self._skip()
             self._tell_waiting(note)
             return
-        taken = frames.take(self._pictures, note)
-        if isinstance(taken, str):
+        image = self._pictures.read(note.slot, note.stamp)
+        if image is None:  # overwritten before it was read
             self._skip()
-            if taken is not frames.GONE:
-                self._complain("frame-refused", f"a frame that cannot be: {taken}")
             return
         self._follow_stream(self._localizer, note)
-        self._localize(self._localizer, taken)
+        self._localize(self._localizer, note, image)
 
     def _skip(self) -> None:
         self._own = replace(self._own, skipped=self._own.skipped + 1)
@@ -119,11 +119,12 @@ class Localizing:
             localizer.set_initial_pose(self._start.at(note.time_ns), note.time_ns)
             self._start = None
 
-    def _localize(self, localizer: Localizer, taken: Taken) -> None:
-        note = taken.note
+    def _localize(
+        self, localizer: Localizer, note: FrameMessage, image: npt.NDArray[np.uint8]
+    ) -> None:
         estimate, reason = None, ""
         try:
-            estimate = localizer.process(note.time_ns, taken.image, note.sequence, taken.exposure_s)
+            estimate = localizer.process(note.time_ns, image, note.sequence, note.exposure_s)
             self._failed = 0
         except BlimpError as error:  # the frame is at fault, as one of another camera's size
             reason = str(error)
@@ -183,7 +184,7 @@ class Localizing:
     def _tell_waiting(self, note: FrameMessage) -> None:
         """Without a map a frame's state says so, each second: an event may have been missed."""
         now_s = time.monotonic()
-        if now_s - self._told_s < _WAITING_EVERY_S or frames.fault_of(note):
+        if now_s - self._told_s < _WAITING_EVERY_S:
             return
         self._told_s = now_s
         about = (self.accounts, "", time.time_ns())
@@ -212,6 +213,6 @@ class Localizing:
             raise MapError(loading.refused)
         return {"map": loading.name, "loading": False}
 
-    def _event(self, level: str, name: str, text: str) -> None:
+    def _event(self, level: bus_messages.Level, name: str, text: str) -> None:
         note = EventMessage(time.time_ns(), "localizer", level, name, text)
         self._bus.publish(bus_messages.EVENT, self._payload_id, note)

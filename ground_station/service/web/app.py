@@ -84,7 +84,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     viewers = live.Live(snapshot, metrics, settings.http, video)
     snapshot.on_evicted(metrics.forget)
     metrics.viewers = lambda: viewers.viewers
-    metrics.bus_dropped = lambda: bus.dropped + snapshot.dropped
+    metrics.bus_dropped = lambda: bus.dropped
     metrics.video = lambda: {
         "encoded": video.encoded,
         "skipped": video.skipped,
@@ -96,7 +96,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loops[:] = [asyncio.get_running_loop()]
         snapshot.listen(bus)
-        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, snapshot.careful(metrics.estimate))
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, metrics.estimate)
         viewers.listen(bus, loops[0])
         ticking = asyncio.create_task(viewers.tick())
         try:

@@ -117,7 +117,7 @@ class Live:
     def event(self, payload_id: str, note: EventMessage) -> None:
         """Everybody is told."""
         document = bus_messages.as_document(note)
-        document["text"] = str(document["text"])[:TEXT]
+        document["text"] = document["text"][:TEXT]
         self._tell(_text("event", event={**document, "payload": payload_id}))
 
     def recording(self, _: str, note: RecordingMessage) -> None:

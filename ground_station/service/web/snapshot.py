@@ -21,7 +21,6 @@ from ground_station.service.bus_messages import (
     EstimateMessage,
     EventMessage,
     FrameMessage,
-    N,
     PayloadMessage,
     ProcessMessage,
     RecordingMessage,
@@ -91,29 +90,16 @@ class Snapshot:
         self._recording: RecordingMessage | None = None
         self._recording_ns = 0
         self._alarms: list[dict[str, Any]] = []
-        self.dropped = 0
-        """Notes whose values could not be used."""
         self._evicted: Callable[[str], None] = lambda _: None
 
     def listen(self, bus: Bus) -> None:
         """Hears everything on the bus."""
-        bus.subscribe(bus_messages.FRAME, FrameMessage, self.careful(self.frame))
-        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self.careful(self.estimate))
-        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self.careful(self.payload))
-        bus.subscribe(bus_messages.EVENT, EventMessage, self.careful(self.event))
-        bus.subscribe(bus_messages.RECORDING, RecordingMessage, self.careful(self.recording))
-        bus.subscribe(bus_messages.PROCESS, ProcessMessage, self.careful(self.process))
-
-    def careful(self, take: Callable[[str, N], None]) -> Callable[[str, N], None]:
-        """`take`, which drops and counts a message that it cannot use."""
-
-        def taken(payload_id: str, note: N) -> None:
-            try:
-                take(payload_id, note)
-            except (TypeError, ValueError, AttributeError, KeyError):
-                self.dropped += 1
-
-        return taken
+        bus.subscribe(bus_messages.FRAME, FrameMessage, self.frame)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self.estimate)
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self.payload)
+        bus.subscribe(bus_messages.EVENT, EventMessage, self.event)
+        bus.subscribe(bus_messages.RECORDING, RecordingMessage, self.recording)
+        bus.subscribe(bus_messages.PROCESS, ProcessMessage, self.process)
 
     def on_evicted(self, call: Callable[[str], None]) -> None:
         """`call` gets the id of each payload that is forgotten."""
@@ -162,16 +148,15 @@ class Snapshot:
                 item.clock_ns = now_ns
             for name in _MESSAGES:
                 message = getattr(note, name)
-                made = message.get("time_ns") if isinstance(message, dict) else None
-                if made is not None and made != item.message_ns.get(name):
-                    item.message_ns[name] = made
+                if message is not None and message.time_ns != item.message_ns.get(name):
+                    item.message_ns[name] = message.time_ns
                     item.came_ns[name] = now_ns
             item.came_ns["payload"] = now_ns
             item.payload = note
 
     def event(self, payload_id: str, note: EventMessage) -> None:
         """Something happened."""
-        note = dataclasses.replace(note, text=str(note.text)[:TEXT], name=str(note.name)[:64])
+        note = dataclasses.replace(note, text=note.text[:TEXT], name=note.name[:64])
         with self._lock:
             self._events.append({**bus_messages.as_document(note), "payload": payload_id})
             if note.source == "payload" and note.name in _ENDED and payload_id in self._payloads:
@@ -186,7 +171,7 @@ class Snapshot:
 
     def _catch_up(self, note: RecordingMessage) -> None:
         """The event that was said before this process listened; call with the lock held."""
-        text = str(note.resumed)[:TEXT]
+        text = note.resumed[:TEXT]
         if all(event["text"] != text for event in self._events):
             time_ns = time.time_ns() - int(1e9 * note.duration_s)
             event = EventMessage(

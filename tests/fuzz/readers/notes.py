@@ -11,6 +11,7 @@ from ground_station.service import bus_messages
 from ground_station.service.settings import Run
 from ground_station.service.web.metrics import Metrics
 from ground_station.service.web.snapshot import Snapshot
+from pi_firmware.wire import messages
 
 _EXAMPLES = (
     bus_messages.FrameMessage(0, 2, 1, 2, 3, 4, 640, 480, 7),
@@ -20,7 +21,7 @@ _EXAMPLES = (
     ),
     bus_messages.PayloadMessage(
         True, 1, 7, frames={"captured": 3}, stream={"packets": 4}, clock={"offset_ns": 5},
-        battery={"time_ns": 1, "voltage": 3.9}, health={"time_ns": 1}, autopilot=None,
+        battery=messages.Battery(1, 3.9), health=messages.Health(1, 60.0), autopilot=None,
     ),
     bus_messages.EventMessage(1, "station", bus_messages.INFO, "hello", "a text"),
     bus_messages.RecordingMessage(True, "flight-1.mcap"),
@@ -34,12 +35,12 @@ def fuzz(data: bytes) -> None:
     snapshot = Snapshot(Run(), "1", lambda: 10**9)
     metrics = Metrics(snapshot)
     takes = (
-        snapshot.careful(snapshot.frame),
-        snapshot.careful(snapshot.estimate),
-        snapshot.careful(snapshot.payload),
-        snapshot.careful(snapshot.event),
-        snapshot.careful(snapshot.recording),
-        snapshot.careful(snapshot.process),
+        snapshot.frame,
+        snapshot.estimate,
+        snapshot.payload,
+        snapshot.event,
+        snapshot.recording,
+        snapshot.process,
     )
     while picker.left():
         number = picker.number(1) % len(_EXAMPLES)
@@ -52,7 +53,7 @@ def fuzz(data: bytes) -> None:
             note = bus_messages.decode(type(example), text)
             takes[number]("blimp-1", note)
             if number == 1:
-                snapshot.careful(metrics.estimate)("blimp-1", note)
+                metrics.estimate("blimp-1", note)
     json.dumps(snapshot.document(), allow_nan=False)
     metrics.text()
 
