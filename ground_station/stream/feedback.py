@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from ground_station.stream.arrivals import Flow
@@ -50,6 +50,18 @@ class Video(Protocol):
     def flow(self) -> Flow | None:
         """How it comes of late; None while there is too little of it."""
         ...
+
+
+@dataclass(frozen=True)
+class Awaited:
+    """A receiver's `port` for a payload of which nothing came yet: it must hear where to send."""
+
+    port: int
+    ssrc: None = None
+    counters: Counters = field(default_factory=Counters)
+
+    def flow(self) -> None:
+        """Nothing comes."""
 
 
 @dataclass(frozen=True)

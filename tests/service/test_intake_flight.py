@@ -74,6 +74,14 @@ def test_two_payloads_and_garbage_on_one_port(tmp_path: Path) -> None:
         assert stand.process.wait(10) == 0 and stand.written() == ""
 
 
+def test_a_payload_that_looks_for_its_station_is_told_where_to_send(tmp_path: Path) -> None:
+    """It sends nothing before, so that the station must not wait for its video to say so."""
+    with Stand(tmp_path) as stand:
+        payload = stand.payload("blimp-1", "link.host=auto", port=1)  # a port that nobody has
+        eventually(lambda: len(stand.heard.of("blimp-1")) > 20)
+        payload.end().assert_in_order()
+
+
 def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
     with (
         Stand(tmp_path) as stand,

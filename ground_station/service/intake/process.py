@@ -22,7 +22,7 @@ from ground_station.service.intake.roster import NAMELESS, Roster
 from ground_station.service.settings import StationSettings
 from ground_station.stream import commands
 from ground_station.stream.assembly import ReceivedFrame
-from ground_station.stream.feedback import Feedback
+from ground_station.stream.feedback import Awaited, Feedback, Video
 from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
@@ -119,7 +119,7 @@ class Intake:
             max_streams=settings.payloads.most,
             srtp_keys=srtp_keys,
         )
-        feedback = Feedback(self._listener, self.video.stream_of)
+        feedback = Feedback(self._listener, self._video_of)
         # In this order at the end: what has come is decoded and recorded, then all is let go of.
         self._stack.callback(self.recorder.close, _STOP_S)
         self._stack.callback(self.video.close)
@@ -184,6 +184,11 @@ class Intake:
         payload = Payload(payload_id, self._folder, self._say, self.recorder)
         payload.clock = lambda: self._listener.clock(payload_id)
         return payload
+
+    def _video_of(self, payload_id: str) -> Video | None:
+        """A payload's stream, or none yet: one that looks for its station sends when it is told."""
+        awaited = Awaited(self.video.port) if self._roster.get(payload_id) is not None else None
+        return self.video.stream_of(payload_id) or awaited
 
     def _take(self, payload_id: str, frame: ReceivedFrame) -> None:
         payload = self._roster.take_up(payload_id)
