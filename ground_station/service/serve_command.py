@@ -10,6 +10,7 @@ _EPILOG = """\
 examples:
   blimp serve --demo                      # the sample flight, played by the real firmware
   blimp serve --map maps/hall
+  blimp serve --map maps/hall --lan       # for payloads on the network, with `blimp keys`
   blimp serve --config station.toml --set http.port=8081
 
 The dashboard is at http://127.0.0.1:8080/ then; service/station.toml names every key."""
@@ -26,12 +27,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--demo", action="store_true", help="play the sample flight, over loopback only"
     )
+    parser.add_argument(
+        "--lan", nargs="?", const="", metavar="INTERFACE",
+        help="heard and found by payloads on that network, as wlan0 (default: the only one)",
+    )  # fmt: skip
     parser.add_argument("--check", action="store_true", help="check the configuration and exit")
 
 
 def run(args: argparse.Namespace) -> int:
     """Serves until a signal; raises a `BlimpError` with one line when it cannot start."""
-    from ground_station.service import settings
+    from ground_station.errors import InputError
+    from ground_station.service import lan, settings
     from ground_station.service.ending import ending
     from ground_station.service.processes import ServiceError
     from ground_station.service.serve import SAMPLE, serve
@@ -40,6 +46,11 @@ def run(args: argparse.Namespace) -> int:
     if args.map is not None:
         folder = dataclasses.replace(loaded.map, folder=str(args.map))
         loaded = dataclasses.replace(loaded, map=folder)
+    if args.lan is not None:
+        if args.demo:
+            raise InputError("--demo plays over loopback only; leave out --demo or --lan")
+        loaded = lan.on(loaded, args.lan)
+        print(lan.told(loaded), flush=True)
     if args.check:
         print("configuration is good")
         return 0

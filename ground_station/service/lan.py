@@ -1,0 +1,127 @@
+"""`--lan`: all that a station needs to be found and heard on a network, set together.
+
+That is its certificates, the TLS listener, the video's address and discovery. A payload whose card
+`make flash` wrote needs nothing more: it looks for its station on the network that it joins.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import socket
+import struct
+from pathlib import Path
+
+from ground_station import user_folders
+from ground_station.errors import InputError
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire import credentials, scouting
+from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.telemetry import PORT, check_endpoint
+
+EVERYWHERE = "0.0.0.0"  # addresses come and go; who may speak is for the certificates to decide
+_SIOCGIFFLAGS = 0x8913  # Linux, not in Python's modules
+_WANTED, _UNWANTED = 0x1 | 0x40 | 0x1000, 0x8 | 0x10
+"""netdevice(7): up, running and with multicast; neither loopback nor a tunnel."""
+
+
+def interfaces() -> dict[str, str]:
+    """The interfaces on which payloads can find this station, with their IPv4 addresses."""
+    found = {}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        for _, name in socket.if_nameindex():
+            try:
+                reply = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, struct.pack("256s", name.encode()))
+            except OSError:  # gone meanwhile
+                continue
+            (flags,) = struct.unpack_from("H", reply, 16)
+            address = scouting.interface_address(name)
+            if address and flags & _WANTED == _WANTED and not flags & _UNWANTED:
+                found[name] = address
+    return found
+
+
+def on(settings: StationSettings, interface: str = "") -> StationSettings:
+    """The settings of a station on the network of an interface; "": the only one there is.
+
+    Certificates that are configured stay, otherwise they are those of `blimp keys ground NAME`.
+    Raises `InputError` with one line when there are none, or when the interface must be named.
+    """
+    held = _certificates(settings)
+    found = interfaces()
+    if not interface:
+        if len(found) != 1:
+            named = ", ".join(f"{name} ({address})" for name, address in found.items())
+            raise InputError(
+                f"--lan: which network are the payloads in? name one of {named}"
+                if found
+                else "--lan: no interface of this machine is up and has an address"
+            )
+        (interface,) = found
+    elif interface not in found:
+        named = ", ".join(found) or "none"
+        raise InputError(f"--lan {interface}: not up, without an address, or not there ({named})")
+    telemetry = settings.telemetry
+    port = PORT
+    if telemetry.listen:
+        certified = bool(telemetry.certificates)
+        _, port = check_endpoint(telemetry.listen[0], certified=certified)
+    return dataclasses.replace(
+        settings,
+        video=dataclasses.replace(settings.video, host=EVERYWHERE),
+        telemetry=dataclasses.replace(
+            telemetry,
+            listen=[f"tls/{EVERYWHERE}:{port}"],
+            certificates=str(held.folder),
+            discoverable=interface,
+        ),
+    )
+
+
+def told(settings: StationSettings) -> str:
+    """What a person must know of it, in lines: where it listens, and what a payload needs."""
+    telemetry = settings.telemetry
+    held = credentials.load(telemetry.certificates)
+    address = scouting.interface_address(telemetry.discoverable)
+    _, port = check_endpoint(telemetry.listen[0], certified=True)
+    payloads = [peer.partition(".")[2] for peer in held.peers]
+    name = payloads[0] if len(payloads) == 1 else "NAME"
+    return "\n".join(
+        (
+            f"station '{held.member}' on {telemetry.discoverable}, {address}: telemetry tcp {port}"
+            f" (TLS), video udp {settings.video.port} (SRTP), discovery udp 7446",
+            f"hears the payloads: {', '.join(payloads)}"
+            if payloads
+            else "hears nobody yet: blimp keys payload NAME, then start this again",
+            f"a payload's card: make flash DEVICE=/dev/sdX IMAGE=FILE PAYLOAD={name} WIFI=SSID"
+            " COUNTRY=DE",
+            "it finds this station by itself on the same network, or by"
+            f" OPTIONS='--ground {address}' where multicast does not pass",
+            f"nothing comes? sudo blimp doctor --lan {telemetry.discoverable}",
+        )
+    )
+
+
+def _certificates(settings: StationSettings) -> credentials.Credentials:
+    """This station's; raises `InputError` that names the command which makes them."""
+    authority = user_folders.data() / "keys"
+    stations = authority / credentials.GROUND
+    folder = Path(settings.telemetry.certificates or stations / settings.name)
+    if not folder.is_dir():
+        make = f"blimp keys ground {settings.name}"
+        if not authority.is_dir():
+            make = f"blimp keys init && {make} && blimp keys payload blimp-1"
+        others = sorted(path.name for path in stations.glob("*") if path.is_dir())
+        hint = f" (keys are here of: {', '.join(others)}; --set name=NAME)" if others else ""
+        raise InputError(f"--lan: no certificates in {folder}; make them: {make}{hint}")
+    try:
+        held = credentials.load(folder)
+    except TelemetryError as error:
+        raise InputError(f"--lan: {error}") from None
+    expected = f"{credentials.GROUND}.{settings.name}"
+    if held.name != expected:
+        raise InputError(
+            f"--lan: {folder} is of {held.name}, and this station is {expected};"
+            f" set its name: --set name={held.member}"
+        )
+    return held
