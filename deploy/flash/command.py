@@ -94,7 +94,7 @@ def _run(options: argparse.Namespace) -> None:
             written = customise.customise(target, boot, content)
             names = ", ".join(path.partition("/")[2] for path in written)
             print(f"{device}: {f'written: {names}' if names else 'all was as asked already'}")
-            _done(device, content.provisioning)
+            _done(options, content)
         return
     if device.exists() and options.image.exists() and device.samefile(options.image):
         raise DeployError(f"{device}: the image itself; name a card, or another file")
@@ -111,7 +111,7 @@ def _run(options: argparse.Namespace) -> None:
         write.write(card, target, lambda: _apply(target, boot, content))
         if not target.reread_table():
             print("the system still has the old partitions: take the card out and put it in again")
-    _done(device, content.provisioning)
+    _done(options, content)
 
 
 def _apply(target: Target, boot: BootPartition, content: Content) -> None:
@@ -170,7 +170,7 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
     wifi = _wifi(options)
     country = options.country if wifi is None else None
     provisioning = wishes.merge(existing, payload, wifi, country=country, **before)
-    return Content(provisioning, held.files if held else None, settings)
+    return Content(provisioning, held, settings)
 
 
 def _wifi(options: argparse.Namespace) -> Wifi | None:
@@ -224,7 +224,8 @@ def _of_board(card: image.Image) -> str:
     return f" ({told})" if told else ""
 
 
-def _done(device: Path, provisioning: Provisioning) -> None:
+def _done(options: argparse.Namespace, content: Content) -> None:
+    device, provisioning, held = options.device, content.provisioning, content.keys
     wifi, keys_held = provisioning.wifi, len(provisioning.authorized_keys)
     network = "no Wi-Fi"
     if wifi is not None:
@@ -234,6 +235,12 @@ def _done(device: Path, provisioning: Provisioning) -> None:
         f"{device}: ready for payload {provisioning.payload_id}: {network}, ground station"
         f" {provisioning.ground_station.host}, {log_in}; read back and the same"
     )
+    serve = ".venv/bin/blimp serve --lan --map maps/NAME"
+    if held is not None:
+        keys.remember(options.keys or wishes.default_keys(), provisioning.payload_id, held)
+        if "ground.main" not in held.peers:
+            serve += f" --set name={held.peers[0].partition('.')[2]}"
+    print(f"next, on the ground station and in the same network: {serve}")
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from deploy.board import settings
 from deploy.errors import DeployError
 from deploy.flash.boot import FOLDER, BootPartition
 from deploy.flash.interrupted import Interrupted
+from deploy.flash.keys import Keys
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse, render
 
@@ -34,8 +35,13 @@ class Content:
     """What is to stand in the boot partition; None: what is there stays."""
 
     provisioning: Provisioning
-    certificates: dict[str, bytes] | None = None
+    keys: Keys | None = None
     payload_toml: bytes | None = None
+
+    @property
+    def certificates(self) -> dict[str, bytes] | None:
+        """The files of the keys."""
+        return self.keys.files if self.keys else None
 
     def files(self) -> dict[str, bytes]:
         """All of it by path, `blimp.toml` last."""

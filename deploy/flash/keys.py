@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,7 @@ from deploy.flash.wishes import read_file
 NEEDED = ("ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key")
 SIGNERS = "allowed_signers"  # whose releases the payload takes
 OPTIONAL = ("ssh_ed25519", "ssh_ed25519.pub", SIGNERS)
+FLASHED, FLASHED_SCHEMA = "flashed.json", "blimp.flashed/1"
 _ACCESS_SCHEMA = "blimp.access/1"
 
 
@@ -51,6 +55,23 @@ def load(folder: Path, payload: str) -> Keys:
         if b"-----BEGIN " not in files[file] or b"-----END " not in files[file]:
             raise DeployError(f"{place / file}: not PEM, or cut")
     return Keys(files, tuple(peers))
+
+
+def remember(folder: Path, payload: str, held: Keys) -> None:
+    """Notes beside the keys which stations the payload's card was told, for `blimp doctor`.
+
+    Keys change when a station is added, the card only when it is written again. A note that cannot
+    be written is left out.
+    """
+    place = folder / "payload" / payload
+    note = {"schema": FLASHED_SCHEMA, "peers": held.peers, "time_s": int(time.time())}
+    with contextlib.suppress(OSError):
+        owner, part = place.stat(), place / f"{FLASHED}.part"
+        part.unlink(missing_ok=True)
+        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            os.fchown(file.fileno(), owner.st_uid, owner.st_gid)  # under sudo it is root's
+            file.write(json.dumps(note) + "\n")
+        part.replace(place / FLASHED)
 
 
 def ground_ssh_keys(folder: Path, peers: tuple[str, ...]) -> tuple[str, ...]:

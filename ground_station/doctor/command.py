@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 _EPILOG = """\
 examples:
   blimp doctor
+  sudo blimp doctor --lan                 # as blimp serve --lan would run
   sudo blimp doctor --config /etc/blimp/station.toml
 
 The exit status is 0 when nothing hinders the service, 1 when there is a problem."""
@@ -28,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
     )
+    parser.add_argument(
+        "--lan", nargs="?", const="", metavar="INTERFACE", help="as of `blimp serve`"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the findings here, too")
 
 
@@ -36,16 +40,18 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.doctor import findings
     from ground_station.doctor.findings import Check
     from ground_station.files import write_json
-    from ground_station.service import settings
-    from pi_firmware.wire.errors import ConfigError
+    from ground_station.service import lan, settings
+    from pi_firmware.wire.errors import BlimpError
 
     name = str(args.config or "defaults")
     todo = of_machine()
     try:
         loaded = settings.load(args.config, args.set)
+        if args.lan is not None:
+            loaded = lan.on(loaded, args.lan)
         first = findings.ok("settings", name)
         todo += of_settings(loaded)
-    except ConfigError as error:
+    except BlimpError as error:
         mend = f"mend {name}; what depends on it is not checked"
         first = findings.problem("settings", str(error), mend)
     found = findings.examine([Check("settings", lambda: first), *todo])
@@ -89,11 +95,13 @@ def of_settings(settings: StationSettings) -> list[Check]:
         return running.payloads(settings)
 
     return [
+        Check("reach", lambda: network.reach(settings)),
         Check("ports", ports),
         Check("firewall", lambda: network.firewall_rules(settings)),
         Check("discovery", lambda: network.discovery(settings)),
         Check("token", lambda: network.token(settings.http)),
         Check("certificate", lambda: world.certificate(settings)),
+        Check("cards", lambda: list(world.cards(settings))),
         Check("map", lambda: list(world.maps(settings.map, settings.localizer.preset))),
         Check("memory", lambda: machine.memory(settings.payloads.most)),
         Check("disk", lambda: machine.disk(settings.recording)),

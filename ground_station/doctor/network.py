@@ -28,6 +28,7 @@ _REFUSES = re.compile(r"\b(drop|reject)\b", re.IGNORECASE)
 """What a firewall that lets not everything pass says somewhere, be it nft's or iptables'."""
 _SERVICE = Path("/etc/blimp")
 """The configuration of the installed service, whose user is blimp."""
+TO_THE_NETWORK = "payloads on a network need blimp serve --lan"
 _TOKEN = "python3 -c 'import secrets; print(secrets.token_urlsafe(32))'"
 
 
@@ -61,6 +62,21 @@ def ports_of(settings: StationSettings) -> list[Port]:
     if foxglove.enabled:
         found.append(Port("foxglove.port", socket.SOCK_STREAM, foxglove.host, foxglove.port))
     return [port for port in found if port.number]
+
+
+def reach(settings: StationSettings) -> Finding:
+    """Whether payloads on other machines reach this station at all."""
+    hosts = [settings.video.host] + [
+        port.host for port in ports_of(settings) if port.setting == "telemetry.listen"
+    ]
+    if all(map(access.is_loopback, hosts)):
+        return ok("reach", f"this computer only (loopback); {TO_THE_NETWORK}")
+    if any(map(access.is_loopback, hosts)):
+        found = "video and telemetry are not both heard beyond loopback"
+        return warning(
+            "reach", found, f"set video.host and telemetry.listen alike; {TO_THE_NETWORK}"
+        )
+    return ok("reach", f"the network: {', '.join(dict.fromkeys(hosts))}")
 
 
 def ports(settings: StationSettings) -> Iterator[Finding]:

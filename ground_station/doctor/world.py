@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from ground_station import user_folders
 from ground_station.doctor.findings import Finding, ok, problem, warning
 from ground_station.errors import GroundStationError
 from ground_station.service.settings import MapSettings, StationSettings
@@ -13,6 +16,7 @@ from ground_station.service.web.access import is_loopback
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
 
+_FLASHED = "flashed.json"  # deploy/flash/keys.py writes it
 _SOON = datetime.timedelta(days=30)
 
 
@@ -121,6 +125,38 @@ def certificate(settings: StationSettings) -> Finding:
             name, f"it is {common}'s, this station is {expected}", f"{anew}, or set name"
         )
     return _lasting(held, until)
+
+
+def cards(settings: StationSettings) -> Iterator[Finding]:
+    """Each card that was written on this machine was told of this station.
+
+    `make flash` leaves a note beside the payload's keys. Without certificates nothing is told.
+    """
+    text = settings.telemetry.certificates
+    if not text:
+        return
+    # The folder may be a copy, as an installed service's is; notes are where the keys were made.
+    for keys in dict.fromkeys((user_folders.data() / "keys", Path(text).resolve().parent.parent)):
+        for path in sorted(keys.glob(f"{credentials.PAYLOAD}/*/{_FLASHED}")):
+            yield _card(path, f"{credentials.GROUND}.{settings.name}")
+
+
+def _card(path: Path, station: str) -> Finding:
+    payload = path.parent.name
+    name = f"card of {payload}"
+    try:
+        note = json.loads(path.read_bytes())
+        stations = ", ".join(map(str, note["peers"]))
+        found = f"written on {time.strftime('%Y-%m-%d', time.gmtime(note['time_s']))}"
+        is_told = station in note["peers"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return warning(
+            name, f"{path}: cannot be read", f"make flash PAYLOAD={payload} makes it anew"
+        )
+    if is_told:
+        return ok(name, f"{found}, for {stations}")
+    mend = f"make flash PAYLOAD={payload} again, or set name to that station's"
+    return problem(name, f"{found} for {stations}; this station is {station}", mend)
 
 
 def _lasting(held: credentials.Credentials, until: datetime.datetime) -> Finding:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import json
 import os
 import socket
 import subprocess
@@ -249,6 +250,32 @@ def test_the_certificate(tmp_path: Path) -> None:
     assert soon.level == WARNING and year[:2] in soon.found
     (folder / "certificate.pem").unlink()
     assert certified(folder).level == PROBLEM
+
+
+def test_a_card_that_was_written_for_another_station_is_a_problem(tmp_path: Path) -> None:
+    authority = Authority.create(tmp_path / "keys")
+    certificates = str(authority.add("ground", "main"))
+    telemetry = TelemetrySettings(listen=["tls/127.0.0.1:7447"], certificates=certificates)
+    note = authority.add("payload", "blimp-1") / "flashed.json"
+    settings = only(StationSettings(), telemetry=telemetry)
+    assert list(world.cards(settings)) == list(world.cards(StationSettings())) == []
+    for written, level in (
+        ({"peers": ["ground.main"], "time_s": 0}, OK),
+        ({"peers": ["ground.hall"], "time_s": 0}, PROBLEM),
+        ({"peers": ["ground.hall"]}, WARNING),
+    ):
+        note.write_text(json.dumps(written))
+        (found,) = world.cards(settings)
+        assert (found.name, found.level) == ("card of blimp-1", level)
+        assert "ground.hall; this station is ground.main" in found.found or level != PROBLEM
+
+
+def test_a_station_on_loopback_is_told_what_the_network_needs() -> None:
+    assert "blimp serve --lan" in network.reach(StationSettings()).found
+    video = only(StationSettings(), video=VideoSettings(host="0.0.0.0"))
+    assert network.reach(video).level == WARNING
+    telemetry = TelemetrySettings(listen=["tls/0.0.0.0:7447"], certificates="/keys")
+    assert network.reach(only(video, telemetry=telemetry)).found == "the network: 0.0.0.0"
 
 
 def test_video_beyond_loopback_without_a_certificate_is_a_warning() -> None:

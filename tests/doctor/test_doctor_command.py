@@ -48,7 +48,7 @@ def doctor(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command,
         cwd=cwd,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "HOME": str(cwd)},
         capture_output=True,
         text=True,
         timeout=120,
@@ -89,6 +89,12 @@ def test_a_configuration_that_is_refused_is_the_first_finding(tmp_path: Path) ->
     assert "nmae" in run.stdout.splitlines()[0] + run.stdout.splitlines()[1]
     assert "Traceback" not in run.stdout + run.stderr
     assert "python" in run.stdout and "port " not in run.stdout
+
+
+def test_a_network_without_certificates_is_the_first_finding(tmp_path: Path) -> None:
+    run = doctor("--lan", "--config", configuration(tmp_path), cwd=tmp_path)
+    assert run.returncode == 1
+    assert "blimp keys ground main" in " ".join(run.stdout.split())
 
 
 def station(port: int) -> StationSettings:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import web_station as station
 
+from ground_station.service import settings
 from ground_station.service.web import trail
 from ground_station.service.web.snapshot import EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
 
@@ -30,6 +31,12 @@ def clock():
 @pytest.fixture
 def snapshot(tmp_path, clock):
     return Snapshot(station.run_of(tmp_path), "0", clock)
+
+
+@pytest.mark.parametrize(("host", "loopback"), [("127.0.0.1", True), ("0.0.0.0", False)])
+def test_it_tells_whether_the_network_reaches_the_station(host, loopback):
+    run = settings.Run(settings.load(None, [f"video.host={host}"]))
+    assert Snapshot(run, "0").document()["station"]["loopback"] is loopback
 
 
 def test_values_carry_their_age_and_go_stale(snapshot, clock):

@@ -71,7 +71,7 @@ class Health(BaseModel):
 
 
 class StationModel(BaseModel):
-    """Which station this is."""
+    """Which station this is; with `loopback` payloads on the network do not reach it."""
 
     name: str
     version: str
@@ -79,6 +79,7 @@ class StationModel(BaseModel):
     started_ns: int
     map: str
     demo: bool
+    loopback: bool
     min_free_MB: int
 
 

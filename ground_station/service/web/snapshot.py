@@ -26,6 +26,7 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.settings import Run
+from ground_station.service.web.access import is_loopback
 from ground_station.service.web.trail import Trail
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import TelemetryError
@@ -241,6 +242,7 @@ class Snapshot:
                     "started_ns": self.run.started_ns,
                     "map": Path(station.map.folder).name,
                     "demo": self.run.demo,
+                    "loopback": is_loopback(station.video.host),
                     "min_free_MB": station.recording.min_free_MB,
                 },
                 "processes": [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from card_bench import BOOT_OFFSET, GAP_MIB, MEBI, Bench, make_image, refused, r
 
 from deploy.provisioning import parse, wpa_supplicant_conf
 from deploy.provisioning.wpa import psk
+from ground_station.keys.authority import Authority
 
 BOOT_MIB, ROOT_MIB = 8, 8
 BOOT_END = BOOT_OFFSET + BOOT_MIB * MEBI
@@ -59,6 +61,22 @@ def _file_systems_are_clean(bench: Bench, folder: Path) -> None:
             card.seek(start * MEBI)
             part.write_bytes(card.read(size * MEBI))
         tool(*check, str(part))
+
+
+def test_it_ends_with_the_command_that_hears_the_card(bench: Bench, tmp_path: Path) -> None:
+    """And notes beside the keys, for the doctor, which stations the card was told."""
+    keys = tmp_path / "of-hall"
+    shutil.copytree(bench.keys, keys)
+    authority = Authority(keys)
+    command = "blimp serve --lan --map maps/NAME"
+    assert run(bench.command()).stdout.splitlines()[-1].endswith(command)
+    authority.add("ground", "hall")
+    authority.revoke("ground.main")
+    bench.keys = keys
+    assert run(bench.command()).stdout.splitlines()[-1].endswith(f"{command} --set name=hall")
+    note = keys / "payload/blimp-1/flashed.json"
+    assert json.loads(note.read_text())["peers"] == ["ground.hall"]
+    assert note.stat().st_mode & 0o777 == 0o600 and authority.check(datetime.now(UTC)) == []
 
 
 def test_a_second_flash_with_other_wifi_changes_only_that(bench: Bench, tmp_path: Path) -> None:

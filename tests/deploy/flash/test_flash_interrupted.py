@@ -46,7 +46,7 @@ class Faulty(Target):
 
 def _flash(bench: Bench, fault: Callable[[str, int, bytes], bytes]) -> None:
     """The program's steps with a card that fails; sector 0 must be zeros afterwards."""
-    content = Content(Provisioning("blimp-1"), keys.load(bench.keys, "blimp-1").files)
+    content = Content(Provisioning("blimp-1"), keys.load(bench.keys, "blimp-1"))
     with image.opened(bench.image, checksum=True) as card, Faulty.open(bench.card) as target:
         assert isinstance(target, Faulty)
         target.fault = fault  # type: ignore[method-assign]
@@ -195,7 +195,7 @@ def test_settings_that_stop_halfway_leave_none(
         whole(self, path, data)
 
     monkeypatch.setattr(BootPartition, "write", stop)
-    content = Content(Provisioning("blimp-2"), keys.load(bench.keys, "blimp-2").files)
+    content = Content(Provisioning("blimp-2"), keys.load(bench.keys, "blimp-2"))
     with Target.open(bench.card) as target:
         boot = BootPartition.find(target.fileno(), "card")
         with pytest.raises(DeployError, match="it is full"):
@@ -337,7 +337,7 @@ def test_a_real_device_is_written_and_read_back(bench: Bench) -> None:
     if done.returncode:
         pytest.skip(f"no loop device here: {done.stderr.strip()}")
     device = Path(done.stdout.strip())
-    content = Content(Provisioning("blimp-1"), keys.load(bench.keys, "blimp-1").files)
+    content = Content(Provisioning("blimp-1"), keys.load(bench.keys, "blimp-1"))
     try:
         with image.opened(bench.image, checksum=True) as card, Target.open(device) as target:
             assert target.is_device and target.size == size

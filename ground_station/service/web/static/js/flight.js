@@ -6,6 +6,7 @@ import { ellipseOf } from "./ellipse.js";
 import { lookOf } from "./states.js";
 
 const TEXT_MS = 150; // numbers that change faster cannot be read
+const LOOPBACK = "this station listens on its own computer only; for the network: blimp serve --lan";
 const HAND_STEP_DEG = 1;
 
 export class Flight {
@@ -16,7 +17,7 @@ export class Flight {
     this.hand = byId("dial-hand");
     this.spoken = byId("say-state");
     this.said = "";
-    loop.add(["estimate", "payload", "tick", "selection"], () => this.draw(), TEXT_MS);
+    loop.add(["estimate", "payload", "tick", "selection", "station"], () => this.draw(), TEXT_MS);
   }
 
   draw() {
@@ -64,6 +65,7 @@ export class Flight {
 
   /** @param {import("./store.js").Payload|null} payload @param {string} state */
   reason(payload, state) {
+    if (state === "NONE" && this.store.station.loopback) return `${lookOf(state).meaning}: ${LOOPBACK}`;
     if (["GONE", "OFFLINE", "STALE"].includes(state) || !payload?.estimate) return lookOf(state).meaning;
     const estimate = payload.estimate;
     if (estimate.reason) return estimate.reason;

@@ -74,6 +74,7 @@
  * @property {number} [uptime_s]
  * @property {string} [map]
  * @property {boolean} [demo]
+ * @property {boolean} [loopback] heard on its own computer only
  *
  * @typedef {object} PayloadEntry
  * @property {PayloadNote|null} [payload]
