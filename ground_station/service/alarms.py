@@ -114,7 +114,10 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
     if not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
         since_s = alive_s if frame_s is None else min(frame_s, alive_s)
-        yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, f"no frames for {since_s:.0f} s")
+        text = f"no frames for {since_s:.0f} s"
+        if frame_s is None:  # telemetry comes through, and never any video
+            text += ": a firewall? sudo blimp doctor looks"
+        yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, text)
     estimates_come = estimate_s is not None and estimate_s <= NO_FRAMES_S
     estimate, state_s = _table(view, "estimate"), _number(view.get("state_s")) or 0.0
     if estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:

@@ -100,6 +100,17 @@ def test_no_frames_from_a_living_payload(told, after_s, found):
     assert ids(snapshot) == ({f"no-frames/{P}": "alarm"} if found else {})
 
 
+def test_telemetry_without_any_video_names_the_firewall(told):
+    snapshot, clock = told
+    for _ in range(6):  # P was seen, the other one never
+        clock.ns += S
+        for name in ("new", P):
+            snapshot.payload(name, station.payload())
+    found = alarms.judge(snapshot.document(), time.time_ns(), {})
+    assert "firewall" in found["no-frames/new"].alarm.text
+    assert "firewall" not in found[f"no-frames/{P}"].alarm.text
+
+
 def test_a_payload_that_came_just_now_gets_a_moment_for_its_first_frame(told):
     snapshot, clock = told
     for name in ("new", P):  # P comes back after a while
