@@ -100,6 +100,7 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 	@$(BLIMP) simulate --sample maps/atrium
 	@$(BLIMP) map build maps/atrium/mapping.mcap --settings maps/atrium/mapping.toml --out maps/atrium
 	@$(BLIMP) map register maps/atrium --pairs maps/atrium/PAIRS.csv
+	@$(BLIMP) map export maps/atrium --png maps/atrium/map.png
 
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
 	@sh tests/pi_firmware/virtual_camera/setup.sh

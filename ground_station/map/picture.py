@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
 from ground_station.map.store import Map
 from ground_station.presentation.theme import Theme, themed
@@ -25,16 +26,23 @@ _VIEW = 0.03
 """Of the picture's longer side: the line by which a camera shows where it looks."""
 
 
-def from_above(map_: Map, missing: Collection[str], title: str, theme: Theme) -> Figure:
+def from_above(
+    map_: Map,
+    missing: Collection[str],
+    title: str,
+    theme: Theme,
+    plan: FloorPlan | None = None,
+) -> Figure:
     """Landmarks, and cameras in the order of their names, joined where no image is `missing`.
 
     `missing` are names of images without a place. Where such are between two cameras, these are
     joined by a dashed line with their number. Of an unregistered map, up is where its cameras have
-    it on average, and lengths are its own.
+    it on average, and lengths are its own. A floor `plan` that is not turned lies below all, and
+    what it shows is shown.
     """
     upright = levelled(map_)
     position, place = upright.landmarks.position_m, upright.keyframes.wTc[:, :3, 3]
-    low, high = _bounds(position, place)
+    low, high = _bounds(position, place) if plan is None else _corners(plan)
     sides = (high - low) * _LONGEST_IN / max(float((high - low).max()), 1e-9)
     width, height = (max(float(side), _LEAST_IN) for side in sides)
     figure = Figure(
@@ -53,6 +61,12 @@ def from_above(map_: Map, missing: Collection[str], title: str, theme: Theme) ->
     looks = upright.keyframes.wTc[:, :2, 2] * _VIEW * float((high - low).max())
     lines = np.stack([place[:, :2], place[:, :2] + looks], axis=1)
     axes.add_collection(LineCollection(list(lines), colors=theme.estimate, linewidths=0.8))
+    if plan is not None:
+        extent = (low[0], high[0], low[1], high[1])
+        axes.imshow(
+            plan.image, cmap="gray", vmin=0, vmax=255, extent=extent, alpha=0.35,
+            interpolation="nearest", zorder=0,
+        )  # fmt: skip
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
@@ -74,6 +88,11 @@ def _bounds(position: F64, place: F64) -> tuple[F64, F64]:
         low, high = np.minimum(low, near), np.maximum(high, far)
     margin = _MARGIN * float((high - low).max())
     return low - margin, high + margin
+
+
+def _corners(plan: FloorPlan) -> tuple[F64, F64]:
+    low = np.array(plan.origin[:2])
+    return low, low + np.array(plan.size_m)
 
 
 def _draw_way(axes: Axes, map_: Map, missing: Collection[str], theme: Theme) -> None:

@@ -76,13 +76,13 @@ def legend(axes: Axes, theme: Theme) -> None:
         )
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes."""
+def png(figure: Figure, dpi: int = _DPI) -> bytes:
+    """The figure as PNG bytes; `dpi` are pixels to an inch."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 
-def write_png(figure: Figure, path: str | Path) -> None:
+def write_png(figure: Figure, path: str | Path, dpi: int = _DPI) -> None:
     """Writes the figure as a PNG file, beside and renamed."""
-    write_bytes(path, png(figure))
+    write_bytes(path, png(figure, dpi))

@@ -76,3 +76,13 @@ def test_the_command_writes_a_built_map(built, tmp_path, capsys):
     assert export_command.run(parser.parse_args([str(built.folder), "--ply", str(out)])) == 0
     assert len(read_ply(out.read_bytes())[1]) == len(built.map.landmarks)
     assert "arbitrary units" in capsys.readouterr().out
+
+
+def test_the_command_writes_a_picture_and_asks_what_is_to_be_written(built, tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    export_command.add_arguments(parser)
+    out = tmp_path / "room.png"
+    assert export_command.run(parser.parse_args([str(built.folder), "--png", str(out)])) == 0
+    assert out.read_bytes().startswith(b"\x89PNG") and "arbitrary" in capsys.readouterr().out
+    with pytest.raises(GroundStationError, match="--ply or --png is needed"):
+        export_command.run(parser.parse_args([str(built.folder)]))
