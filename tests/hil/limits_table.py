@@ -11,7 +11,7 @@ from ground_station.files import write_json, write_text
 BEGIN = "<!-- limits: made by `make limits` and its --accept; do not edit -->"
 END = "<!-- limits: end -->"
 ACCEPTED = Path(__file__).with_name("limits_accepted.json")
-README = Path(__file__).resolve().parents[2] / "README.md"
+README = Path(__file__).resolve().with_name("README.md")
 QUIET_CORES = 0.2
 """What others may use of the machine during any trial of a run that is accepted."""
 

@@ -1,0 +1,99 @@
+"""What the README files say can be typed: commands, options, targets; links lead somewhere."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from deploy.flash.command import _parser as flash
+from ground_station.cli import parser as blimp
+from hw.command import parser as hw
+from pi_firmware.__main__ import _parser as firmware
+
+ROOT = Path(__file__).parents[2]
+ROOMS = ("deploy", "ground_station", "hw", "maps", "pi_firmware", "tests")
+PAGES = [ROOT / "README.md", *(page for room in ROOMS for page in (ROOT / room).rglob("README.md"))]
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+MOST_WORDS, MOST_PICTURE_BYTES = 1200, 200 * 1024
+PARSERS: dict[str, Callable[[], object]] = {
+    "blimp": blimp, "hw": hw, "deploy.flash": flash, "pi_firmware": firmware,
+}  # fmt: skip
+
+
+def blocks(page: Path) -> Iterator[str]:
+    """The indented blocks of a page, whole; those of a list are indented by more."""
+    for block in re.findall(r"(?:^ {4,}.*\n|^\n(?= {4}))+", page.read_text(), re.MULTILINE):
+        yield textwrap.dedent(block).strip("\n")
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """The words of each command line of ours in a page's blocks, without prompt and comment."""
+    for block in blocks(page):
+        for line in block.replace("\\\n", " ").splitlines():
+            for part in re.split(r"\s#\s|\s{6,}(?=[a-z])", line)[0].split(";"):
+                words = shlex.split(part) if part.count("'") % 2 == 0 else []
+                words = [word for word in words if word != "sudo" and not word.startswith("blimp=")]
+                if words and Path(words[0]).name in ("make", "blimp", "$blimp"):
+                    yield [Path(words[0]).name.removeprefix("$"), *words[1:]]
+                elif len(words) > 2 and words[1] == "-m" and words[2] in PARSERS:
+                    yield words[2:]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_page_is_one(page: Path) -> None:
+    for program, *words in commands(page):
+        if program == "make":
+            named = {word for word in words if "=" not in word}
+            assert named <= TARGETS, f"{page}: make {' '.join(words)}"
+        else:
+            accepts(program, words, page)
+
+
+def accepts(program: str, words: Sequence[str], page: Path) -> None:
+    """Fails where the program's own parser refuses the words."""
+    try:
+        PARSERS[program]().parse_args(words)  # type: ignore[attr-defined]
+    except SystemExit as ended:
+        pytest.fail(f"{page}: {program} {' '.join(words)}: status {ended.code}")
+
+
+def test_the_pages_have_commands_to_check() -> None:
+    found = [words[0] for page in PAGES for words in commands(page)]
+    assert found.count("blimp") > 30 and found.count("make") > 20 and "hw" in found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+    text = re.sub(r"`[^`]*`", "", page.read_text())
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{page}: {link}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", target.read_text(), re.MULTILINE)
+            slugs = [re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in headings]
+            assert anchor in slugs, f"{page}: {link}"
+
+
+def test_the_readme_is_short_and_has_pictures_that_are_small() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text.split()) <= MOST_WORDS
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
+    assert pictures
+    for picture in pictures:
+        assert (ROOT / picture).stat().st_size <= MOST_PICTURE_BYTES, picture
+
+
+def test_python_of_the_pages_is_python() -> None:
+    found = [block for page in PAGES for block in blocks(page) if block.startswith("import ")]
+    assert found
+    for block in found:
+        ast.parse(block)
