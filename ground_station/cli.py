@@ -27,6 +27,7 @@ _COMMANDS = (
         "ground_station.doctor.command",
         "check this machine, and say how to mend it",
     ),
+    ("import", "ground_station.recording.import_command", "make a recording of a plain video"),
     ("export", "ground_station.recording.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("experiments", "ground_station.experiments.command", "fly the thesis's experiments again"),

@@ -94,6 +94,20 @@ def for_pictures(
     return upright, said
 
 
+def misfit(camera: Camera, width_px: int, height_px: int) -> str:
+    """Of a picture that has not the camera's size: both sizes, and what to do, for an error."""
+    size, theirs = f"{width_px}x{height_px}", f"{camera.width_px}x{camera.height_px}"
+    if _same_shape(turned(camera, 1), width_px, height_px):
+        how = ("lies", "stands upright") if width_px > height_px else ("stands upright", "lies")
+        mend = (
+            f"it {how[0]}, the camera's picture {how[1]}: hold the camera as when it was"
+            " calibrated, or calibrate it like this (blimp calibrate)"
+        )
+    else:
+        mend = f"use pictures of {theirs}, or calibrate at {size} (blimp calibrate)"
+    return f"{size} pixels, the camera {theirs}: {mend}"
+
+
 def _same_shape(camera: Camera, width: int, height: int) -> bool:
     """Whether a size is the camera's times a factor, but for a side's rounding."""
     return (

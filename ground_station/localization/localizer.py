@@ -12,6 +12,7 @@ from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.resizing import misfit
 from ground_station.localization import following, gate
 from ground_station.localization.acquisition import Acquired, Acquirer, Located
 from ground_station.localization.attempt import Attempt, Conditions
@@ -148,10 +149,8 @@ class Localizer:
         """
         camera = self.camera
         if image.shape != (camera.height_px, camera.width_px):
-            size = "x".join(str(n) for n in reversed(image.shape))
-            raise InputError(
-                f"frame {index} has {size} pixels, the camera {camera.width_px}x{camera.height_px}"
-            )
+            height, width = image.shape
+            raise InputError(f"frame {index} has {misfit(camera, width, height)}")
         attempt = Attempt(time_ns, index)
         if (refused := self._refuse(attempt)) is not None:
             return refused

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
+from ground_station.recording.encoding import H264Encoder
 from ground_station.simulator import dynamics, handheld, scenes
-from ground_station.simulator.encoding import H264Encoder
 from ground_station.simulator.imaging import (
     AutoExposure,
     FrameMaker,

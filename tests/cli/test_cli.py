@@ -17,6 +17,7 @@ COMMANDS = [
     ["replay"],
     ["command"],
     ["serve"],
+    ["import"],
     ["models", "list"],
     ["models", "import"],
     ["models", "quantize"],

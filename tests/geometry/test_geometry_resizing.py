@@ -9,7 +9,7 @@ import pytest
 
 from ground_station.errors import CameraError
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.geometry.resizing import for_pictures, scaled, turned
+from ground_station.geometry.resizing import for_pictures, misfit, scaled, turned
 
 RAYS = np.random.default_rng(3).uniform(-0.4, 0.4, (50, 2))
 
@@ -108,3 +108,18 @@ def test_what_fits_neither_way_is_refused_with_what_to_do(
     with pytest.raises(CameraError, match=words) as caught:
         for_pictures(THESIS_CAMERA, size, 180, "a.mp4")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((480, 640), "480x640 pixels, the camera 640x480: it stands upright, the camera's picture"),
+        ((240, 320), "it stands upright"),
+        ((320, 240), "use pictures of 640x480, or calibrate at 320x240"),
+        ((640, 360), "use pictures of 640x480, or calibrate at 640x360"),
+    ],
+)
+def test_a_picture_that_does_not_fit_says_how_it_would(size: tuple[int, int], words: str) -> None:
+    assert words in misfit(THESIS_CAMERA, *size)
+    lying = turned(THESIS_CAMERA, 1)
+    assert "it lies, the camera's picture stands upright" in misfit(lying, 640, 480)

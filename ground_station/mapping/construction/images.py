@@ -15,6 +15,7 @@ from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.resizing import misfit
 from ground_station.mapping.construction import content
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.feature_file import FeatureFile
@@ -133,7 +134,4 @@ def extractor_of(settings: MappingSettings) -> Extractor:
 def _check_size(frame: Frame, camera: Camera) -> None:
     if frame.image.shape != (camera.height_px, camera.width_px):
         height, width = frame.image.shape[:2]
-        raise MapError(
-            f"{frame.name}: is {width}x{height} pixels, "
-            f"the camera {camera.width_px}x{camera.height_px}"
-        )
+        raise MapError(f"{frame.name}: is {misfit(camera, width, height)}")

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.resizing import misfit
 from ground_station.mapping.construction.motion import Figures, Motion
 from ground_station.mapping.settings import KeyframeSettings
 from ground_station.recording.frames import Frame
@@ -59,10 +60,7 @@ def measure(frames: Iterable[Frame], camera: Camera, settings: KeyframeSettings)
     for frame in frames:
         height, width = frame.image.shape
         if (width, height) != (camera.width_px, camera.height_px):
-            raise MapError(
-                f"{frame.name}: is {width}x{height} pixels, "
-                f"the camera {camera.width_px}x{camera.height_px}"
-            )
+            raise MapError(f"{frame.name}: is {misfit(camera, width, height)}")
         motion.add(frame.index, frame.time_ns, frame.image)
     return motion.figures()
 

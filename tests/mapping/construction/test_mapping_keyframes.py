@@ -176,5 +176,5 @@ def test_sharpness_does_not_see_brightness_or_contrast_but_blur() -> None:
 
 def test_a_frame_of_another_size_is_refused_by_its_name() -> None:
     frame = Frame(0, "a.png", 0, np.zeros((480, 640), np.uint8))
-    with pytest.raises(MapError, match=r"^a.png: is 640x480 pixels, the camera 320x240$"):
+    with pytest.raises(MapError, match=r"^a.png: is 640x480 pixels, the camera 320x240: use"):
         measure([frame], CAMERA, dataclasses.replace(SETTINGS))

@@ -8,12 +8,17 @@ from fractions import Fraction
 import av
 import numpy as np
 import numpy.typing as npt
+from av.video.frame import PictureType
 
-from ground_station.simulator.scene import SimulatorError
+from ground_station.errors import GroundStationError
+
+
+class EncodingError(GroundStationError):
+    """Pictures that cannot be encoded here."""
 
 
 class H264Encoder:
-    """Encodes 8-bit RGB pictures; access units come out in the order the pictures went in.
+    """Encodes 8-bit pictures, RGB or grey; access units come out in the order the pictures went in.
 
     `crf` is x264's constant quality (0 to 51, smaller is better), unless `bitrate_kbps` is given.
     One thread, so that equal pictures give equal bytes.
@@ -30,7 +35,7 @@ class H264Encoder:
     ) -> None:
         context = av.CodecContext.create("libx264", "w")
         if not isinstance(context, av.VideoCodecContext):
-            raise SimulatorError("libx264 is not a video encoder in this build of FFmpeg")
+            raise EncodingError("libx264 is not a video encoder in this build of FFmpeg")
         context.width, context.height, context.pix_fmt = width_px, height_px, "yuv420p"
         rate = Fraction(rate_hz).limit_denominator(1000)
         context.framerate, context.time_base = rate, 1 / rate
@@ -58,9 +63,18 @@ class H264Encoder:
         self._context = context
         self._count = 0
 
-    def encode(self, picture: npt.NDArray[np.uint8]) -> Iterator[tuple[int, bytes]]:
-        """Takes a picture (H, W, 3) RGB; yields (index, access unit) of those that are ready."""
+    def encode(
+        self, picture: npt.NDArray[np.uint8], *, idr: bool = False
+    ) -> Iterator[tuple[int, bytes]]:
+        """Takes a picture, (H, W, 3) RGB or (H, W) grey of full range; as an IDR if asked.
+
+        Yields (index, access unit) of those that are ready.
+        """
+        if picture.ndim == 2:
+            picture = np.repeat(picture[:, :, None], 3, axis=2)
         frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+        if idr:
+            frame.pict_type = PictureType.I
         frame.pts = self._count
         self._count += 1
         yield from self._packets(frame)
@@ -72,5 +86,5 @@ class H264Encoder:
     def _packets(self, frame: av.VideoFrame | None) -> Iterator[tuple[int, bytes]]:
         for packet in self._context.encode(frame):
             if packet.pts is None:
-                raise SimulatorError("the encoder lost the order of its pictures")
+                raise EncodingError("the encoder lost the order of its pictures")
             yield int(packet.pts), bytes(packet)
