@@ -162,9 +162,8 @@ configure() {
 
 # A release that refuses the configuration never takes the place of one that runs with it.
 check_configuration() {
-  PYTHONPATH=$release "$environment/bin/python" -B -m ground_station.cli serve --check \
-    --config "$etc/station.toml" >/dev/null \
-    || die "the new release refuses $etc/station.toml; nothing was switched"
+  PYTHONPATH=$release "$environment/bin/python" -B -m ground_station.service.settings \
+    "$etc/station.toml" || die "the new release refuses $etc/station.toml; nothing was switched"
 }
 
 fill_state() {
@@ -252,6 +251,7 @@ install_service() {
   fi
   if [ -z "$changed" ]; then say "nothing to change"; return; fi
   say "configuration in $etc/station.toml; then: systemctl restart $unit"
+  say "for payloads on the network: the block at the top of that file"
   say "to look at what may hinder it: blimp doctor --config /etc/blimp/station.toml"
 }
 

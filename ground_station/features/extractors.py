@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ground_station.features.inference import Network
 
 _EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": RootSift, "orb": Orb}
+_IMPORTABLE = ("superpoint", "alike")
+"""How the networks are called that `blimp models import` knows."""
 _DEFAULT = LearnedSettings()
 
 
@@ -35,7 +37,10 @@ def create(
         return _EXTRACTORS[name](max_features)
     if name not in catalogue.names():
         known = ", ".join(names())
-        raise FeatureError(f"features: there is no extractor '{name:.80}' (known: {known})")
+        bring = ""
+        if name.startswith(_IMPORTABLE):
+            bring = "; its weights do not ship, bring your own: blimp models import FILE"
+        raise FeatureError(f"features: there is no extractor '{name:.80}' (known: {known}){bring}")
     # onnxruntime and onnx take half a second to import, which only models need.
     from ground_station.features.inference import Network, threads_beside_tracker
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ground_station.files import write_json
 from ground_station.map.table import print_table
 
 if TYPE_CHECKING:
     from ground_station.geometry.trajectory import Trajectory
+    from ground_station.map.store import Map
 
 HELP = "Shows a map, and how well a camera is placed where in it, on one HTML page."
 
@@ -71,7 +72,10 @@ def run(args: argparse.Namespace) -> int:
     document = {"localizability": found.summary()}
     if compared is not None:
         document["compared"] = compared.summary()
+    document = {name: _own_lengths(table, map_) for name, table in document.items()}
     print_table(document["localizability"] | document.get("compared", {}))
+    if map_.info.units != "m":
+        print("lengths are in the map's own units: it has no metres before blimp map register")
     if args.json:
         write_json(args.json, document)
     print(args.out)
@@ -80,6 +84,13 @@ def run(args: argparse.Namespace) -> int:
 
         webbrowser.open(Path(args.out).resolve().as_uri())
     return 0
+
+
+def _own_lengths(table: dict[str, Any], map_: Map) -> dict[str, Any]:
+    """Figures whose names say metres only where the map has them."""
+    if map_.info.units == "m":
+        return table
+    return {name.removesuffix("_m"): value for name, value in table.items()}
 
 
 def _trajectory(path: Path, is_truth: bool) -> Trajectory:

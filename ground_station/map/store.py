@@ -203,8 +203,11 @@ def load_info(folder: str | Path) -> MapInfo:
     """Reads `map.toml`; raises `MapError` with one line."""
     folder = Path(folder)
     path = folder / "map.toml"
+    build = f"blimp map build INPUT --out {folder} makes one"
     if not folder.is_dir():
-        raise MapError(f"{folder}: there is no such map")
+        raise MapError(f"{folder}: there is no such map; {build}")
+    if not path.exists():
+        raise MapError(f"{folder}: a folder without a map (map.toml); {build}")
     try:
         document = config.read(path)
         features, camera = document.get("features"), document.get("camera")

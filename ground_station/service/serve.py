@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import socket
 import sys
 import tempfile
 import threading
@@ -19,7 +20,7 @@ from ground_station.service.bus import Bus, Router
 from ground_station.service.bus_messages import EventMessage, PayloadMessage, ProcessMessage
 from ground_station.service.processes import Children
 from ground_station.service.settings import RUN_FILE, Run, StationSettings, write_run
-from pi_firmware.wire import config
+from pi_firmware.wire import config, scouting
 from pi_firmware.wire.systemd import Notifier
 
 DEMO_PAYLOAD = "demo"
@@ -147,13 +148,42 @@ def _sweep(place: Path) -> None:
                 os.close(lock)
 
 
+def check(settings: StationSettings) -> None:
+    """Raises a `BlimpError` for what the service refuses at its start, ports that are held aside.
+
+    Those are `blimp doctor`'s: they are held by the service itself where it runs.
+    """
+    from ground_station.service.cameras import camera_of
+    from ground_station.service.web.access import read_token
+    from ground_station.stream.srtp import load_keys
+    from pi_firmware.wire import credentials
+
+    telemetry = settings.telemetry
+    _check_map(Path(settings.map.folder))
+    camera_of(settings.map, settings.map.folder)
+    if telemetry.certificates:
+        credentials.load(telemetry.certificates)
+        load_keys(telemetry.certificates)
+    interfaces = [name for _, name in socket.if_nameindex()]
+    scouting.check(
+        "", telemetry.discoverable, telemetry.listen, certified=bool(telemetry.certificates)
+    )
+    if telemetry.discoverable and telemetry.discoverable not in interfaces:
+        raise InputError(
+            f"telemetry.discoverable is '{telemetry.discoverable}': no such interface"
+            f" (there are: {', '.join(interfaces)})"
+        )
+    read_token(settings.http)
+
+
 def _check_map(folder: Path) -> None:
     """Raises a `BlimpError` for what no localizer could use.
 
     The localizers read the map itself: this process stays small for as long as the service runs.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such map")
+    if not (folder / "map.toml").exists():
+        what = "a folder without a map" if folder.is_dir() else "there is no such map"
+        raise InputError(f"{folder}: {what}; blimp map build INPUT --out {folder} makes one")
     if config.read(folder / "map.toml").get("frame") != "world":
         raise InputError(f"{folder}: it is not registered to a floor plan; see blimp map register")
 

@@ -31,7 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--lan", nargs="?", const="", metavar="INTERFACE",
         help="heard and found by payloads on that network, as wlan0 (default: the only one)",
     )  # fmt: skip
-    parser.add_argument("--check", action="store_true", help="check the configuration and exit")
+    parser.add_argument(
+        "--check", action="store_true", help="check the configuration and what it names, and exit"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.service import lan, settings
     from ground_station.service.ending import ending
     from ground_station.service.processes import ServiceError
-    from ground_station.service.serve import SAMPLE, serve
+    from ground_station.service.serve import SAMPLE, check, serve
 
     loaded = settings.load(args.config, args.set)
     if args.map is not None:
@@ -51,12 +53,13 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("--demo plays over loopback only; leave out --demo or --lan")
         loaded = lan.on(loaded, args.lan)
         print(lan.told(loaded), flush=True)
-    if args.check:
-        print("configuration is good")
-        return 0
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(loaded.map, folder=str(SAMPLE), shelf=str(SAMPLE.parent))
         loaded = dataclasses.replace(loaded, map=shelf)
+    if args.check:
+        check(loaded)
+        print("configuration is good")
+        return 0
     try:
         serve(loaded, ending(None), demo=SAMPLE / "flight.mcap" if args.demo else None)
     except ServiceError:  # the process that could not start has said why

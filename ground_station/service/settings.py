@@ -1,9 +1,14 @@
-"""The ground station's configuration; `station.toml` beside this file is its commented form."""
+"""The ground station's configuration; `station.toml` beside this file is its commented form.
+
+`python -m ground_station.service.settings FILE` checks the file alone: what it names, maps and
+keys, may not be there yet when the service is installed.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -178,3 +183,10 @@ def load_run(folder: Path) -> Run:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except ValueError:
         raise ConfigError(f"{path}: not JSON text") from None
+
+
+if __name__ == "__main__":
+    try:
+        load(Path(sys.argv[1]))
+    except ConfigError as error:
+        sys.exit(f"settings: {error}")

@@ -135,7 +135,13 @@ def test_the_installed_command_runs_its_own_release(installed: Path, tmp_path: P
     # What lies about where it is called, or is named in the environment, is not imported.
     (tmp_path / "ground_station.py").write_text("raise SystemExit('the wrong one')")
     run = subprocess.run(
-        [installed / "opt/blimp/current/bin/blimp", "serve", "--check"],
+        [
+            installed / "opt/blimp/current/bin/blimp",
+            "serve",
+            "--check",
+            "--map",
+            installed / "var/lib/blimp/maps/atrium",
+        ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,

@@ -14,7 +14,8 @@ from reference import networks
 from safetensors.numpy import save
 
 from ground_station import cli
-from ground_station.features import catalogue
+from ground_station.features import catalogue, extractors
+from ground_station.features.extractor import FeatureError
 
 
 @pytest.fixture(autouse=True)
@@ -142,3 +143,9 @@ def test_a_folder_that_cannot_be_made_is_one_line(
     weights = tmp_path / "alike-t.safetensors"
     weights.write_bytes(save(networks.alike_weights("t")))
     assert "Not a directory" in _refused(["import", str(weights)], capsys)
+
+
+@pytest.mark.parametrize("name", ["superpoint", "superpoint-open", "alike", "alike-n"])
+def test_a_network_that_is_not_here_yet_names_the_command_that_brings_it(name: str) -> None:
+    with pytest.raises(FeatureError, match="bring your own: blimp models import FILE"):
+        extractors.create(name)

@@ -188,7 +188,10 @@ def test_the_command_writes_page_and_figures(built, tmp_path, capsys):
     assert f"Map {built.map.info.name}" in out.read_text(encoding="utf-8")
     figures = json.loads(figures_file.read_text())["localizability"]
     assert figures["headings"] == 4 and 0 < figures["share_lost"] <= 1
-    assert "share_lost" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "share_lost" in said and "lengths are in the map's own units" in said
+    # It is not registered: no name of a figure says metres.
+    assert not [name for name in figures if name.endswith("_m")] and "_m " not in said
     with pytest.raises(GroundStationError, match="its folder does not exist"):
         view_command.run(parser.parse_args([shown[0], "--out", str(tmp_path / "a" / "b.html")]))
     flight = ["--compare", str(tmp_path / "est.txt"), str(tmp_path / "truth.txt")]

@@ -157,5 +157,7 @@ def test_a_map_of_other_features_is_refused_by_name(built):
 
 
 def test_there_is_no_such_map(tmp_path):
-    with pytest.raises(MapError, match="no such map"):
+    with pytest.raises(MapError, match=r"a folder without a map .*; blimp map build INPUT --out"):
+        store.load(tmp_path)
+    with pytest.raises(MapError, match="no such map; blimp map build INPUT --out"):
         store.load(tmp_path / "nowhere")
