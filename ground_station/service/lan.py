@@ -6,8 +6,11 @@ That is its certificates, the TLS listener, the video's address and discovery. A
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import fcntl
+import os
+import pwd
 import socket
 import struct
 from pathlib import Path
@@ -97,14 +100,25 @@ def told(settings: StationSettings) -> str:
             " COUNTRY=DE",
             "it finds this station by itself on the same network, or by"
             f" OPTIONS='--ground {address}' where multicast does not pass",
-            f"nothing comes? sudo blimp doctor --lan {telemetry.discoverable}",
+            f"nothing comes? blimp doctor --lan {telemetry.discoverable}"
+            " (with sudo it sees the firewall, too)",
         )
     )
 
 
+def _authority() -> Path:
+    """Where `blimp keys` made the keys: of the person at the keyboard, also under sudo."""
+    if os.geteuid() == 0 and (person := os.environ.get("SUDO_USER")):
+        with contextlib.suppress(KeyError):
+            theirs = Path(pwd.getpwnam(person).pw_dir) / ".local/share/blimp/keys"
+            if theirs.is_dir():
+                return theirs
+    return user_folders.data() / "keys"
+
+
 def _certificates(settings: StationSettings) -> credentials.Credentials:
     """This station's; raises `InputError` that names the command which makes them."""
-    authority = user_folders.data() / "keys"
+    authority = _authority()
     stations = authority / credentials.GROUND
     folder = Path(settings.telemetry.certificates or stations / settings.name)
     if not folder.is_dir():

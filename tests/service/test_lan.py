@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -75,6 +76,17 @@ def test_it_tells_what_a_payload_needs(data: Path) -> None:
     said = lan.told(lan.on(StationSettings(), "wlan0"))
     for words in ("hears the payloads: blimp-7", "PAYLOAD=blimp-7", "video udp 5600 (SRTP)"):
         assert words in said
+
+
+def test_under_sudo_the_keys_are_those_of_the_person(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = data.parent / "home"
+    folder = Authority.create(home / ".local/share/blimp/keys").add("ground", "main")
+    monkeypatch.setattr(lan.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(lan.pwd, "getpwnam", lambda _: SimpleNamespace(pw_dir=str(home)))
+    monkeypatch.setenv("SUDO_USER", "somebody")
+    assert lan.on(StationSettings(), "wlan0").telemetry.certificates == str(folder)
 
 
 def test_loopback_is_no_network() -> None:
