@@ -235,7 +235,7 @@ def _done(options: argparse.Namespace, content: Content) -> None:
         f"{device}: ready for payload {provisioning.payload_id}: {network}, ground station"
         f" {provisioning.ground_station.host}, {log_in}; read back and the same"
     )
-    serve = ".venv/bin/blimp serve --lan --map maps/NAME"
+    serve = ".venv/bin/blimp serve --lan"
     if held is not None:
         keys.remember(options.keys or wishes.default_keys(), provisioning.payload_id, held)
         if "ground.main" not in held.peers:

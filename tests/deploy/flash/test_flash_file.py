@@ -68,7 +68,7 @@ def test_it_ends_with_the_command_that_hears_the_card(bench: Bench, tmp_path: Pa
     keys = tmp_path / "of-hall"
     shutil.copytree(bench.keys, keys)
     authority = Authority(keys)
-    command = "blimp serve --lan --map maps/NAME"
+    command = "blimp serve --lan"
     assert run(bench.command()).stdout.splitlines()[-1].endswith(command)
     authority.add("ground", "hall")
     authority.revoke("ground.main")
