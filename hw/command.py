@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from hw.errors import HardwareError
 from hw.quantities import RANGES, checked, unit_of
-from pi_firmware.wire.errors import BlimpError
 
 CONDITIONS = ("temperature_C", "pressure_hPa", "altitude_m", "humidity_percent",
                "purity_percent", "superpressure_Pa", "leak_percent_per_day", "days",
@@ -108,22 +106,3 @@ def parser() -> argparse.ArgumentParser:
     sub = command("wiring", "the wiring of a build as SVG", "wiring --out out/wiring.svg")
     sub.add_argument("--out", type=Path, metavar="F.svg", help="file (default: standard output)")
     return result
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; 0, 1 (a margin or a current misses its bound) or 2 (bad input)."""
-    args = parser().parse_args(arguments)
-    from hw import answering
-
-    run: dict[str, Callable[[argparse.Namespace], int]] = {
-        "buoyancy": answering.buoyancy, "endurance": answering.endurance,
-        "budget": answering.budget, "wiring": answering.wiring,
-    }  # fmt: skip
-    try:
-        return run[args.command](args)
-    except BlimpError as error:
-        print(f"python -m hw {args.command}: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"python -m hw {args.command}: interrupted", file=sys.stderr)
-        return 130

@@ -22,14 +22,13 @@ from deploy.image import (
     ext4,
     ext4_read,
     initrd,
-    layer,
     manifest,
     partitions,
     release,
     root,
 )
 from deploy.image.card import Identifiers, beside, building
-from deploy.image.packages import add_packages
+from deploy.image.packages import add_packages, layer
 from deploy.image.packages.board import Board
 from deploy.image.partitions import FAT32_LBA, LINUX
 from deploy.image.sparse import Range, cut_out, sha256

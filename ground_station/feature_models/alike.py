@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from ground_station.feature_models.graph import Graph, fold_batch_norm
 from ground_station.feature_models.weights import Weights, WeightsError
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 _SIZES = {
     # Widths of the four blocks, dimension of the descriptor, whether there is a second head.

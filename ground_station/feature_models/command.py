@@ -10,7 +10,7 @@ from ground_station.files import write_json
 
 if TYPE_CHECKING:
     from ground_station.feature_models.comparison import Comparison
-    from ground_station.features.model import Model
+    from ground_station.features.model_info import Model
 
 _FRAMES = (4, 512)
 _THREADS = (1, 64)
@@ -138,7 +138,7 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     from ground_station.feature_models import comparison, importer, quantize
     from ground_station.features import catalogue, extractors
     from ground_station.features.extractor import FeatureError
-    from ground_station.features.model import Model
+    from ground_station.features.model_info import Model
     from ground_station.recording.open import open_input, parse_range
 
     for option, value, (low, high) in (

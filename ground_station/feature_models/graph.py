@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from ground_station import files
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 OPSET = 17
 IR_VERSION = 8

@@ -11,7 +11,7 @@ from ground_station.feature_models.weights import WeightsError
 from ground_station.features import catalogue, extractors, inspection
 from ground_station.features import model as models
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import Model, ModelInfo
+from ground_station.features.model_info import Model, ModelInfo
 
 _NETWORKS = (superpoint, alike)
 

@@ -22,7 +22,7 @@ from onnxruntime.quantization import (
 
 from ground_station.feature_models.graph import serialized
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import Model, ModelInfo
+from ground_station.features.model_info import Model, ModelInfo
 from ground_station.features.padding import padded
 
 KINDS = ("int8", "fp16")

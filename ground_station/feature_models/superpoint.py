@@ -11,7 +11,7 @@ from typing import Final
 
 from ground_station.feature_models.graph import Graph, batch_norm_terms, fold_batch_norm
 from ground_station.feature_models.weights import Weights
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 _WIDTHS: Final = (64, 64, 128, 128)
 """Of the encoder's four pairs of 3x3 convolutions, with a pooling between two pairs."""

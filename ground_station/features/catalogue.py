@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 from ground_station import user_folders
-from ground_station.features import model
+from ground_station.features import model, model_info
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import Model
+from ground_station.features.model_info import Model
 
 SHIPPED = Path(__file__).with_name("models")
 _ENDING = ".onnx"
@@ -23,7 +23,7 @@ def users() -> Path:
 
 def path_for(name: str) -> Path:
     """Where a user's model of that name belongs; raises `FeatureError` for what is no name."""
-    model.check_name(name)
+    model_info.check_name(name)
     return users() / f"{name}{_ENDING}"
 
 

@@ -67,7 +67,7 @@ def names() -> list[str]:
 
 def check_free(name: str) -> None:
     """Raises `FeatureError` unless a new model may have that name: well formed, and no method's."""
-    from ground_station.features.model import check_name
+    from ground_station.features.model_info import check_name
 
     check_name(name)
     if name in _EXTRACTORS or name == "map":

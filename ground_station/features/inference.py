@@ -10,7 +10,7 @@ import numpy.typing as npt
 import onnxruntime
 
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import Model
+from ground_station.features.model_info import Model
 
 F32 = npt.NDArray[np.float32]
 

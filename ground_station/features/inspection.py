@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import onnx
 
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 OPSETS = (17, 26)
 """The oldest and the newest of ONNX's operator sets that are taken."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ground_station.feature_models import scale
 from ground_station.feature_models.graph import Graph, fold_batch_norm
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 from ground_station.training.errors import TrainingError
 from ground_station.training.topology import LOGITS, Conv, Shape, layers
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import onnx
 from onnx import helper, numpy_helper
 
-from ground_station.features.model import Model
+from ground_station.features.model_info import Model
 
 
 def scores_only(teacher: Model) -> Model:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ground_station.features import catalogue, detection, model, sampling
 from ground_station.features.inference import Network
-from ground_station.features.model import Model
+from ground_station.features.model_info import Model
 from ground_station.training.errors import TrainingError
 from ground_station.training.score_graph import scores_only
 from ground_station.training.warps import WarpLimits, around

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.feature_models.graph import Graph
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 
 def info(name: str = "made-up", layout: str = "cells", **changes: object) -> ModelInfo:

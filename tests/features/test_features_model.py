@@ -13,7 +13,7 @@ from onnx import TensorProto, helper
 from ground_station.feature_models.graph import Graph
 from ground_station.features import inspection, model
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from hw import answering
+from hw.__main__ import main
 from hw.catalogue import BUILDS_FILE, load_builds
-from hw.command import main
 
 ROOT = Path(__file__).parents[2]
 

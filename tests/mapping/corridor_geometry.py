@@ -16,7 +16,7 @@ from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.sfm.two_view import TwoView
 
 BAY_M = 2.5
 WALL_M = 2.6

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.feature_models.graph import Graph
-from ground_station.features.model import ModelInfo
+from ground_station.features.model_info import ModelInfo
 from ground_station.training.topology import Shape, layers
 
 

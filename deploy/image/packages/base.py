@@ -2,7 +2,7 @@
 
 The base's own sources and keys say where packages come from, as on the board itself: Raspberry Pi
 OS's are the only ones built for ARMv6. Its programs run in a chroot, emulated. Kept is what that
-changed, as a layer (`deploy.image.layer`), so that nothing else of the base is ever written anew.
+changed, as a layer (`layer`), so that nothing else of the base is ever written anew.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import layer
 from deploy.image.ext4_read import unpack
-from deploy.image.packages import apt, cache, foreign, libraries
+from deploy.image.packages import apt, cache, foreign, layer, libraries
 from deploy.image.packages.board import Board, Group
 from deploy.image.packages.long import run_long
 from deploy.image.tree import Tree

@@ -23,12 +23,12 @@ import numpy as np
 from ground_station.geometry.alignment import align
 from ground_station.map import colmap, store
 from ground_station.mapping.construction.assembly import assemble
+from ground_station.mapping.construction.dask_option import open_workers
 from ground_station.mapping.construction.feature_file import FeatureFile
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.parts.reconstruction import reconstruct
 from ground_station.mapping.construction.structure import adjust_and_filter
 from ground_station.mapping.construction.verification import match
-from ground_station.mapping.construction.workers import open_workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.presentation.text import columns
 from ground_station.simulator.campus import CAMERA, Campus, campus

@@ -24,7 +24,6 @@ from ground_station.mapping.construction.content import structure_key
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.lens import SelfCalibration, with_lens
 from ground_station.mapping.construction.lens_prior import LensPrior
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.reconstruction import reconstruct
 from ground_station.mapping.construction.structure import Structure, adjust_and_filter
@@ -33,6 +32,7 @@ from ground_station.mapping.construction.work import lasting
 from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.recording.frames import Frame
 
 

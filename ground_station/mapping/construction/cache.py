@@ -24,7 +24,7 @@ from ground_station import user_folders
 from ground_station.features.extractor import Features
 from ground_station.mapping.construction import entries
 from ground_station.mapping.construction.entries import Entry, EntryError
-from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.sfm.two_view import TwoView
 
 Out = TypeVar("Out")
 

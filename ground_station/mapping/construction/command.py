@@ -76,9 +76,9 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.map.picture import from_above
     from ground_station.map.summary import describe
     from ground_station.mapping.construction.build import build_map
+    from ground_station.mapping.construction.dask_option import open_workers
     from ground_station.mapping.construction.inputs import open_inputs
     from ground_station.mapping.construction.verdict import next_step, verdict
-    from ground_station.mapping.construction.workers import open_workers
     from ground_station.mapping.settings import load_settings, with_changes
     from ground_station.presentation.theme import LIGHT, write_png
 

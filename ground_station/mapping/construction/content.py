@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -20,12 +20,28 @@ import numpy.typing as npt
 
 from ground_station.features.extractor import Extractor
 from ground_station.geometry.camera import Camera
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 
-if TYPE_CHECKING:
-    from ground_station.mapping.construction.images import Images
-    from ground_station.mapping.construction.verification import Rules
+
+class KeyPoints(Protocol):
+    """The images of a build: their names, times and undistorted key points."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of the files, or of the frames' numbers."""
+        ...
+
+    @property
+    def time_ns(self) -> npt.NDArray[np.int64]:
+        """(n,)."""
+        ...
+
+    @property
+    def pinhole_px(self) -> Sequence[npt.NDArray[np.float64]]:
+        """(N, 2) of each."""
+        ...
+
 
 _FEATURES, _PAIR, _STRUCTURE = b"blimp features 1\n", b"blimp pair 1\n", b"blimp structure 2\n"
 """Counted on when the same input gives another result: what was made before is then made anew."""
@@ -57,12 +73,12 @@ def features_key(image: npt.NDArray[np.uint8], how: bytes) -> bytes:
     return hashlib.sha256(_FEATURES + how + size + b"\n" + image.tobytes()).digest()
 
 
-def comparison(camera: Camera, rules: Rules) -> bytes:
+def comparison(camera: Camera, rules: Mapping[str, float]) -> bytes:
     """What, besides their features, decides a pair's geometry; one line for `pair_key`."""
     lens = {name: value for name, value in camera.as_dict().items() if name != "readout_s"}
     if math.isfinite(camera.lens.reach):  # beyond it key points are left out, which numbers them
         lens["reach"] = camera.lens.reach
-    return _line({"camera": lens, "rules": asdict(rules), "opencv": cv2.__version__})
+    return _line({"camera": lens, "rules": dict(rules), "opencv": cv2.__version__})
 
 
 def pair_key(first: bytes, second: bytes, how: bytes) -> bytes:
@@ -71,7 +87,7 @@ def pair_key(first: bytes, second: bytes, how: bytes) -> bytes:
 
 
 def structure_key(
-    images: Images,
+    images: KeyPoints,
     pairs: Mapping[tuple[int, int], TwoView],
     camera: Camera,
     settings: MappingSettings,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.features.extractor import Features
-from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.sfm.two_view import TwoView
 
 FEATURES, PAIR = 1, 2
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from ground_station.mapping.sfm.two_view import TwoView
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -49,21 +49,6 @@ def mutual_matches(first: F32, second: F32, ratio: float) -> I32:
     column_runner_up = np.maximum(similarity[:, j].max(axis=0), others[j])
     keep = 1 - value < square * (1 - column_runner_up)
     return np.stack([i[keep], j[keep]], axis=1).astype(np.int32)
-
-
-@dataclass(frozen=True)
-class TwoView:
-    """The verified geometry of a pair.
-
-    `matches` (K, 2), the inliers' key points; `essential` (3, 3) with x₂ᵀ E x₁ = 0 for coordinates
-    on the plane z = 1; `homography` (3, 3) of undistorted pixels or None; `degenerate`: the scene
-    is a plane or the camera only turned, so the pair gives no baseline.
-    """
-
-    matches: I32
-    essential: F64
-    homography: F64 | None
-    degenerate: bool
 
 
 def verify(

@@ -15,7 +15,6 @@ from ground_station.map import colmap, landmarks
 from ground_station.map.model import Model
 from ground_station.mapping.construction.consistency import plausible_frames
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair, sequences
 from ground_station.mapping.construction.placing import (
     bridges,
@@ -31,6 +30,7 @@ from ground_station.mapping.sfm import adjustment, global_mapping
 from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
 from ground_station.mapping.sfm.models import without_points, without_sights
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
 _FOLDED = 0.1

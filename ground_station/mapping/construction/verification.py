@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,10 @@ from ground_station.mapping.construction import pairs as choice
 from ground_station.mapping.construction.cache import Cache, Known
 from ground_station.mapping.construction.feature_file import KeptFeatures, KeptSide, Lazily, Side
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView, mutual_matches, verify
+from ground_station.mapping.construction.matching import mutual_matches, verify
 from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
 F32 = npt.NDArray[np.float32]
@@ -154,7 +155,9 @@ class _Comparison:
         self._matrix = camera.matrix
         self._neighbours = settings.match.neighbours
         self._rules = {far: rules_of(settings, far) for far in (False, True)}
-        self._how = {far: content.comparison(camera, rules) for far, rules in self._rules.items()}
+        self._how = {
+            far: content.comparison(camera, asdict(rules)) for far, rules in self._rules.items()
+        }
         self._cache, self._workers = cache, workers
 
     def compare(self, pairs: Sequence[Pair], label: str) -> dict[Pair, TwoView]:

@@ -12,10 +12,11 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView, mutual_matches
+from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.mapping.construction.verification import rules_of
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
 F64 = npt.NDArray[np.float64]

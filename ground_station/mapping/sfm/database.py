@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.colmap import pycolmap
-from ground_station.mapping.construction.matching import TwoView
+from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
 
 F64 = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 from card_parts import CAPABILITY
 
 from deploy.errors import DeployError
-from deploy.image import layer
+from deploy.image.packages import layer
 from deploy.image.packages.base import leave_out
 from deploy.image.packages.board import Group
 from deploy.image.tree import Content, Entry, Tree

@@ -7,9 +7,9 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.geometry.epipolar import essential
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.placing import bridges, contradictions
 from ground_station.mapping.construction.placing.placed import Placed
+from ground_station.mapping.sfm.two_view import TwoView
 
 K = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]])
 PINHOLE = np.array([500.0, 500, 320, 240])

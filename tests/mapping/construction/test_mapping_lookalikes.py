@@ -11,13 +11,13 @@ import pytest
 
 from ground_station.map import colmap
 from ground_station.mapping.construction import structure
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import sequences
 from ground_station.mapping.construction.placing import chains, lookalikes, loops
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
+from ground_station.mapping.sfm.two_view import TwoView
 
 SETTINGS = MappingSettings(threads=1)
 

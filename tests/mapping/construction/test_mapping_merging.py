@@ -13,10 +13,10 @@ from ground_station.geometry.alignment import Alignment
 from ground_station.map import colmap, landmarks
 from ground_station.map.model import Model
 from ground_station.mapping.construction import structure
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.placing import loops, merging
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 
 PINHOLE = np.array([500.0, 500.0, 320.0, 240.0])
 LANDMARKS = 120

@@ -12,16 +12,17 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map import colmap
+from ground_station.mapping.construction.dask_option import open_workers
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.parts import joining, solving, uniting
 from ground_station.mapping.construction.parts.cutting import inside, overlapping
 from ground_station.mapping.construction.parts.reconstruction import reconstruct
 from ground_station.mapping.construction.parts.solving import Solved
 from ground_station.mapping.construction.structure import adjust_and_filter
 from ground_station.mapping.construction.verification import match
-from ground_station.mapping.construction.workers import Threads, open_workers
+from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings, SfmSettings
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.simulator.campus import CAMERA, campus
 
 SETTINGS = MappingSettings(sfm=SfmSettings(part_images=50))

@@ -16,13 +16,12 @@ import pytest
 from ground_station.errors import InputError, MapError
 from ground_station.mapping.construction import cluster as dask
 from ground_station.mapping.construction import content
+from ground_station.mapping.construction.dask_option import open_workers, parse_cluster
 from ground_station.mapping.construction.images import extract
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.workers import (
     Threads,
     in_order,
-    open_workers,
-    parse_cluster,
     under_way,
 )
 from ground_station.mapping.settings import MappingSettings

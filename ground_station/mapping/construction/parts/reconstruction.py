@@ -12,13 +12,13 @@ from ground_station.map import colmap
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.feature_file import Lazily
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts import cutting, joining, solving, uniting
 from ground_station.mapping.construction.structure import Structure
 from ground_station.mapping.construction.workers import Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import adjustment
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
 _TOLERANCE = 1e-6

@@ -17,10 +17,10 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.structure import reconstruct
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

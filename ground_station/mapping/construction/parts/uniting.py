@@ -13,9 +13,9 @@ from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.solving import Solved
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -20,9 +20,9 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.workers import Threads
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -19,11 +19,11 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.epipolar import essential, sampson_px
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.lookalikes import HOLDS, SPEAKS
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.construction.workers import Threads
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 

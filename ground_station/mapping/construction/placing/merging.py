@@ -17,10 +17,10 @@ import numpy.typing as npt
 from ground_station.errors import GeometryError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map import colmap
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.sfm import robust_similarity
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

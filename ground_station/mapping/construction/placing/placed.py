@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.map.model import Model
-from ground_station.mapping.construction.matching import TwoView
 from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.sfm.two_view import TwoView
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
