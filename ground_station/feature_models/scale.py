@@ -21,8 +21,8 @@ from ground_station.feature_models.images import procedural
 from ground_station.features.extractor import Extractor
 from ground_station.features.extractors import of_network
 from ground_station.features.inference import Network
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.features.model_info import SCALES, Model, ModelInfo
-from ground_station.features.rootsift import RootSift
 
 _PAIRS, _SIZE, _SEED = 8, (240, 320), 7
 _FEATURES = 500

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
+import pkgutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ground_station.features import catalogue
+from ground_station.features import catalogue, methods
 from ground_station.features.extractor import Extractor, FeatureError
-from ground_station.features.orb import Orb
-from ground_station.features.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 
 if TYPE_CHECKING:
     from ground_station.features.inference import Network
 
-_EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"rootsift": RootSift, "orb": Orb}
 _IMPORTABLE = ("superpoint", "alike")
 """How the networks are called that `blimp models import` knows."""
+
+
+def _method(name: str, max_features: int) -> Extractor:
+    module = importlib.import_module(f"{methods.__name__}.{name}")
+    extractor: Extractor = module.METHOD(max_features)
+    return extractor
+
+
+METHODS: dict[str, Callable[[int], Extractor]] = {
+    module.name: functools.partial(_method, module.name)
+    for module in pkgutil.iter_modules(methods.__path__)
+}
+"""What makes each, keeping at most so many key points."""
 _DEFAULT = LearnedSettings()
 
 
@@ -33,8 +46,8 @@ def create(
     tracker's) say how its network runs, which is warm when this returns. Raises `FeatureError`
     naming those there are, and as `catalogue.find` and `Network` do.
     """
-    if name in _EXTRACTORS:
-        return _EXTRACTORS[name](max_features)
+    if name in METHODS:
+        return METHODS[name](max_features)
     if name not in catalogue.names():
         known = ", ".join(names())
         bring = ""
@@ -62,7 +75,7 @@ def of_network(
 
 def names() -> list[str]:
     """The names that `create` knows."""
-    return sorted({*_EXTRACTORS, *catalogue.names()})
+    return sorted({*METHODS, *catalogue.names()})
 
 
 def check_free(name: str) -> None:
@@ -70,5 +83,5 @@ def check_free(name: str) -> None:
     from ground_station.features.model_info import check_name
 
     check_name(name)
-    if name in _EXTRACTORS or name == "map":
+    if name in METHODS or name == "map":
         raise FeatureError(f"name is '{name}', which is a method's; give the model another")

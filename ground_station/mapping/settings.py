@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ground_station.features.rootsift import RootSift
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError

@@ -21,8 +21,8 @@ from ground_station.features import model
 from ground_station.features.cells import CellFeatures
 from ground_station.features.extractor import Extractor
 from ground_station.features.inference import Network
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.features.pixels import PixelFeatures
-from ground_station.features.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 from ground_station.progress import Progress
 from ground_station.training import checkpoint, corpus, curve, teacher, validation

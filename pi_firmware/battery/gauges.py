@@ -2,46 +2,30 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import re
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 from pi_firmware import uri
-from pi_firmware.battery import simulated
+from pi_firmware.battery import chips, simulated
 from pi_firmware.battery.bus import Counts, Smbus, WordBus
 from pi_firmware.battery.cell import Cell
+from pi_firmware.battery.chip import Chip, Gauge, Shunt
 from pi_firmware.battery.fake import FakeGauge
-from pi_firmware.battery.ina import Ina219, Ina226, Shunt
-from pi_firmware.battery.max17048 import Max17048
 from pi_firmware.settings import BatterySettings
-from pi_firmware.wire.messages import Battery
 
 WHAT = "battery.uri"
-_PATH = re.compile(r"(ina219|ina226|max17048)@(\d{1,3}|fake):(0x[0-9a-fA-F]{1,2})")
-_ADDRESSES = {
-    "ina219": range(0x40, 0x50),
-    "ina226": range(0x40, 0x50),
-    "max17048": range(0x36, 0x37),
-}
+_PATH = re.compile(r"([a-z0-9]+)@(\d{1,3}|fake):(0x[0-9a-fA-F]{1,2})")
 _SHUNT = ("shunt_ohm", "max_A", "discharge")
-# What the boards sold with these chips have: 0.1 ohm. The INA226 measures up to 82 mV only.
-_MAX_A = {"ina219": 3.0, "ina226": 0.8}
 _FAULTS = ("percentage", "load_A", "absent", "fail_every", "nonsense_every", "nonsense")
 
 
-class Gauge(Protocol):
-    """Anything that can say how much charge is left, or voltage and current to find it from."""
-
-    counts: Counts
-
-    def read(self, time_ns: int) -> Battery:
-        """One reading, stamped with the payload's clock; raises `GaugeError` without one."""
-        ...
-
-    def close(self) -> None:
-        """Releases the device; the next reading opens it again."""
-        ...
+def chips_known() -> dict[str, Chip]:
+    """The chips that the files in `chips` declare, by name."""
+    names = [f"{chips.__name__}.{module.name}" for module in pkgutil.iter_modules(chips.__path__)]
+    return {n: c for name in names for n, c in importlib.import_module(name).CHIPS.items()}
 
 
 def cell_of(settings: BatterySettings) -> Cell:
@@ -69,41 +53,31 @@ def open_gauge(text: str, settings: BatterySettings | None = None) -> Gauge:
 
 
 def _open_i2c(parsed: uri.Uri, settings: BatterySettings) -> Gauge:
+    known = chips_known()
     match = _PATH.fullmatch(parsed.path)
-    if match is None:
+    if match is None or match[1] not in known:
         raise parsed.fail(
-            "expected i2c:CHIP@BUS:ADDRESS as i2c:ina219@1:0x40 (chips: ina219, ina226, max17048)"
+            f"expected i2c:CHIP@BUS:ADDRESS as i2c:ina219@1:0x40 (chips: {', '.join(known)})"
         )
-    chip, bus, address = match[1], match[2], int(match[3], 16)
-    allowed = _ADDRESSES[chip]
+    name, bus, address = match[1], match[2], int(match[3], 16)
+    chip = known[name]
+    allowed = chip.addresses
     if address not in allowed:
         raise parsed.fail(
-            f"address {address:#04x}; allowed for {chip}: {allowed[0]:#04x} to {allowed[-1]:#04x}"
+            f"address {address:#04x}; allowed for {name}: {allowed[0]:#04x} to {allowed[-1]:#04x}"
         )
-    shunted = chip != "max17048"
-    parsed.only(*(_SHUNT if shunted else ()), *(_FAULTS if bus == "fake" else ()))
-    shunt = _shunt(parsed, chip) if shunted else Shunt()
+    parsed.only(*(_SHUNT if chip.shunt else ()), *(_FAULTS if bus == "fake" else ()))
+    shunt = chip.shunt(parsed) if chip.shunt else Shunt()
     counts = Counts()
     if bus == "fake":
-        fake = _fake_bus(parsed, chip, address, shunt, cell_of(settings))
-        words = WordBus(lambda: fake, address, chip, counts)
+        fake = _fake_bus(parsed, name, address, shunt, cell_of(settings))
+        words = WordBus(lambda: fake, address, name, counts)
     else:
-        words = WordBus(_opener(parsed, int(bus)), address, f"{chip} on i2c-{bus}", counts)
-    if chip == "max17048":
-        return Max17048(words, counts, settings.capacity_mAh / 1000, settings.temperature_C)
+        words = WordBus(_opener(parsed, int(bus)), address, f"{name} on i2c-{bus}", counts)
     try:
-        return (Ina219 if chip == "ina219" else Ina226)(words, shunt, counts)
+        return chip.open(words, shunt, counts, settings)
     except ValueError as error:
         raise parsed.fail(str(error)) from None
-
-
-def _shunt(parsed: uri.Uri, chip: str) -> Shunt:
-    return Shunt(
-        resistance_ohm=parsed.number("shunt_ohm", 0.1, 0.0005, 10.0),
-        max_A=parsed.number("max_A", _MAX_A[chip], 0.01, 100.0),
-        discharge_positive=parsed.choice("discharge", "positive", ("positive", "negative"))
-        == "positive",
-    )
 
 
 def _opener(parsed: uri.Uri, number: int) -> Callable[[], Smbus]:

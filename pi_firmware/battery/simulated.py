@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from pi_firmware.battery import ina, max17048
 from pi_firmware.battery.bus import swap
 from pi_firmware.battery.cell import Cell, Polarization
+from pi_firmware.battery.chips import ina, max17048
 
 
 class SimulatedCell:

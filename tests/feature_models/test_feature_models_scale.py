@@ -7,8 +7,8 @@ import pytest
 
 from ground_station.feature_models.scale import distance_scale
 from ground_station.features.extractor import Features
-from ground_station.features.orb import Orb
-from ground_station.features.rootsift import RootSift
+from ground_station.features.methods.orb import Orb
+from ground_station.features.methods.rootsift import RootSift
 
 
 class Turned(RootSift):

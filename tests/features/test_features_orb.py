@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ground_station.features import extractors
-from ground_station.features.orb import unit_of_bits
+from ground_station.features.methods.orb import unit_of_bits
 from ground_station.mapping.construction.matching import mutual_matches
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from ground_station.features import extractors
 from ground_station.features.extractor import FeatureError
-from ground_station.features.rootsift import hellinger
+from ground_station.features.methods.rootsift import hellinger
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ground_station.features.rootsift import RootSift
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization import tracking

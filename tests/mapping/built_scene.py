@@ -127,7 +127,7 @@ def use_scene(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     """Registers an extractor that gives the features of a scene."""
 
     def use(scene: Scene) -> None:
-        monkeypatch.setitem(extractors._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
+        monkeypatch.setitem(extractors.METHODS, "scene", lambda _: SceneExtractor(scene))
 
     return use
 
@@ -138,6 +138,6 @@ def built(tmp_path_factory: pytest.TempPathFactory, scene_settings: MappingSetti
     scene = make_scene()
     folder = tmp_path_factory.mktemp("built") / "room"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(extractors._EXTRACTORS, "scene", lambda _: SceneExtractor(scene))
+        patch.setitem(extractors.METHODS, "scene", lambda _: SceneExtractor(scene))
         map_ = build.build_map(scene.frames(), scene.camera, scene_settings, folder)
     return Built(scene, scene_settings, map_, folder)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pi_firmware.battery import ina, simulated
+from pi_firmware.battery import simulated
 from pi_firmware.battery.bus import Counts, WordBus
 from pi_firmware.battery.cell import Cell, Polarization
 from pi_firmware.battery.charge import ChargeFilter
+from pi_firmware.battery.chips import ina
 
 CAPACITY_AH = 0.6
 SHUNT = ina.Shunt(0.1, 3.0)

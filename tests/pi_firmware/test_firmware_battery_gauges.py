@@ -6,8 +6,9 @@ from collections.abc import Callable
 import pytest
 
 from pi_firmware import battery
-from pi_firmware.battery import ina, max17048, simulated
+from pi_firmware.battery import simulated
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed, swap
+from pi_firmware.battery.chips import ina, max17048
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire.errors import SourceError
 

@@ -85,9 +85,10 @@ def test_a_sag_of_a_moment_is_no_alarm_and_a_lasting_one_ends_the_flight_above_3
 
 
 def test_shutdown_comes_before_3_2_volts_under_load() -> None:
-    from pi_firmware.battery import ina, simulated
+    from pi_firmware.battery import simulated
     from pi_firmware.battery.bus import WordBus
     from pi_firmware.battery.cell import Cell
+    from pi_firmware.battery.chips import ina
 
     for celsius in (5.0, 25.0):
         cell = simulated.SimulatedCell(Cell(0.55, temperature_c=celsius - 3), 0.3)

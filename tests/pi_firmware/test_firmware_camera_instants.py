@@ -8,8 +8,8 @@ import pytest
 
 from pi_firmware import clocks
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources import v4l2
 from pi_firmware.sources.live import LiveSource
+from pi_firmware.sources.schemes import v4l2
 from pi_firmware.sources.shutter import Mark, to_middle_ns
 
 _SOE, _EOF = 0x00010000, 0

@@ -14,8 +14,9 @@ from receiving import Receiver
 
 from pi_firmware import clocks, gstreamer, uri
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources import libcamera, open_source
-from pi_firmware.sources.libcamera import LibcameraSource
+from pi_firmware.sources import open_source
+from pi_firmware.sources.schemes import libcamera
+from pi_firmware.sources.schemes.libcamera import LibcameraSource
 from pi_firmware.wire.errors import SourceError
 
 ROOT = Path(__file__).parents[2]

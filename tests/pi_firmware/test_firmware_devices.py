@@ -5,7 +5,7 @@ import pytest
 
 from pi_firmware import battery, encoder, gstreamer, sources, uri
 from pi_firmware.settings import CameraSettings, EncoderSettings
-from pi_firmware.sources.replay import RateGrid
+from pi_firmware.sources.schemes.replay import RateGrid
 from pi_firmware.wire.errors import BlimpError, SourceError, StreamError
 
 

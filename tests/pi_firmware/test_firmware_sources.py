@@ -9,7 +9,8 @@ import pytest
 from receiving import Receiver
 
 from pi_firmware.settings import CameraSettings, load
-from pi_firmware.sources import clock, v4l2
+from pi_firmware.sources import clock
+from pi_firmware.sources.schemes import v4l2
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (64, 64)])

@@ -7,7 +7,7 @@ import pytest
 
 from ground_station.feature_models import images
 from ground_station.features import detection
-from ground_station.features.rootsift import RootSift
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.training import labels, pairs, validation, warps
 from ground_station.training.corpus import Place
 

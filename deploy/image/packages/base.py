@@ -74,7 +74,7 @@ def add_packages(
             package isn't there or doesn't install; nothing half-made is left. What the tools said
             then stands in `base-BOARD.log` there.
     """
-    made_by = (_RECIPE, _HERE / "install.sh", _HERE.parent / "layer.py")
+    made_by = (_RECIPE, _HERE / "install.sh", _HERE / "layer.py")
     names = sorted(missing)
     key = cache.key(base, board.architecture, names, board.left_out, *made_by)
     target = cache_folder / f"base-{board.name}-{key}.tar"

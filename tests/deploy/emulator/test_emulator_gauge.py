@@ -7,7 +7,7 @@ import pytest
 from deploy.emulator import gauge
 from deploy.errors import DeployError
 from pi_firmware.battery.bus import Counts, WordBus
-from pi_firmware.battery.max17048 import Max17048
+from pi_firmware.battery.chips.max17048 import Max17048
 
 
 class Eeprom:

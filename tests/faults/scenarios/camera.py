@@ -40,7 +40,7 @@ class Truth:
         poses = RecordingReader(recording).poses(TRUTH_TOPIC)
         self._time_ns = np.array([pose.time_ns for pose in poses])
         self._position_m = np.array([pose.position_m for pose in poses])
-        # As `pi_firmware.sources.replay` shifts a round: by its length, and one frame more.
+        # As `pi_firmware.sources.schemes.replay` shifts a round: by its length, and one frame more.
         first, before, last = (int(self._time_ns[i]) for i in (0, -2, -1))
         self._first_ns, self.round_ns = first, last - first + (last - before)
 

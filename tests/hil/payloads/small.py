@@ -22,7 +22,7 @@ from ground_station.progress import Progress
 from ground_station.recording.encoding import H264Encoder
 from ground_station.recording.flight import FlightRecording, camera_of
 from ground_station.recording.frames import CAMERA_TABLE
-from pi_firmware.sources.replay import RateGrid
+from pi_firmware.sources.schemes.replay import RateGrid
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader, RecordingWriter
 

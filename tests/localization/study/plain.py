@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.features.rootsift import RootSift
+from ground_station.features.methods.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map

@@ -191,7 +191,7 @@ def _corridor_world(tmp_path_factory) -> World:
 @pytest.fixture
 def corridor_world(_corridor_world, monkeypatch) -> World:
     """Its extractor is registered; tests that change the map work on a copy (`--out`)."""
-    monkeypatch.setitem(extractors._EXTRACTORS, "corridor", lambda _: _corridor_world.corridor)
+    monkeypatch.setitem(extractors.METHODS, "corridor", lambda _: _corridor_world.corridor)
     return _corridor_world
 
 
@@ -205,7 +205,7 @@ def extended(world: World, out: Path, *inputs: Path) -> tuple[store.Map, store.M
 def by_sunset(_corridor_world, tmp_path_factory):
     """Extended once by the sunset flight; the tests only read it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(extractors._EXTRACTORS, "corridor", lambda _: _corridor_world.corridor)
+        patch.setitem(extractors.METHODS, "corridor", lambda _: _corridor_world.corridor)
         out = tmp_path_factory.mktemp("sunset") / "extended"
         return extended(_corridor_world, out, _corridor_world.flights["sunset"])
 

@@ -174,7 +174,7 @@ def test_killed_while_it_writes_it_leaves_the_old_map(corridor_world, short_flig
         "rows = [(kept[f'keypoints_px{k}'], kept[f'descriptors{k}']) for k in range(9)]\n"
         "pictures = [Features(p, np.ones(len(p), np.float32), d) for p, d in rows]\n"
         "world = Corridor(None, None, None, None, None, pictures)\n"
-        "extractors._EXTRACTORS['corridor'] = lambda _: world\n"
+        "extractors.METHODS['corridor'] = lambda _: world\n"
         "write = extend.store.save_tables\n"
         "def killed(*words, **more):\n"
         "    write(*words, **more)\n"

@@ -55,7 +55,7 @@ def main(out, folder, calls, step, count):
     scene = make_scene()
     extractor = SceneExtractor(scene)
     extractor.extract = note.around("extract", extractor.extract)
-    extractors._EXTRACTORS["scene"] = lambda _: extractor
+    extractors.METHODS["scene"] = lambda _: extractor
     verification.verify_pair = note.around("verify", verification.verify_pair)
     store.save_tables = note.around("save", store.save_tables)
     stepped = Progress.step

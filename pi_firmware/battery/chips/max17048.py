@@ -6,6 +6,7 @@ Registers and units are those of Maxim's datasheet 19-6171, revision 7.
 from __future__ import annotations
 
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
+from pi_firmware.battery.chip import Chip
 from pi_firmware.wire.messages import Battery
 
 VCELL, SOC, VERSION, CONFIG, CRATE, STATUS = 0x02, 0x04, 0x08, 0x0C, 0x16, 0x1A
@@ -76,3 +77,13 @@ def compensation(temperature_c: float) -> int:
     """
     slope = -0.5 if temperature_c > 20 else -5.0
     return max(0, min(255, round(_RCOMP_AT_20_C + (temperature_c - 20) * slope)))
+
+
+CHIPS = {
+    "max17048": Chip(
+        range(0x36, 0x37),
+        lambda bus, _, counts, battery: Max17048(
+            bus, counts, battery.capacity_mAh / 1000, battery.temperature_C
+        ),
+    )
+}

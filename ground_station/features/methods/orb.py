@@ -70,3 +70,6 @@ def unit_of_bits(bits: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """Binary descriptors (N, B / 8) as unit vectors (N, B) of the two values ±1/√B."""
     signs = np.unpackbits(bits, axis=1).astype(np.float32) * 2 - 1
     return np.asarray(signs / np.sqrt(np.float32(signs.shape[1])), np.float32)
+
+
+METHOD = Orb

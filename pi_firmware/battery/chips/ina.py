@@ -6,9 +6,10 @@ Registers, bits and equations are those of the datasheets SBOS448G (INA219) and 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
+from pi_firmware.battery.chip import Chip, Shunt
+from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 
 CONFIGURATION, SHUNT_VOLTAGE, BUS_VOLTAGE, POWER, CURRENT, CALIBRATION = range(6)
@@ -16,18 +17,6 @@ MANUFACTURER_ID, DIE_ID = 0xFE, 0xFF
 RESET = 0x8000
 _DISCHARGING, _CHARGING, _GOOD, _LIPO = 2, 1, 1, 3
 _INA219_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # of the programmable gain 1, 1/2, 1/4, 1/8
-
-
-@dataclass(frozen=True)
-class Shunt:
-    """The resistor and the largest current expected through it.
-
-    `discharge_positive`: a discharging current flows from IN+ to IN-.
-    """
-
-    resistance_ohm: float = 0.1
-    max_A: float = 3.0
-    discharge_positive: bool = True
 
 
 class _Ina(ABC):
@@ -206,3 +195,27 @@ def _reading(time_ns: int, voltage: float, through_shunt_a: float, shunt: Shunt)
         power_supply_health=_GOOD,
         power_supply_technology=_LIPO,
     )
+
+
+def _shunt(parsed: Uri, max_A: float) -> Shunt:
+    """What the boards sold with these chips have is 0.1 ohm."""
+    return Shunt(
+        resistance_ohm=parsed.number("shunt_ohm", 0.1, 0.0005, 10.0),
+        max_A=parsed.number("max_A", max_A, 0.01, 100.0),
+        discharge_positive=parsed.choice("discharge", "positive", ("positive", "negative"))
+        == "positive",
+    )
+
+
+CHIPS = {
+    "ina219": Chip(
+        range(0x40, 0x50),
+        lambda bus, shunt, counts, _: Ina219(bus, shunt, counts),
+        lambda parsed: _shunt(parsed, 3.0),
+    ),
+    "ina226": Chip(  # measures up to 82 mV only
+        range(0x40, 0x50),
+        lambda bus, shunt, counts, _: Ina226(bus, shunt, counts),
+        lambda parsed: _shunt(parsed, 0.8),
+    ),
+}

@@ -197,3 +197,6 @@ class ReplaySource:
         if structure.has_field("colorimetry"):
             text += f",colorimetry={structure.get_value('colorimetry')}"
         return f"{text},framerate={rate.numerator}/{rate.denominator}"
+
+
+SOURCE = ReplaySource

@@ -195,3 +195,6 @@ class V4l2Source(LiveSource):
             return timestamp_mark(file)
         finally:
             os.close(file)
+
+
+SOURCE = V4l2Source

@@ -182,3 +182,6 @@ class LibcameraSource(LiveSource):
 def _text(value: Any) -> str:
     """A property's value as GStreamer reads it; booleans are `true` and `false` there."""
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+SOURCE = LibcameraSource

@@ -1,0 +1,1 @@
+"""Extractors without a model, a file each, found by its name: `METHOD` makes one."""
