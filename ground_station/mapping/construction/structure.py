@@ -20,6 +20,7 @@ from ground_station.mapping.construction.placing import (
     bridges,
     chains,
     contradictions,
+    elsewhere,
     lookalikes,
     loops,
     merging,
@@ -118,6 +119,9 @@ class _Reconstruction:
             still = self._misplaced(again[0], links, trusted)
             if again[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
                 models, notes, wrong, pairs = again, said, still, trusted
+        better = {k for k, rival in self._rivals(models[0], pairs).items() if rival.better} - wrong
+        wrong |= better
+        moved += len(better)
         if wrong:
             model = self._placed(models[0])
             lies = lookalikes.refuted(model, wrong, links, pairs, self._images.pinhole_px)
@@ -128,6 +132,7 @@ class _Reconstruction:
             colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
         self._drop_implausible(models[0], ordered)
         models, doubts = self._consistent(models, pairs)
+        doubts += elsewhere.doubt(self._rivals(models[0], pairs), self._images.names)
         gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
         if moved:
             notes.append(
@@ -303,6 +308,11 @@ class _Reconstruction:
 
     def _placed(self, model: colmap.Reconstruction) -> Placed:
         return Placed.of(colmap.to_arrays(model), self._counts)
+
+    def _rivals(self, model: colmap.Reconstruction, pairs: Pairs) -> dict[int, elsewhere.Rival]:
+        return elsewhere.rivals(
+            self._placed(model), pairs, self._images.pinhole_px, self._camera.matrix
+        )
 
     def _misplaced(self, model: colmap.Reconstruction, links: set[Pair], pairs: Pairs) -> set[int]:
         return lookalikes.misplaced(self._placed(model), links, pairs, self._images.pinhole_px)

@@ -14,6 +14,8 @@ from ground_station.mapping.construction.feature_file import Lazily
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts import cutting, joining, solving, uniting
+from ground_station.mapping.construction.placing import elsewhere
+from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.construction.structure import Structure
 from ground_station.mapping.construction.workers import Workers
 from ground_station.mapping.settings import MappingSettings
@@ -110,4 +112,11 @@ def _joined(
         [len(model.names), *sorted(apart, reverse=True)],
         [],
         notes + joined.notes,
-    )
+        doubts=elsewhere.doubt(
+            elsewhere.rivals(
+                Placed.of(colmap.to_arrays(reconstruction), [len(p) for p in images.pinhole_px]),
+                pairs, images.pinhole_px, camera.matrix,
+            ),
+            images.names,
+        ),
+    )  # fmt: skip

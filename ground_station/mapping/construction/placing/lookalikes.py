@@ -24,7 +24,7 @@ F64 = npt.NDArray[np.float64]
 
 SPEAKS = 15
 """Fewer landmarks in common say nothing about two images."""
-HOLDS, _BREAKS = 0.5, 0.2
+HOLDS, BREAKS = 0.5, 0.2
 """Shares of the landmarks in common that are in their place: of a link that holds, and of one that
 does not. Between the two a link says nothing."""
 
@@ -47,7 +47,7 @@ def misplaced(
             good, total = model.in_place(pair, pairs[pair], pixels)
             if total >= SPEAKS and good >= HOLDS * total:
                 holding.append(pair)
-            elif total >= SPEAKS and good <= _BREAKS * total:
+            elif total >= SPEAKS and good <= BREAKS * total:
                 broken.append(pair)
     edges = np.array(holding, dtype=np.int64).reshape(-1, 2)
     piece = components([edges], len(model.landmark))

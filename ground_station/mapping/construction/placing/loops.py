@@ -28,7 +28,7 @@ I64 = npt.NDArray[np.int64]
 
 _DRIFT = 0.05
 """Drift over the way: visual odometry of a calibrated camera has about a hundredth."""
-_SLACK_DEPTHS = 0.08
+SLACK_DEPTHS = 0.08
 """What a landmark's own error may be, in distances at which landmarks are seen."""
 _SPEAKS = 6
 """Landmarks that a pair must show twice, or nothing is known of it."""
@@ -58,7 +58,7 @@ def believed(
                     moved.append(by)
         if loops:
             ends, way = np.array(loops), _way(model, sequence)
-            slack = _SLACK_DEPTHS * model.depth
+            slack = SLACK_DEPTHS * model.depth
             agreeing = _agreeing(way[ends], sequence[ends], np.array(moved), slack)
             kept.update(loop for loop, agrees in zip(loops, agreeing, strict=True) if agrees)
     return kept

@@ -30,7 +30,7 @@ _WITHIN_DEPTHS = 0.05
 """A landmark of both models is the same place so exactly, in distances at which they are seen."""
 _FEWEST = 30
 """Landmarks in common that join two models."""
-_SECOND = 0.5
+SECOND = 0.5
 """A second similarity that fits so many of the first one's number makes it doubtful."""
 _SHOWN = 4
 """Ranges of names that a report lists."""
@@ -60,7 +60,7 @@ def junction(target: Placed, source: Placed, pairs: Mapping[Pair, TwoView], seed
         )
     other, others = _similarity(x[~fits], y[~fits], within, seed)
     second = np.count_nonzero(others)
-    if other is not None and second >= _SECOND * first:
+    if other is not None and second >= SECOND * first:
         return Junction(
             None,
             f"they fit the largest in two places: {first} landmarks say one, {second} another",

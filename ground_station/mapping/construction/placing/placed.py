@@ -17,7 +17,7 @@ from ground_station.mapping.sfm.two_view import TwoView
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
-_IN_PLACE_PX = 8.0
+IN_PLACE_PX = 8.0
 """A landmark seen so near to where it should be is in its place; neighbours fit within 1 px."""
 
 
@@ -81,6 +81,6 @@ class Placed:
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = local[:, :2] / local[:, 2:] * self.pinhole[:2] + self.pinhole[2:]
             error = np.linalg.norm(at - pixels[other][matches[known, 1]], axis=1)
-            good += int(np.count_nonzero((local[:, 2] > 0) & (error < _IN_PLACE_PX)))
+            good += int(np.count_nonzero((local[:, 2] > 0) & (error < IN_PLACE_PX)))
             total += int(np.count_nonzero(known))
         return good, total

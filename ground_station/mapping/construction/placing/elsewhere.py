@@ -1,0 +1,123 @@
+"""Images that would fit another place of the model as well as theirs, as where walls repeat.
+
+Pairs that hold an image say where it is. Those that break say together where else it may be: its
+key points against the landmarks that other images see there. Where walls repeat, a model may hold
+an image at the wrong bay without any residual, and its rotation is right in each; only this second
+hypothesis tells. As where two models are joined, one that half as many landmarks support makes the
+first doubtful; and the first is wrong where it is supported by less than half of the second's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.geometry import poses
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.placing.lookalikes import BREAKS, SPEAKS
+from ground_station.mapping.construction.placing.loops import SLACK_DEPTHS
+from ground_station.mapping.construction.placing.merging import SECOND
+from ground_station.mapping.construction.placing.placed import IN_PLACE_PX, Placed
+from ground_station.mapping.sfm.two_view import TwoView
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+_DRAWS = 1000
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Rival:
+    """How many key points support an image's place, and how many the best other one."""
+
+    here: int
+    there: int
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the other place is nearly as good."""
+        return self.there >= SECOND * self.here
+
+    @property
+    def better(self) -> bool:
+        """Whether the other place is much better."""
+        return self.here <= SECOND * self.there
+
+
+def rivals(
+    model: Placed, pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64
+) -> dict[int, Rival]:
+    """The images, by index, that their broken pairs would place elsewhere, doubtful or not.
+
+    `pixels` (N, 2) are each image's undistorted key points.
+    """
+    key_point: dict[int, list[I64]] = {}
+    landmark: dict[int, list[I64]] = {}
+    for (i, j), view in pairs.items():
+        if not {i, j} <= model.wTc.keys():
+            continue
+        good, total = model.in_place((i, j), view, pixels)
+        if total < SPEAKS or good > BREAKS * total:
+            continue
+        for mine, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
+            seen = model.landmark[other][matches[:, 1]]
+            key_point.setdefault(mine, []).append(matches[seen >= 0, 0].astype(np.int64))
+            landmark.setdefault(mine, []).append(seen[seen >= 0])
+    found = {}
+    for k, lists in sorted(key_point.items()):
+        here = int(np.count_nonzero(model.landmark[k] >= 0))
+        index = np.concatenate(lists)
+        points = model.position[np.concatenate(landmark[k])]
+        there = _elsewhere(model, k, index, pixels[k][index], points, camera_matrix)
+        if there >= SPEAKS:
+            found[k] = Rival(here, there)
+    return found
+
+
+def _elsewhere(
+    model: Placed,
+    image: int,
+    key_point: I64,
+    pixel: F64,
+    points: F64,
+    camera_matrix: F64,
+) -> int:
+    """How many of an image's key points the best pose from these landmarks explains.
+
+    0 where that is its own place.
+    """
+    if len(points) < SPEAKS:
+        return 0
+    solved, turn, t, inliers = cv2.solvePnPRansac(
+        points, pixel, camera_matrix, None,
+        iterationsCount=_DRAWS, reprojectionError=IN_PLACE_PX, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not solved or inliers is None:
+        return 0
+    wTc = poses.inverse(poses.pose(cv2.Rodrigues(turn)[0], t.ravel()))
+    if np.linalg.norm(wTc[:3, 3] - model.wTc[image][:3, 3]) <= SLACK_DEPTHS * model.depth:
+        return 0
+    return len(np.unique(key_point[inliers.ravel()]))
+
+
+def doubt(found: Mapping[int, Rival], names: Sequence[str]) -> list[str]:
+    """A sentence on the images that fit two places; none where there are none."""
+    doubtful = [k for k, rival in sorted(found.items()) if rival.doubtful]
+    if not doubtful:
+        return []
+    shown = ", ".join(names[k] for k in doubtful[:_SHOWN])
+    more = f" and {len(doubtful) - _SHOWN} more" if len(doubtful) > _SHOWN else ""
+    return [
+        f"{_images(doubtful)} in another place nearly as well as in theirs, because what is seen"
+        f" repeats itself: {shown}{more}"
+    ]
+
+
+def _images(index: Iterable[int]) -> str:
+    count = len(list(index))
+    return "one image fits" if count == 1 else f"{count} images fit"

@@ -1,0 +1,82 @@
+"""An image that fits another bay of a wall that repeats: moved where that is clear, else said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ground_station.geometry import poses
+from ground_station.mapping.construction.placing import elsewhere
+from ground_station.mapping.construction.placing.elsewhere import Rival
+from ground_station.mapping.construction.placing.placed import Placed
+from ground_station.mapping.sfm.two_view import TwoView
+
+MATRIX = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+BAY_M = 6.0
+N = 80
+
+
+def camera(x_m: float) -> np.ndarray:
+    return poses.pose(np.eye(3), [x_m, 0.0, 0.0])
+
+
+def seen_from(x_m: float, points: np.ndarray) -> np.ndarray:
+    local = points - [x_m, 0.0, 0.0]
+    return local[:, :2] / local[:, 2:] * 500 + [320, 240]
+
+
+def view(count: int) -> TwoView:
+    matches = np.stack([np.arange(count)] * 2, axis=1).astype(np.int32)
+    return TwoView(matches, np.eye(3), None, degenerate=False)
+
+
+def wall(there: int) -> tuple[Placed, dict, list[np.ndarray]]:
+    """Three images of a bay, two of the next one, and the last, of which the next bay's two say
+    with `there` key points that it is theirs; it stands at the first."""
+    rng = np.random.default_rng(3)
+    first = rng.uniform([-2, -1, 4], [2, 1, 6], (N, 3))
+    points = np.concatenate([first, first + np.array([BAY_M, 0, 0])])
+    x_m = [0.0, 0.3, -0.3, BAY_M, BAY_M + 0.3, 0.1]
+    own = [first, first, first, points[N:], points[N:], first]
+    pixels = [seen_from(x, of) for x, of in zip(x_m, own, strict=True)]
+    landmark = [np.arange(N)] * 3 + [np.arange(N, 2 * N)] * 2 + [np.arange(N)]
+    model = Placed(
+        landmark, {k: camera(x) for k, x in enumerate(x_m)}, points,
+        np.array([500.0, 500.0, 320.0, 240.0]),
+    )  # fmt: skip
+    pairs = {(0, 1): view(N), (0, 2): view(N), (3, 4): view(N), (0, 5): view(N)}
+    pairs |= {(3, 5): view(there), (4, 5): view(there)}
+    return model, pairs, pixels
+
+
+@pytest.mark.parametrize(("there", "doubtful"), [(20, False), (60, True)])
+def test_an_image_that_fits_the_next_bay_nearly_as_well_is_doubtful(
+    there: int, doubtful: bool
+) -> None:
+    model, pairs, pixels = wall(there)
+    found = elsewhere.rivals(model, pairs, pixels, MATRIX)
+    assert found[5] == Rival(here=N, there=there)
+    assert found[5].doubtful is doubtful and not found[5].better
+    said = elsewhere.doubt(found, [f"frame-{k}" for k in range(6)])
+    assert any("frame-5" in line and "repeats itself" in line for line in said) is doubtful
+
+
+def test_one_that_fits_the_next_bay_much_better_is_to_go_there() -> None:
+    model, pairs, pixels = wall(60)
+    model.landmark[5] = np.where(np.arange(N) < 25, np.arange(N), -1)
+    assert elsewhere.rivals(model, pairs, pixels, MATRIX)[5] == Rival(here=25, there=60)
+    assert Rival(25, 60).better and not Rival(60, 25).better and not Rival(60, 25).doubtful
+
+
+def test_a_model_whose_pairs_hold_has_no_rival() -> None:
+    model, pairs, pixels = wall(60)
+    held = {pair: pairs[pair] for pair in pairs if pair not in ((3, 5), (4, 5))}
+    assert elsewhere.rivals(model, held, pixels, MATRIX) == {}
+    assert elsewhere.doubt({}, []) == []
+
+
+def test_a_pair_that_breaks_by_a_drift_is_no_other_place() -> None:
+    """Landmarks that stand twice, a little apart, place the image where it is."""
+    model, pairs, pixels = wall(60)
+    model.position[N:] = model.position[:N] + np.array([0.15, 0.0, 0.0])
+    assert 5 not in elsewhere.rivals(model, pairs, pixels, MATRIX)
