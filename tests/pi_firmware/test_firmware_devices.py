@@ -12,7 +12,7 @@ from pi_firmware.wire.errors import BlimpError, SourceError, StreamError
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("webcam:0", "unknown scheme (available: libcamera:, v4l2:, replay:, test:)"),
+        ("webcam:0", "unknown scheme (available: libcamera:, replay:, test:, v4l2:)"),
         ("v4l2:video0", "expected v4l2:/dev/videoN"),
         ("v4l2:/dev/video77", "/dev/video77': No such file"),
         ("v4l2:/dev/null?focus=3", "focus: the device has no such control"),
