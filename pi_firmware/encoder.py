@@ -91,6 +91,8 @@ class Encoder:
         self._adaptation = Adaptation(encoder, self._longest)
         self._lateness, self._lock = StandingDelay(), threading.Lock()
         self._since_idr = 0
+        self._beside_kbps = 0.0
+        """What is sent again, beside what the encoder makes."""
         self._set_kbps = encoder.bitrate_kbps
 
     @property
@@ -99,9 +101,13 @@ class Encoder:
         return self._set_kbps
 
     def set_bitrate(self, kbps: int) -> int:
-        """Asks for this bit rate within the configured bounds; returns the one asked for."""
+        """Has no more than this sent, within the configured bounds; returns what is asked for.
+
+        That is less by what is sent again.
+        """
         self._adaptation.bitrate_kbps = self._adaptation.limited(kbps)
-        limited = round(self._adaptation.bitrate_kbps)
+        own_kbps = self._adaptation.bitrate_kbps - self._beside_kbps
+        limited = round(self._adaptation.limited(own_kbps))
         if limited != self._set_kbps:
             self._set_kbps = limited
             if self._settings.name == "x264enc":
@@ -121,6 +127,8 @@ class Encoder:
         """Adapts to what the ground saw, unless `encoder.adapt` is false."""
         if self._settings.adapt:
             self._adaptation.report(self._of_the_link(report), time.monotonic())
+            again_kbps = report.retransmitted_kbps or 0.0
+            self._beside_kbps = min(max(again_kbps, 0.0), self._adaptation.bitrate_kbps)
             self.set_bitrate(round(self._adaptation.bitrate_kbps))
 
     def _of_the_link(self, report: LinkReport) -> LinkReport:

@@ -63,6 +63,11 @@ class Ground:
         seen = self._seen
         return seen if seen and self._clock() - seen.heard_s < _SILENT_S else None
 
+    @property
+    def rtx_ssrc(self) -> int | None:
+        """What the ground asks for again comes with it; None: nothing does."""
+        return self._link.rtx_ssrc
+
     def heard(self, report: LinkReport) -> None:
         """Takes a report; on any thread. One that cannot be changes nothing."""
         if not (_LOWEST_PORT <= report.video_port <= _HIGHEST_PORT and 0 <= report.lost <= 1):

@@ -14,7 +14,7 @@ import sys
 import threading
 from pathlib import Path
 
-from pi_firmware import gstreamer
+from pi_firmware import gstreamer, retransmission
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import srtp, video
 from pi_firmware.wire.errors import StreamError
@@ -44,7 +44,10 @@ def description(link: LinkSettings, ssrc: int, *, encrypted: bool = False) -> st
 
     The address and the key are not in it: `Link` sets those, whatever characters they have.
     """
+    history = retransmission.description(link, ssrc)
     mtu_bytes, protect = link.mtu_bytes, ""
+    if history:
+        mtu_bytes -= video.OSN_BYTES
     if encrypted:
         mtu_bytes -= srtp.TAG_BYTES
         protect = (
@@ -55,7 +58,7 @@ def description(link: LinkSettings, ssrc: int, *, encrypted: bool = False) -> st
         "appsrc name=link is-live=true format=time max-bytes=0 "
         "caps=video/x-h264,stream-format=byte-stream,alignment=au "
         f"! rtph264pay pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={mtu_bytes} "
-        f"config-interval=0 aggregate-mode=none {protect}"
+        f"config-interval=0 aggregate-mode=none {history}{protect}"
         "! udpsink name=out sync=false async=false"
     )
 
@@ -70,6 +73,8 @@ class Link:
     without a key it speaks to loopback only, and raises `StreamError` with one line for any other
     host. An SSRC must not serve two links with one key: both would encrypt with the same keystream
     (RFC 3711, 9.1), so that a fixed `link.ssrc` is refused, too.
+
+    What a ground station asks for again within `link.history_s` is sent again, beside.
     """
 
     def __init__(self, link: LinkSettings, ssrc: int, key: bytes | None = None) -> None:
@@ -88,6 +93,14 @@ class Link:
             element.set_property("key", self._gst.Buffer.new_wrapped(key))
         self._source = self._pipeline.get_by_name("link")
         self._sink = self._pipeline.get_by_name("out")
+        self._retransmission: retransmission.Retransmission | None = None
+        self.rtx_ssrc: int | None = None
+        """What is asked for again comes with it; None: nothing does."""
+        if link.history_s:
+            self._retransmission = retransmission.Retransmission(
+                self._pipeline, link, ssrc, key if encrypted else None
+            )
+            self.rtx_ssrc = retransmission.rtx_ssrc(ssrc)
         self._first_ns: int | None = None
         self._to: tuple[str, int] | None = None
         self._waits_for_idr = False
@@ -118,6 +131,8 @@ class Link:
             message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
             reason = message.parse_error()[0].message if message else "it does not start"
             raise StreamError(f"video link: {reason}")
+        if self._retransmission is not None:
+            self._retransmission.start()
 
     def redirect(self, host: str, port: int) -> bool:
         """Sends to another numeric address from the next packet on; False if it must not."""
@@ -145,6 +160,8 @@ class Link:
         self._waits_for_idr = False
         if self._first_ns is None:
             self._first_ns = clock_ns
+        if self._retransmission is not None:
+            self._retransmission.budget.sent(len(access_unit))
         buffer = self._gst.Buffer.new_wrapped(access_unit)
         buffer.pts = clock_ns - self._first_ns
         return bool(self._source.emit("push-buffer", buffer) == self._gst.FlowReturn.OK)
@@ -169,6 +186,8 @@ class Link:
     def stop(self) -> None:
         """Stops the pipeline, whatever is queued."""
         self._closing.set()
+        if self._retransmission is not None:
+            self._retransmission.stop()
         self._pipeline.set_state(self._gst.State.NULL)
         if self._resolver is not None:
             self._resolver.join(_RESOLVE_S)

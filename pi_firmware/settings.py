@@ -93,6 +93,9 @@ class LinkSettings:
     port: int = key(video.PORT, "its UDP port", low=1, high=65535)
     ssrc: int = key(0, "RTP stream id; 0 draws one at random", low=0, high=0xFFFFFFFF)
     mtu_bytes: int = key(1400, "largest RTP packet", unit="bytes", low=200, high=8900)
+    history_s: float = key(
+        1.5, "how long a packet can be sent again, as lost; 0: never", unit="s", low=0, high=5
+    )
     encrypted: bool = key(True, "SRTP with the key of telemetry.certificates, or loopback only")
 
 

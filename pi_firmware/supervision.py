@@ -167,6 +167,7 @@ class Supervision:
             release=self.release.how,
             release_reason=self.release.reason,
             early_reports=True,
+            rtx_ssrc=ground.rtx_ssrc,
             **asdict(self._board.read()),
         )
 

@@ -14,6 +14,7 @@ from ground_station.stream import rtp
 from ground_station.stream.arrivals import Arrivals
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
+from ground_station.stream.retransmission import Retransmission
 from pi_firmware.wire import sei
 from pi_firmware.wire.annexb import NO_PARAMETER_SETS
 
@@ -67,8 +68,10 @@ class Assembly:
         """Monotonic, of the newest packet."""
         self.arrivals = Arrivals()
         """How its packets come, for whoever sends them."""
+        self.retransmission = Retransmission(counters)
+        """What is missing of it, and when that is to be asked for."""
         self._counters = counters
-        self._reorderer = rtp.Reorderer(counters)
+        self._reorderer = rtp.Reorderer(counters, retransmission=self.retransmission)
         self._depacketizer = rtp.Depacketizer(counters)
         self._decoder = Decoder(counters)
         self._sets_timeout_ns = int(sets_timeout_s * 1e9)
@@ -93,8 +96,9 @@ class Assembly:
         )
 
     def push(self, packet: rtp.Packet) -> Iterator[ReceivedFrame]:
-        """Takes a packet; the frames that are whole with it."""
-        self._counters.packets += 1
+        """Takes a packet, sent once or again; the frames that are whole with it."""
+        if not packet.again:
+            self._counters.packets += 1
         self.arrivals.add(packet)
         self.last_arrival_ns = packet.arrival_ns
         if self._first_arrival_ns is None:

@@ -51,6 +51,13 @@ class Video(Protocol):
         """How it comes of late; None while there is too little of it."""
         ...
 
+    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
+        """Hears whether its payload sends again what is asked for, and after how long it may come.
+
+        None: it does not, or its round trip is not known.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class Awaited:
@@ -69,18 +76,21 @@ class Tally:
     """Packets of one stream: those in time, each once, and those the decoder went on without.
 
     A packet that comes late was given up before and stays lost; a duplicate counts once. So both
-    together are the packets that were sent. `frames` is how many the payload says it sent.
+    together are the packets that were sent. `frames` is how many the payload says it sent, `mended`
+    those of the packets in time that had to be sent again.
     """
 
     packets: int = 0
     lost: int = 0
     frames: int = 0
+    mended: int = 0
 
     def __sub__(self, other: Tally) -> Tally:
         return Tally(
             max(0, self.packets - other.packets),
             max(0, self.lost - other.lost),
             max(0, self.frames - other.frames),
+            max(0, self.mended - other.mended),
         )
 
     @property
@@ -91,6 +101,13 @@ class Tally:
         # Of a single frame the word may be here before its packets.
         return 1.0 if self.frames > 1 else 0.0
 
+    @property
+    def share_missed(self) -> float:
+        """The same of what was lost before it was mended."""
+        if self.packets + self.lost:
+            return (self.lost + self.mended) / (self.packets + self.lost)
+        return self.share_lost
+
 
 class StreamAccount:
     """Turns a receiver's counters, which go on from stream to stream, into those of one stream."""
@@ -100,6 +117,8 @@ class StreamAccount:
         self._before = Counters()
         self._last = Counters()
         self._window: deque[tuple[float, Tally]] = deque()
+        self.late = Tally()
+        """Of the last 2 s, or what is known of them."""
 
     def add(self, ssrc: int, counters: Counters, frames: int, now_s: float) -> tuple[Tally, float]:
         """The stream's tally so far, and the share lost over the last 2 s or what is known of them.
@@ -121,7 +140,8 @@ class StreamAccount:
         if frames < since.frames:  # the payload counts anew
             self._window.clear()
         self._window.append((now_s, tally))
-        return tally, (tally - since).share_lost
+        self.late = tally - since
+        return tally, self.late.share_lost
 
 
 class Urgency:
@@ -158,7 +178,8 @@ def _is_urgent(seen: Flow | messages.LinkReport | None) -> bool:
 
 
 def _tally(counters: Counters, frames: int) -> Tally:
-    return Tally(counters.packets - counters.packets_late, counters.packets_lost, frames)
+    in_time = counters.packets - counters.packets_late + counters.packets_mended
+    return Tally(in_time, counters.packets_lost, frames, counters.packets_mended)
 
 
 class Feedback:
@@ -229,7 +250,10 @@ class Feedback:
         return state is not None and state.health is not None and state.health.early_reports
 
     def _wants_idr(self, payload_id: str, video: Video, now_s: float) -> bool:
-        """Whether frames came since the last look that only an IDR lets be shown again."""
+        """Whether frames came since the last look that only an IDR lets be shown again.
+
+        Those that wait for what was asked for again are not among them.
+        """
         withheld = video.counters.withheld
         before, asked_s = self._withheld.get(payload_id, (withheld, float("-inf")))
         wanted = withheld > before and now_s - asked_s >= _IDR_GAP_S
@@ -242,15 +266,19 @@ class Feedback:
     def _report(self, payload_id: str, video: Video) -> messages.LinkReport:
         state = self._listener.state(payload_id)
         ssrc, counters = video.ssrc, video.counters
+        round_trip_s = self._listener.round_trip_s(payload_id)
         if ssrc is not None and _is_anothers(ssrc, state):
             ssrc = None
-        tally, lost, flow = Tally(), 0.0, None
+        tally, lost, missed, flow = Tally(), 0.0, 0.0, None
         if ssrc is not None:
             flow = video.flow()
+            health = state.health if state is not None else None
+            video.retransmits(health.rtx_ssrc if health is not None else None, round_trip_s)
             frames = state.frames if state is not None else None
             account = self._accounts.setdefault(payload_id, StreamAccount())
             sent = frames.sent if frames is not None else 0
             tally, lost = account.add(ssrc, counters, sent, time.monotonic())
+            missed = account.late.share_missed
         return messages.LinkReport(
             time_ns=time.time_ns(),
             ground=self._listener.name,
@@ -259,10 +287,13 @@ class Feedback:
             packets=tally.packets,
             packets_lost=tally.lost,
             lost=lost,
-            round_trip_s=self._listener.round_trip_s(payload_id),
+            round_trip_s=round_trip_s,
             received_kbps=flow.received_kbps if flow is not None else None,
             queue_s=flow.queue_s if flow is not None else None,
             dropped=flow.dropped if flow is not None else None,
+            packets_mended=tally.mended,
+            missed=missed,
+            retransmitted_kbps=flow.retransmitted_kbps if flow is not None else None,
         )
 
     def _publish(self, payload_id: str, report: messages.LinkReport) -> None:

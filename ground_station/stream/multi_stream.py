@@ -7,7 +7,10 @@ counted, held for a moment, and forgotten.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import secrets
+import socket
 import threading
 import time
 from collections import deque
@@ -19,7 +22,9 @@ from ground_station.stream.arrivals import Flow
 from ground_station.stream.assembly import Assembly, ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.srtp import Unprotector
-from ground_station.stream.udp import bind, read
+from ground_station.stream.udp import Address, bind, read
+from pi_firmware.wire import rtcp
+from pi_firmware.wire.srtcp import SrtcpProtector
 from pi_firmware.wire.video import PORT
 
 Owner = Callable[[int, str | None, float], str | None]
@@ -28,6 +33,8 @@ Owner = Callable[[int, str | None, float], str | None]
 None: not known, or not taken. It is asked on the receiver's thread and has to return at once.
 """
 OnFrame = Callable[[str, ReceivedFrame], None]
+Send = Callable[[str, bytes, Address], None]
+"""Sends RTCP to a payload at an address."""
 
 _POLL_S = 0.05
 _BUSY_POLL_S, _IDLE_POLL_S = 0.01, 0.25
@@ -50,9 +57,17 @@ class Stream:
     """One payload's stream, decoded on a thread of its own; what `Feedback` reports on."""
 
     def __init__(
-        self, ssrc: int, payload_id: str, port: int, counters: Counters, on_frame: OnFrame
+        self,
+        ssrc: int,
+        payload_id: str,
+        port: int,
+        counters: Counters,
+        on_frame: OnFrame,
+        send: Send,
     ) -> None:
         self.ssrc = ssrc
+        self.rtx_ssrc: int | None = None
+        """What comes with it is sent again (RFC 4588); None: nothing is."""
         self.payload_id = payload_id
         self.port = port
         self.bytes = 0
@@ -62,7 +77,9 @@ class Stream:
         self.began_ns = self.last_ns = time.monotonic_ns()
         self._counters = counters
         self._assembly = Assembly(ssrc, counters)
-        self._on_frame = on_frame
+        self._on_frame, self._send = on_frame, send
+        self._address: Address | None = None
+        self._sender_ssrc = 1 + secrets.randbelow(0xFFFFFFFF)
         self._waiting: deque[rtp.Packet] = deque()
         self._there = threading.Condition()
         self._closing = False
@@ -84,9 +101,24 @@ class Stream:
         """Why the stream cannot be shown, in words; "" while it can."""
         return self.failure or self._assembly.problem or ""
 
-    def put(self, packet: rtp.Packet) -> None:
-        """Queues a packet; a stream that is decoded too slowly loses it, and nobody else does."""
+    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
+        """Takes with what SSRC its payload says that it sends again what is asked for; None: never.
+
+        `round_trip_s`, to it and back, counts until retransmissions tell their own.
+        """
+        self.rtx_ssrc = rtx_ssrc
+        retransmission = self._assembly.retransmission
+        if round_trip_s is not None:
+            retransmission.round_trip.hint(int(1e9 * round_trip_s), time.monotonic_ns())
+        retransmission.offered = rtx_ssrc is not None
+
+    def put(self, packet: rtp.Packet, address: Address | None = None) -> None:
+        """Queues a packet; a stream that is decoded too slowly loses it, and nobody else does.
+
+        What is missing is asked for at the `address` that the newest came from.
+        """
         self.last_ns = packet.arrival_ns
+        self._address = address or self._address
         self.bytes += len(packet.payload)
         with self._there:
             if len(self._waiting) >= _QUEUE_PACKETS:
@@ -107,18 +139,30 @@ class Stream:
 
     def _run(self) -> None:
         while True:
-            busy = time.monotonic_ns() - self.last_ns < _BUSY_NS
+            wait_s = self._wait_s(time.monotonic_ns())
             with self._there:
                 if not self._waiting and not self._closing:
-                    self._there.wait(_BUSY_POLL_S if busy else _IDLE_POLL_S)
+                    self._there.wait(wait_s)
                 packets, closing = list(self._waiting), self._closing
                 self._waiting.clear()
             for packet in packets:
                 self._give(self._assembly.push(packet))
             # After the queue, so that a packet that waits in it is not given up.
+            self._ask_for(self._assembly.retransmission.due(time.monotonic_ns()))
             self._give(self._assembly.expire(time.monotonic_ns()))
             if closing:
                 return
+
+    def _wait_s(self, now_ns: int) -> float:
+        """The longest until something may have to be done without a packet."""
+        wait_s = _BUSY_POLL_S if now_ns - self.last_ns < _BUSY_NS else _IDLE_POLL_S
+        due_ns = self._assembly.retransmission.next_ns()
+        return wait_s if due_ns is None else min(wait_s, max(0, due_ns - now_ns) / 1e9)
+
+    def _ask_for(self, sequences: list[int]) -> None:
+        if sequences and self._address is not None:
+            asked = rtcp.nack(self._sender_ssrc, self.ssrc, sequences)
+            self._send(self.payload_id, asked, self._address)
 
     def _give(self, frames: Iterable[ReceivedFrame]) -> None:
         try:
@@ -139,6 +183,7 @@ class _Candidate:
     last_ns: int
     asked_ns: int = 0
     packets: deque[rtp.Packet] = field(default_factory=deque)
+    address: Address | None = None
 
     @property
     def continuous(self) -> bool:
@@ -154,6 +199,8 @@ class MultiStreamReceiver:
     stream's own thread, and must not wait. A payload has one stream at a time: another that is its
     own, too, is taken once the one before has been silent for half a second, with what was held
     of it. With `srtp_keys` (30 bytes by payload id) only SRTP of these payloads is looked at.
+
+    Of a stream whose payload `retransmits` it asks for what is missing, from the same port.
 
     Raises `StreamError` with one line when the port is in use. `port` 0 takes a free one.
     """
@@ -171,6 +218,10 @@ class MultiStreamReceiver:
         self._owner, self._on_frame, self._max_streams = owner, on_frame, max_streams
         self._counters = Counters()
         self._unprotector = None if srtp_keys is None else Unprotector(srtp_keys, self._counters)
+        self._protectors = {
+            payload_id: SrtcpProtector(payload_id, key)
+            for payload_id, key in (srtp_keys or {}).items()
+        }
         self._streams: dict[int, Stream] = {}
         self._candidates: dict[int, _Candidate] = {}
         self._accounts: dict[int, Counters] = {}
@@ -235,19 +286,19 @@ class MultiStreamReceiver:
         while not self._closing.is_set():
             datagram: bytes | None = None
             try:
-                datagram, waited_ns = read(self._socket)
+                datagram, waited_ns, address = read(self._socket)
             except TimeoutError:
                 pass
             except OSError:
                 continue  # an ICMP error of someone else's datagram
             now_ns = time.monotonic_ns()
             if datagram is not None:
-                self._take(datagram, now_ns, waited_ns)
+                self._take(datagram, now_ns, waited_ns, address)
             if now_ns - tidied_ns >= _ASK_NS:
                 tidied_ns = now_ns
                 self._tidy(now_ns)
 
-    def _take(self, datagram: bytes, now_ns: int, waited_ns: int) -> None:
+    def _take(self, datagram: bytes, now_ns: int, waited_ns: int, address: Address) -> None:
         if self._unprotector is not None:
             plain = self._unprotector.unprotect(datagram)
             if plain is None:
@@ -257,13 +308,33 @@ class MultiStreamReceiver:
         if packet is None:
             self._counters.garbage += 1
             return
-        stream = self._streams.get(packet.ssrc)
+        stream = self._again(packet) if packet.again else self._streams.get(packet.ssrc)
         if stream is not None:
-            stream.put(packet)
-            return
-        self._hold(packet)
+            stream.put(packet, address)
+        elif packet.again:
+            self._counters.other_streams += 1
+        else:
+            self._hold(packet, address)
 
-    def _hold(self, packet: rtp.Packet) -> None:
+    def _again(self, packet: rtp.Packet) -> Stream | None:
+        """The stream of a retransmission, if its payload sent it; None for a stranger's."""
+        key_owner = self._unprotector.payload_id(packet.ssrc) if self._unprotector else None
+        for stream in self._streams.values():
+            if stream.rtx_ssrc == packet.ssrc and key_owner in (None, stream.payload_id):
+                return stream
+        return None
+
+    def _send(self, payload_id: str, asked: bytes, address: Address) -> None:
+        """Sends RTCP to a payload, from any thread; with keys only as SRTCP."""
+        if self._unprotector is not None:
+            protector = self._protectors.get(payload_id)
+            if protector is None:
+                return
+            asked = protector.protect(asked)
+        with contextlib.suppress(OSError):  # closed meanwhile, or its network is gone
+            self._socket.sendto(asked, socket.MSG_DONTWAIT, address)
+
+    def _hold(self, packet: rtp.Packet, address: Address) -> None:
         """Keeps a stranger's packet; beyond the limits the oldest is another stream's datagram."""
         ssrc, now_ns = packet.ssrc, packet.arrival_ns
         candidate = self._candidates.get(ssrc)
@@ -278,6 +349,7 @@ class MultiStreamReceiver:
             candidate = self._candidates[ssrc] = _Candidate(key_owner, now_ns, now_ns)
         candidate.last_ns = now_ns
         candidate.packets.append(packet)
+        candidate.address = address
         if len(candidate.packets) > _HELD_PACKETS:
             candidate.packets.popleft()
             self._counters.other_streams += 1
@@ -298,11 +370,11 @@ class MultiStreamReceiver:
         self._accounts[ssrc] = counters
         if len(self._accounts) > _ACCOUNTS:
             del self._accounts[next(iter(self._accounts))]
-        stream = Stream(ssrc, owner, self.port, counters, self._on_frame)
+        stream = Stream(ssrc, owner, self.port, counters, self._on_frame, self._send)
         with self._changed:
             self._streams[ssrc] = stream
         for packet in candidate.packets:
-            stream.put(packet)
+            stream.put(packet, candidate.address)
 
     def _make_room(self, owner: str, now_ns: int) -> bool:
         """Whether a payload's new stream can be taken: its earlier one has gone, or goes now."""

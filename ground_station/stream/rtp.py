@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ground_station.stream.counters import Counters
+from ground_station.stream.retransmission import Retransmission
 from pi_firmware.wire import video
 from pi_firmware.wire.annexb import NAL_AUD, NAL_SPS, START_CODE
 
@@ -22,7 +23,8 @@ MAX_ACCESS_UNIT_BYTES = 4 << 20
 class Packet:
     """One RTP packet of H.264; `arrival_ns` is on the receiver's monotonic clock.
 
-    It is when it was read; before that it lay in the machine for `waited_ns`.
+    It is when it was read; before that it lay in the machine for `waited_ns`. `again`: a
+    retransmission (RFC 4588), of whose packet `sequence` and `payload` are the original's.
     """
 
     sequence: int
@@ -32,6 +34,7 @@ class Packet:
     payload: bytes
     arrival_ns: int
     waited_ns: int = 0
+    again: bool = False
 
     @property
     def came_ns(self) -> int:
@@ -40,11 +43,15 @@ class Packet:
 
 
 def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None:
-    """The packet in a datagram; None when it is not RTP version 2 with the video's payload type."""
+    """The packet in a datagram; None when it is not RTP version 2 with a payload type of the video.
+
+    Of a retransmission `ssrc` is its own stream's, and not the original's.
+    """
     if len(datagram) < _HEADER_BYTES:
         return None
     first, second, sequence, timestamp, ssrc = struct.unpack_from(">BBHII", datagram)
-    if first >> 6 != 2 or second & 0x7F != video.PAYLOAD_TYPE:
+    again = second & 0x7F == video.RTX_PAYLOAD_TYPE
+    if first >> 6 != 2 or not (again or second & 0x7F == video.PAYLOAD_TYPE):
         return None
     start = _HEADER_BYTES + 4 * (first & 0x0F)
     if first & 0x10:  # header extension
@@ -54,66 +61,114 @@ def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None
     end = len(datagram)
     if first & 0x20:  # padding; its last byte counts it
         end -= datagram[-1]
+    if again:
+        if start + video.OSN_BYTES >= end:
+            return None
+        (sequence,) = struct.unpack_from(">H", datagram, start)
+        start += video.OSN_BYTES
     if start >= end:
         return None
     payload, marker = datagram[start:end], bool(second & 0x80)
-    return Packet(sequence, timestamp, ssrc, marker, payload, arrival_ns, waited_ns)
+    return Packet(sequence, timestamp, ssrc, marker, payload, arrival_ns, waited_ns, again)
 
 
 class Reorderer:
     """Puts packets of one stream in order and decides when a missing one is lost.
 
-    A packet is waited for until `depth` later ones are here, or `wait_ns` have passed.
+    While `retransmission` helps, that is when it cannot come any more. Otherwise it is waited for
+    until `depth` later ones are here, or `wait_ns` have passed.
     """
 
-    def __init__(self, counters: Counters, *, depth: int = 32, wait_ns: int = 30_000_000) -> None:
+    def __init__(
+        self,
+        counters: Counters,
+        *,
+        depth: int = 32,
+        wait_ns: int = 30_000_000,
+        retransmission: Retransmission | None = None,
+    ) -> None:
         self._counters = counters
         self._depth = depth
         self._wait_ns = wait_ns
+        self.retransmission = retransmission or Retransmission(counters)
         self._expected: int | None = None
         self._held: dict[int, Packet] = {}
+        self._next = 0
+        """After the newest packet."""
+        self._came_ns = 0
         self._jumped: Packet | None = None
 
     def push(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
         """Packets that can go on, each with whether packets before it are missing."""
+        if packet.again:
+            self._counters.retransmissions += 1
+            if not self.retransmission.came(packet.sequence, packet.arrival_ns, again=True):
+                return  # nobody waits for it
+            self._counters.packets_mended += 1
+            self._held[packet.sequence] = packet
+            yield from self._release(patient=True)
+            return
         if self._expected is None:
-            self._expected = packet.sequence
+            self._begin(packet.sequence)
+        assert self._expected is not None
         ahead = (packet.sequence - self._expected) & 0xFFFF
         if MAX_JUMP < ahead < 0x10000 - MAX_JUMP:
             yield from self._restart(packet)
         elif ahead > MAX_JUMP or packet.sequence in self._held:
             self._counters.packets_late += 1  # given up on, or here already
         else:
+            self._note(packet)
             self._held[packet.sequence] = packet
-            yield from self._release(all_held=len(self._held) > self._depth)
+            helps = self.retransmission.helps
+            yield from self._release(patient=helps or len(self._held) <= self._depth)
+
+    def expire(self, now_ns: int) -> Iterator[tuple[Packet, bool]]:
+        """Packets that go on because what is missing before them has not come in time."""
+        if self._held:
+            oldest_ns = min(packet.arrival_ns for packet in self._held.values())
+            patient = self.retransmission.helps or now_ns - oldest_ns < self._wait_ns
+            yield from self._release(patient=patient)
+
+    def _begin(self, sequence: int) -> None:
+        self._expected = self._next = sequence
+
+    def _note(self, packet: Packet) -> None:
+        """Takes note of what is missing before the newest packet."""
+        retransmission, now_ns = self.retransmission, packet.arrival_ns
+        ahead = (packet.sequence - self._next) & 0xFFFF
+        if ahead > MAX_JUMP:
+            retransmission.came(packet.sequence, now_ns, again=False)
+            return
+        if ahead and retransmission.helps:
+            retransmission.missed(self._next, ahead, now_ns - self._came_ns, now_ns)
+        self._next = (packet.sequence + 1) & 0xFFFF
+        self._came_ns = now_ns
 
     def _restart(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
         """The sender began anew if two packets in a row are far off; one alone is a stray."""
         before, self._jumped = self._jumped, packet
         if before is None or (before.sequence + 1) & 0xFFFF != packet.sequence:
             return
-        yield from self._release(all_held=True)
+        self.retransmission.forget()
+        yield from self._release(patient=False)
         self._jumped = None
-        self._expected = (packet.sequence + 1) & 0xFFFF
+        self._begin((packet.sequence + 1) & 0xFFFF)
         yield before, True
         yield packet, False
 
-    def expire(self, now_ns: int) -> Iterator[tuple[Packet, bool]]:
-        """Packets that go on because what is missing before them has not come in time."""
-        if self._held:
-            oldest_ns = min(packet.arrival_ns for packet in self._held.values())
-            if now_ns - oldest_ns >= self._wait_ns:
-                yield from self._release(all_held=True)
-
-    def _release(self, *, all_held: bool) -> Iterator[tuple[Packet, bool]]:
+    def _release(self, *, patient: bool) -> Iterator[tuple[Packet, bool]]:
+        """What can go on: up to a gap, and beyond it if nothing in it can come any more."""
+        awaits, helps = self.retransmission.awaits, self.retransmission.helps
         while self._held:
             assert self._expected is not None
             gap = False
             if self._expected not in self._held:
-                if not all_held:
-                    return
                 expected = self._expected
+                if patient and (not helps or awaits(expected)):
+                    return
                 nearest = min((number - expected) & 0xFFFF for number in self._held)
+                if patient and any(awaits((expected + n) & 0xFFFF) for n in range(1, nearest)):
+                    return
                 self._counters.packets_lost += nearest
                 self._expected = (expected + nearest) & 0xFFFF
                 gap = True
@@ -149,6 +204,7 @@ class Depacketizer:
         self._fragment: bytearray | None = None
         self._complete = True
         self._follows_gap = False
+        self._arrival_ns = 0
 
     def push(self, packet: Packet, gap: bool) -> Iterator[AccessUnit]:
         """Access units that end with, or before, this packet."""
@@ -161,7 +217,7 @@ class Depacketizer:
             # Nothing of this one is missing if the packet after the gap is its first.
             self._complete = self._timestamp is None and _begins_access_unit(packet.payload)
         self._timestamp = packet.timestamp
-        self._arrival_ns = packet.arrival_ns
+        self._arrival_ns = max(self._arrival_ns, packet.arrival_ns)
         if not self._take(packet.payload):
             self._counters.malformed += 1
             self._complete = False

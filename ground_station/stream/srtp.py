@@ -17,13 +17,12 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
-
 from ground_station.stream.counters import Counters
 from pi_firmware.wire import keys as names
 from pi_firmware.wire import video
 from pi_firmware.wire.errors import StreamError, TelemetryError
-from pi_firmware.wire.srtp import KEY_BYTES, MASTER_BYTES, SALT_BYTES, TAG_BYTES, read_key
+from pi_firmware.wire.srtcp import SRTP_LABEL, SessionKeys
+from pi_firmware.wire.srtp import TAG_BYTES, read_key
 
 FOLDER = "srtp"
 """Where the payloads' keys are in a ground station's certificate folder."""
@@ -36,8 +35,6 @@ SEARCH_RATE_HZ = 20_000
 SEARCH_TAGS = 2048
 """Tags computed for one packet, at most: 1024 rollovers are three days of 240 packets a second."""
 
-_CIPHER_KEY, _AUTHENTICATION_KEY, _CIPHER_SALT = 0, 1, 2  # labels (RFC 3711, 4.3.2)
-_AUTHENTICATION_KEY_BYTES = 20
 _HEADER_BYTES = 12
 _WINDOW_MASK = (1 << REPLAY_WINDOW) - 1
 _ROC_LIMIT = 1 << 16
@@ -63,21 +60,6 @@ def load_keys(folder: str | Path) -> dict[str, bytes]:
     return loaded
 
 
-def aes_cm(key: bytes, counter: int, data: bytes) -> bytes:
-    """AES in counter mode (RFC 3711, 4.1.1) from a 128-bit counter on: data to or from cipher."""
-    return _aes_cm(algorithms.AES(key), counter, data)
-
-
-def _aes_cm(key: algorithms.AES, counter: int, data: bytes) -> bytes:
-    return Cipher(key, modes.CTR(counter.to_bytes(16, "big"))).encryptor().update(data)
-
-
-def derive(master: bytes, label: int, size: int) -> bytes:
-    """A session key of `size` bytes (RFC 3711, 4.3.1, rate 0) from the master key with its salt."""
-    salt = int.from_bytes(master[KEY_BYTES:], "big")
-    return aes_cm(master[:KEY_BYTES], (salt ^ label << 48) << 16, bytes(size))
-
-
 class _Packet(NamedTuple):
     """An SRTP packet, taken apart."""
 
@@ -93,7 +75,7 @@ def _parse(datagram: bytes) -> _Packet | None:
     if len(datagram) < _HEADER_BYTES + TAG_BYTES:
         return None
     first, second, sequence, ssrc = struct.unpack_from(">BBH4xI", datagram)
-    if first >> 6 != 2 or second & 0x7F != video.PAYLOAD_TYPE:
+    if first >> 6 != 2 or second & 0x7F not in (video.PAYLOAD_TYPE, video.RTX_PAYLOAD_TYPE):
         return None
     authenticated = datagram[:-TAG_BYTES]
     size = _HEADER_BYTES + 4 * (first & 0x0F)
@@ -104,34 +86,6 @@ def _parse(datagram: bytes) -> _Packet | None:
     if len(authenticated) < size:
         return None
     return _Packet(sequence, ssrc, size, authenticated, datagram[-TAG_BYTES:])
-
-
-class _Keys:
-    """One payload's session keys."""
-
-    def __init__(self, payload_id: str, master: bytes) -> None:
-        if len(master) != MASTER_BYTES:
-            raise StreamError(
-                f"SRTP key of '{payload_id}': {len(master)} bytes; it has {MASTER_BYTES}"
-            )
-        self.payload_id = payload_id
-        self._cipher = algorithms.AES(derive(master, _CIPHER_KEY, KEY_BYTES))
-        self._salt = int.from_bytes(derive(master, _CIPHER_SALT, SALT_BYTES), "big") << 16
-        self._mac = hmac.new(
-            derive(master, _AUTHENTICATION_KEY, _AUTHENTICATION_KEY_BYTES), digestmod="sha1"
-        )
-
-    def begin_tag(self, packet: _Packet) -> hmac.HMAC:
-        """The packet's tag but for the ROC, which is authenticated last (RFC 3711, 4.2)."""
-        mac = self._mac.copy()
-        mac.update(packet.authenticated)
-        return mac
-
-    def decrypt(self, packet: _Packet, index: int) -> bytes:
-        """The RTP packet in an SRTP packet of this index."""
-        counter = self._salt ^ packet.ssrc << 64 ^ index << 16
-        header, size = packet.authenticated[: packet.header_bytes], packet.header_bytes
-        return header + _aes_cm(self._cipher, counter, packet.authenticated[size:])
 
 
 def _made_with(begun: hmac.HMAC, roc: int, tag: bytes) -> bool:
@@ -146,7 +100,7 @@ def _made_with(begun: hmac.HMAC, roc: int, tag: bytes) -> bool:
 class _Stream:
     """What belongs to one SSRC: whose it is, its highest index, and which ones below it came."""
 
-    keys: _Keys
+    keys: SessionKeys
     highest: int
     came: int = 0  # bit n: the packet of index `highest` - n
 
@@ -209,7 +163,9 @@ class Unprotector:
         self.counters = counters or Counters()
         self.tags_searched = 0
         """Tags computed so far to find ROCs."""
-        self._keys = [_Keys(payload_id, master) for payload_id, master in keys.items()]
+        self._keys = [
+            SessionKeys(payload_id, master, SRTP_LABEL) for payload_id, master in keys.items()
+        ]
         self._ssrc = ssrc
         self._streams: dict[int, _Stream] = {}
         # Apart, so that a flood of unknown streams does not keep a known one from coming back.
@@ -244,7 +200,8 @@ class Unprotector:
         if not stream.accept(index):
             self.counters.replayed += 1
             return None
-        return stream.keys.decrypt(packet, index)
+        header, size = packet.authenticated[: packet.header_bytes], packet.header_bytes
+        return header + stream.keys.crypt(packet.authenticated[size:], packet.ssrc, index)
 
     def _find(self, packet: _Packet) -> tuple[_Stream, int] | None:
         """The packet's stream and index, authenticated; None when it is not authentic."""
@@ -252,7 +209,7 @@ class Unprotector:
         if stream is None:
             return self._join(packet)
         index = stream.estimate(packet.sequence)
-        if _made_with(stream.keys.begin_tag(packet), index >> 16, packet.tag):
+        if _made_with(stream.keys.begin_tag(packet.authenticated), index >> 16, packet.tag):
             return stream, index
         if not self._to_follow.is_left():
             return None
@@ -274,10 +231,10 @@ class Unprotector:
         return _Stream(*found), found[1]
 
     def _search(
-        self, packet: _Packet, keys: Sequence[_Keys], rocs: Iterable[int], budget: _Budget
-    ) -> tuple[_Keys, int] | None:
+        self, packet: _Packet, keys: Sequence[SessionKeys], rocs: Iterable[int], budget: _Budget
+    ) -> tuple[SessionKeys, int] | None:
         """Whose the packet is and its index, if the tag was made with one of these ROCs."""
-        begun = [(own, own.begin_tag(packet)) for own in keys]
+        begun = [(own, own.begin_tag(packet.authenticated)) for own in keys]
         before = self.tags_searched
         try:
             for roc in rocs:

@@ -16,6 +16,9 @@ _SO_TIMESTAMPNS = 35
 _TIMESPEC = struct.Struct("@ll")
 _LONGEST_WAIT_NS = 5_000_000_000
 
+Address = tuple[str, int] | tuple[str, int, int, int]
+"""Of IPv4 or IPv6, as a socket says it."""
+
 
 def bind(host: str, port: int, poll_s: float) -> socket.socket:
     """A UDP socket with room for a burst, whose reads wait `poll_s`.
@@ -41,16 +44,17 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
     return receiver
 
 
-def read(receiver: socket.socket) -> tuple[bytes, int]:
-    """The next datagram and how long the machine has had it, ns; 0 where it does not tell.
+def read(receiver: socket.socket) -> tuple[bytes, int, Address]:
+    """The next datagram, how long the machine has had it, ns, 0 where it does not tell, and whose.
 
     Raises `OSError` like the socket, `TimeoutError` when none comes.
     """
-    datagram, said, _, _ = receiver.recvmsg(65535, socket.CMSG_SPACE(_TIMESPEC.size))
+    datagram, said, _, address = receiver.recvmsg(65535, socket.CMSG_SPACE(_TIMESPEC.size))
     for level, kind, data in said:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS, _TIMESPEC.size):
             seconds, ns = _TIMESPEC.unpack(data)
             waited_ns = time.time_ns() - (seconds * 10**9 + ns)
             # The stamp is the wall clock's, which may have been set in between.
-            return datagram, waited_ns if 0 <= waited_ns < _LONGEST_WAIT_NS else 0
-    return datagram, 0
+            is_sound = 0 <= waited_ns < _LONGEST_WAIT_NS
+            return datagram, waited_ns if is_sound else 0, address
+    return datagram, 0, address

@@ -162,7 +162,7 @@ class Health(Message):
     """How payload and board are; None: this board cannot tell, or nothing was heard."""
 
     SCHEMA: ClassVar[str] = "blimp.health"
-    MINOR: ClassVar[int] = 2
+    MINOR: ClassVar[int] = 3
 
     uptime_s: float  # of the program
     captured: int = 0
@@ -196,6 +196,7 @@ class Health(Message):
     release: str = ""  # how it came: factory, update, fell back; empty: it runs on no card
     release_reason: str = ""  # why an update did not stay
     early_reports: bool = False  # it takes link reports between those of each second
+    rtx_ssrc: int | None = None  # what is asked for again comes with it; None: nothing does
 
 
 @dataclass(frozen=True)
@@ -207,10 +208,14 @@ class LinkReport(Message):
     do others while a queue stands or overflows, if the payload's `Health` says `early_reports`.
     `received_kbps`, `queue_s` and `dropped` are None where an older ground station measures none
     or has nothing to measure them by.
+
+    A packet was sent, and is one of `packets` or of `packets_lost`; `packets_mended` of the former
+    were missing, asked for again, and came in time. So `lost` is what is left after mending, and
+    `missed` and `dropped` are of what the link lost before it.
     """
 
     SCHEMA: ClassVar[str] = "blimp.link"
-    MINOR: ClassVar[int] = 2
+    MINOR: ClassVar[int] = 3
 
     ground: str  # its name
     video_port: int  # where it takes the video
@@ -223,6 +228,9 @@ class LinkReport(Message):
     received_kbps: float | None = None  # of the packets' payloads, over the last half second
     queue_s: float | None = None  # what most frames waited on the way, beyond the least of late
     dropped: float | None = None  # share of packets lost in the last second while others came
+    packets_mended: int = 0
+    missed: float | None = None  # share of packets that were lost or mended, of late
+    retransmitted_kbps: float | None = None  # of received_kbps: packets that were sent again
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,12 @@ PORT = 5600
 PAYLOAD_TYPE = 96
 """RTP payload type of H.264."""
 
+RTX_PAYLOAD_TYPE = 97
+"""RTP payload type of packets that are sent again, on an SSRC of their own (RFC 4588, 4)."""
+
+OSN_BYTES = 2
+"""What such a packet begins with: its original sequence number."""
+
 CLOCK_RATE_HZ = 90_000
 """RTP clock of H.264 (RFC 6184, 8.2.1)."""
 

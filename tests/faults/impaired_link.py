@@ -11,11 +11,13 @@ import contextlib
 import heapq
 import itertools
 import random
+import select
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 _BUFFER_BYTES = 8 << 20
 _SO_RCVBUFFORCE = 33  # Linux, not in Python's socket module
@@ -98,6 +100,9 @@ class ImpairedLink:
     lost. Packets to a port where nobody listens count as passed, as they would on the air.
     `outages` are (at_s, for_s) from the first packet on, in which nothing passes. `port` 0 is a
     free one.
+
+    What comes back goes to whoever sent last, after the same delay and with the same loss and
+    outages, drawn apart: the fates of what comes do not depend on it. `returned` counts it.
     """
 
     def __init__(
@@ -116,7 +121,10 @@ class ImpairedLink:
         self._bottleneck = Bottleneck()
         self._counts = LinkCounts()
         self._impairment = impairment
-        self._random = random.Random(seed)
+        self._random, self._random_back = random.Random(seed), random.Random(f"{seed} back")
+        self._sender: Any = None
+        self._back: list[tuple[float, int, bytes]] = []  # a heap by due time and number
+        self.returned = 0
         self._tap = tap
         self._bad = False
         self._gone_until_s = 0.0
@@ -179,14 +187,18 @@ class ImpairedLink:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            self._in.settimeout(self._wait_s())
-            with contextlib.suppress(TimeoutError):
-                self._take(self._in.recv(65535))
+            ready, _, _ = select.select([self._in, self._out], [], [], self._wait_s())
+            if self._in in ready:
+                datagram, self._sender = self._in.recvfrom(65535)
+                self._take(datagram)
+            if self._out in ready:
+                self._take_back(self._out.recv(65535))
             self._release(time.monotonic())
         self._release(float("inf"))
 
     def _wait_s(self) -> float:
-        due_s = [held.until_s for held in self._held] + [entry[0] for entry in self._waiting[:1]]
+        due_s = [held.until_s for held in self._held]
+        due_s += [entry[0] for entry in (*self._waiting[:1], *self._back[:1])]
         return min(max(min(due_s) - time.monotonic(), 1e-4), _POLL_S) if due_s else _POLL_S
 
     def _take(self, datagram: bytes) -> None:
@@ -223,6 +235,13 @@ class ImpairedLink:
         else:
             self._go_on(datagram, copies, delay_s, now_s, delayed=delay_s > 0)
 
+    def _take_back(self, datagram: bytes) -> None:
+        now_s, does = time.monotonic(), self._impairment
+        lost = self._random_back.random() < does.loss or now_s < self._gone_until_s
+        if lost or (self._first_s is not None and self._is_out(now_s - self._first_s)):
+            return
+        heapq.heappush(self._back, (now_s + does.delay_s, next(self._number), datagram))
+
     def _is_out(self, since_s: float) -> bool:
         return any(at_s <= since_s < at_s + for_s for at_s, for_s in self._outages)
 
@@ -235,6 +254,10 @@ class ImpairedLink:
         while self._waiting and self._waiting[0][0] <= now_s:
             _, _, datagram, copies = heapq.heappop(self._waiting)
             self._send(datagram, copies, delayed=True)
+        while self._back and self._back[0][0] <= now_s:
+            _, _, datagram = heapq.heappop(self._back)
+            self._in.sendto(datagram, self._sender)
+            self.returned += 1
 
     def _go_on(
         self, datagram: bytes, copies: int, delay_s: float, now_s: float, *, delayed: bool

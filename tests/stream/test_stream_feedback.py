@@ -28,6 +28,10 @@ class Video:
     ssrc: int | None = None
     counters: Counters = field(default_factory=Counters)
     seen: Flow | None = None
+    told: tuple[int | None, float | None] = (None, None)
+
+    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
+        self.told = (rtx_ssrc, round_trip_s)
 
     def flow(self) -> Flow | None:
         return self.seen

@@ -7,8 +7,9 @@ import struct
 
 from pieces import Picker, blocks, stretch
 
-from ground_station.stream.srtp import STREAMS, Unprotector, derive
+from ground_station.stream.srtp import STREAMS, Unprotector
 from pi_firmware.wire import video
+from pi_firmware.wire.srtcp import derive
 
 _MASTER = bytes(range(30))
 _MOST_PACKETS = 2000

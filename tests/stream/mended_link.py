@@ -1,0 +1,140 @@
+"""A link that loses packets and a sender that has kept them, without a program or a clock.
+
+Packets, what is asked for and what is sent again take half a round trip each and are lost by the
+same draws; time goes on in steps of a millisecond. All is drawn with a seed.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from impaired_link import Impairment
+
+from ground_station.stream import rtp
+from ground_station.stream.counters import Counters
+from ground_station.stream.rtp import AccessUnit
+from pi_firmware.wire import rtcp
+
+MS = 1_000_000
+RATE_HZ = 30
+
+
+class Loss:
+    """Which packets an impairment's loss and bursts take (Gilbert-Elliott)."""
+
+    def __init__(self, does: Impairment, seed: int) -> None:
+        self._does, self._draw, self._bad = does, random.Random(seed), False
+
+    def takes(self) -> bool:
+        """Whether the next packet is lost."""
+        does, (turn, lost, burst) = self._does, (self._draw.random() for _ in range(3))
+        self._bad = turn >= does.burst_end if self._bad else turn < does.burst_start
+        return lost < does.loss or (self._bad and burst < does.burst_loss)
+
+
+@dataclass
+class Mended:
+    """What came out: access units with when, ms; the receiver's counters; datagrams by kind."""
+
+    units: list[tuple[int, AccessUnit]] = field(default_factory=list)
+    counters: Counters = field(default_factory=Counters)
+    lost: int = 0
+    nacks: int = 0
+    again: int = 0
+
+
+def fly(
+    frames: Sequence[Sequence[bytes]],
+    does: Impairment,
+    *,
+    round_trip_ms: int = 10,
+    seed: int = 0,
+    offered: bool = True,
+    history_ms: int = 500,
+    ssrc: int = 77,
+    drop: Collection[int] = (),
+) -> Mended:
+    """Sends a frame's datagrams each 1/30 s; `offered`: what is missing is asked for.
+
+    `drop` are those, in their order, that are lost besides the first time.
+    """
+    made = Mended()
+    counters = made.counters
+    reorderer = rtp.Reorderer(counters)
+    depacketizer, retransmission = rtp.Depacketizer(counters), reorderer.retransmission
+    retransmission.offered = offered
+    retransmission.round_trip.hint(round_trip_ms * MS, 0)
+    ahead, back = Loss(does, seed), Loss(does, seed + 1)
+    number, sends = itertools.count(), itertools.count()
+    events: list[tuple[int, int, str, bytes]] = []  # when, in what order, what happens
+    history: dict[int, tuple[int, bytes]] = {}
+    half_ms, last_ms = round_trip_ms // 2, 1000 * len(frames) // RATE_HZ
+
+    def later(at_ms: int, what: str, datagram: bytes) -> None:
+        heapq.heappush(events, (at_ms, next(number), what, datagram))
+
+    def happened(now_ms: int) -> Iterator[tuple[rtp.Packet, bool]]:
+        while events and events[0][0] <= now_ms:
+            _, _, what, datagram = heapq.heappop(events)
+            if what == "send":
+                history[int.from_bytes(datagram[2:4], "big")] = (now_ms, datagram)
+                sent = next(sends)
+                if ahead.takes() or sent in drop:
+                    made.lost += 1
+                else:
+                    later(now_ms + half_ms, "came", datagram)
+            elif what == "asked":
+                for sequence in rtcp.asked_for(datagram, ssrc):
+                    at_ms, kept = history.get(sequence, (-history_ms, b""))
+                    if now_ms - at_ms < history_ms and not ahead.takes():
+                        later(now_ms + half_ms, "came", sent_again(kept))
+            else:
+                packet = rtp.parse(datagram, now_ms * MS)
+                assert packet is not None
+                made.again += packet.again
+                counters.packets += not packet.again
+                yield from reorderer.push(packet)
+
+    for index, datagrams in enumerate(frames):
+        for place, datagram in enumerate(datagrams):
+            later(1000 * index // RATE_HZ + place // 4, "send", datagram)
+    for now_ms in range(last_ms + 1000):
+        ready = list(happened(now_ms))
+        if asked := retransmission.due(now_ms * MS):
+            made.nacks += 1
+            if not back.takes():
+                later(now_ms + half_ms, "asked", rtcp.nack(1, ssrc, asked))
+        for ordered, gap in [*ready, *reorderer.expire(now_ms * MS)]:
+            made.units += [(now_ms, unit) for unit in depacketizer.push(ordered, gap)]
+    return made
+
+
+def sent_again(datagram: bytes, ssrc: int = 99, number: int = 0) -> bytes:
+    """The retransmission of an RTP packet (RFC 4588, 4)."""
+    head = bytes([datagram[0], datagram[1] & 0x80 | 97]) + number.to_bytes(2, "big")
+    return head + datagram[4:8] + ssrc.to_bytes(4, "big") + datagram[2:4] + datagram[12:]
+
+
+def shown(made: Mended, idr: Sequence[int]) -> list[int]:
+    """Of frames numbered by the order of their units: those that a decoder may show.
+
+    `idr` says which frames are IDRs; after a loss nothing is shown up to the next one.
+    """
+    return [*_shown(made, frozenset(idr))]
+
+
+def _shown(made: Mended, idr: frozenset[int]) -> Iterator[int]:
+    trusted = False
+    for _, unit in made.units:
+        if unit.follows_gap or not unit.complete:
+            trusted = False
+        if not unit.complete:
+            continue
+        index = int.from_bytes(unit.data[-4:], "big")
+        trusted = trusted or index in idr
+        if trusted:
+            yield index
