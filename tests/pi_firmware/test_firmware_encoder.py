@@ -1,6 +1,7 @@
 """The encoder follows the link within its bounds, and its properties while it runs."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -12,10 +13,13 @@ from pi_firmware.wire.messages import LinkReport
 
 
 class Element:
-    """Where GStreamer's element would be."""
+    """Where GStreamer's element would be; it notes the bit rates asked for."""
+
+    def __init__(self) -> None:
+        self.kbps: list[int] = []
 
     def set_property(self, name: str, value: int) -> None:
-        pass
+        self.kbps.append(value)
 
 
 @pytest.mark.parametrize(("own_s", "kbps"), [(0.0, 1140), (0.12, 2000)])
@@ -81,3 +85,23 @@ def test_bit_rate_and_idr_are_those_asked_for_while_it_runs() -> None:
     assert len(sizes) == 60
     assert idrs[0] and any(idrs[10:15])
     assert sum(sizes[50:60]) < 0.5 * sum(sizes[30:40])
+
+
+def test_what_is_sent_again_is_part_of_the_bit_rate() -> None:
+    element = Element()
+    controlled = Encoder(element, EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=300), 30.0)
+    report = LinkReport(1, "main", 5600, received_kbps=2000.0, queue_s=0.0, dropped=0.02)
+    for again_kbps, asked_kbps in ((0.0, 2000), (150.0, 1850), (9e9, 300), (None, 2000)):
+        controlled.link_report(replace(report, retransmitted_kbps=again_kbps))
+        assert controlled.bitrate_kbps == asked_kbps
+    assert element.kbps == [1850, 300, 2000]
+    assert controlled.set_bitrate(1000) == 1000
+    controlled.link_report(replace(report, retransmitted_kbps=-5.0))
+    assert controlled.bitrate_kbps >= 1000
+
+
+def test_without_adaptation_the_bit_rate_stays() -> None:
+    controlled = Encoder(Element(), EncoderSettings(adapt=False), 30.0)
+    report = LinkReport(1, "main", 5600, received_kbps=2000.0, queue_s=0.0, dropped=0.0)
+    controlled.link_report(replace(report, retransmitted_kbps=500.0))
+    assert controlled.bitrate_kbps == 2000

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,6 +47,17 @@ def test_a_late_packet_stays_lost_and_a_duplicate_counts_once() -> None:
     assert lost == pytest.approx(0.1)
 
 
+def test_what_was_mended_is_not_lost_but_was_missed() -> None:
+    account = StreamAccount()
+    account.add(7, Counters(), 0, 0.0)
+    # Of 100 sent 10 did not come by themselves: 7 were sent again in time, 3 given up, of which
+    # one came late.
+    came = Counters(packets=91, packets_late=1, packets_lost=3, packets_asked=10, packets_mended=7)
+    tally, lost = account.add(7, came, 20, 1.0)
+    assert (tally.packets, tally.mended, tally.lost) == (97, 7, 3)
+    assert lost == pytest.approx(0.03) and account.late.share_missed == pytest.approx(0.1)
+
+
 def test_the_share_is_of_the_last_two_seconds() -> None:
     account = StreamAccount()
     shares = []
@@ -83,6 +94,13 @@ def test_a_new_stream_and_a_new_receiver_count_from_zero() -> None:
 def listener() -> Iterator[TelemetryListener]:
     with TelemetryListener(["tcp/127.0.0.1:0"]) as opened:
         yield opened
+
+
+def until(condition: Callable[[], object]) -> bool:
+    deadline = time.monotonic() + LIMIT_S
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return bool(condition())
 
 
 class Ear:
@@ -144,6 +162,29 @@ def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener
     assert ears["elsewhere"].reports == []
     for ear in ears.values():
         ear.close()
+
+
+def test_a_stream_hears_what_its_payload_sends_again_and_reports_what_that_mended(
+    listener: TelemetryListener,
+) -> None:
+    ear = Ear(listener, "one")
+    counters = Counters(packets=95, packets_lost=1, packets_asked=5, packets_mended=4)
+    video = Video(5601, 11, counters, Flow(900.0, 0.0, 0.05, 40.0))
+    ear.telemetry.gate(gate(10, 11))
+    assert listener.wait("one", lambda s: s.alive and s.ssrc is not None, LIMIT_S)
+    with Feedback(listener, lambda _: video, period_s=0.05):
+        told = ear.wait(lambda report: report.packets_mended == 4)
+        assert told is not None and told.missed is not None
+        assert (told.packets, told.packets_lost, told.retransmitted_kbps) == (99, 1, 40.0)
+        assert video.told[0] is None  # an older payload says nothing of it
+        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=4711))
+        assert until(lambda: video.told[0] == 4711)
+        assert until(lambda: video.told[1] is not None)
+        video.ssrc = 12  # a stream that is not the payload's own
+        video.told = (None, None)
+        time.sleep(0.2)
+        assert video.told == (None, None)
+    ear.close()
 
 
 def test_a_payload_that_has_ended_hears_no_more(listener: TelemetryListener) -> None:
