@@ -94,14 +94,17 @@ def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
         note = stand.settled("blimp-1", ended)
         account, stream = note.frames, note.stream
         shown = all_right(stand, "blimp-1")
-        assert account["received"] == len(shown) < account["sent"]
+        assert account["received"] == len(shown) <= account["sent"]
         assert account["received"] + account["withheld"] + account["lost"] == account["sent"]
         given_up = stream["packets_late"]  # later than 30 ms on a busy machine
-        assert stream["packets"] == link.counts.passed
+        assert stream["packets"] + stream["retransmissions"] == link.counts.passed
         assert given_up <= stream["packets"] // 20
-        # A loss behind the last packet that came is one that nobody can see.
-        assert 0 <= link.counts.lost - (stream["packets_lost"] - given_up) <= 3
-        assert any(said.lost_share > 0 for said in stand.heard.payloads["blimp-1"])
+        assert stream["packets_mended"] > stream["packets_lost"] - given_up
+        # A loss behind the last packet that came is one that nobody can see, and so is most of what
+        # was sent again and lost again.
+        missed = stream["packets_lost"] - given_up + stream["packets_mended"]
+        assert 0 <= link.counts.lost - missed <= 3 + 0.1 * link.counts.lost
+        assert account["withheld"] == 0 or stream["packets_lost"] > 0
 
 
 def test_a_payload_that_starts_anew_is_taken_up_and_counts_from_zero(tmp_path: Path) -> None:
