@@ -23,6 +23,8 @@ _STALE_NS = 5_000_000_000
 """A round trip of ours that is older says less than telemetry's newest."""
 _GRANULARITY_NS = 10_000_000
 """Of the threads on both sides: no answer is missed earlier than this after a usual one."""
+_MOST_OVERTAKEN_NS = LIVE_NS // 5
+"""What is later than this was lost; so long was waited for all, before anything was asked for."""
 _QUESTIONS = 4
 """Where a tenth is lost each way, so many leave 0.1 % of what is asked for unanswered."""
 
@@ -66,18 +68,25 @@ class RoundTrip:
 
 @dataclass
 class _Missing:
-    until_ns: int
+    since_ns: int
+    ask_ns: int
+    """When it is to be asked for next."""
     first_ns: int | None = None
     """When it was asked for first, and last."""
     last_ns: int = 0
     came_ns: int = 0
+
+    @property
+    def until_ns(self) -> int:
+        return self.since_ns + LIVE_NS
 
 
 class Retransmission:
     """The missing packets of one stream, by sequence number; for one thread, times monotonic.
 
     Each is asked for when it is missed, and again when the answer must have been lost, as long as
-    another can be here within `LIVE_NS`. It is given up when none is under way any more.
+    another can be here within `LIVE_NS`. It is given up when none is under way any more. On a way
+    on which packets overtake each other it is asked for when it is later than those of late were.
     """
 
     def __init__(self, counters: Counters) -> None:
@@ -87,6 +96,8 @@ class Retransmission:
         self._counters = counters
         self._missing: dict[int, _Missing] = {}
         self._ambiguous: dict[int, _Missing] = {}
+        self._overtaken_ns = 0
+        """How late packets of late were that others had overtaken."""
 
     @property
     def helps(self) -> bool:
@@ -108,20 +119,26 @@ class Retransmission:
         if silent_ns > _SILENT_NS and count > _ONE_ENTRY:
             return
         for ahead in range(min(count, _MOST_MISSING - len(self._missing))):
-            self._missing[(first + ahead) & 0xFFFF] = _Missing(now_ns + LIVE_NS)
+            sequence = (first + ahead) & 0xFFFF
+            self._missing[sequence] = _Missing(now_ns, now_ns + self._overtaken_ns)
 
     def awaits(self, sequence: int) -> bool:
         """Whether this one can still come."""
         return sequence in self._missing
 
     def came(self, sequence: int, now_ns: int, *, again: bool) -> bool:
-        """Takes note of one that came, `again` as a retransmission; whether it was missing."""
-        missing = self._missing.pop(sequence, None)
-        if missing is None:
+        """Takes note of one that came, `again` as a retransmission; whether it was waited for."""
+        missing = self._missing.get(sequence)
+        if missing is None or (again and missing.first_ns is None):  # nobody asked for it
             if again:
                 self._came_twice(sequence, now_ns)
             return False
-        if again and missing.first_ns is not None:
+        del self._missing[sequence]
+        if not again:
+            late_ns = now_ns - missing.since_ns
+            self._overtaken_ns = min(max(self._overtaken_ns, late_ns), _MOST_OVERTAKEN_NS)
+        elif missing.first_ns is not None:
+            self._overtaken_ns -= self._overtaken_ns // 8
             if missing.last_ns == missing.first_ns:
                 self.round_trip.measure(now_ns - missing.first_ns, now_ns)
             else:  # whichever question it answers (Karn's algorithm)
@@ -145,25 +162,20 @@ class Retransmission:
         asked, gone = [], []
         timeout_ns, trip_ns = self.round_trip.timeout_ns, self.round_trip.smoothed_ns or 0
         for sequence, missing in self._missing.items():
+            if now_ns < min(missing.ask_ns, missing.until_ns):
+                continue
             if missing.first_ns is None:
-                missing.first_ns = missing.last_ns = now_ns
+                missing.first_ns = now_ns
                 self._counters.packets_asked += 1
-                asked.append(sequence)
-            elif now_ns >= missing.until_ns:
+            elif now_ns + trip_ns > missing.until_ns:
                 gone.append(sequence)
-            elif now_ns - missing.last_ns >= timeout_ns:
-                if now_ns + trip_ns > missing.until_ns:
-                    gone.append(sequence)
-                else:
-                    missing.last_ns = now_ns
-                    asked.append(sequence)
+                continue
+            missing.last_ns, missing.ask_ns = now_ns, now_ns + timeout_ns
+            asked.append(sequence)
         for sequence in gone:
             del self._missing[sequence]
         return asked
 
     def next_ns(self) -> int | None:
         """When `due` has something to say next; None while nothing is missing."""
-        if not self._missing:
-            return None
-        timeout_ns = self.round_trip.timeout_ns
-        return min(min(m.until_ns, m.last_ns + timeout_ns) for m in self._missing.values())
+        return min((min(m.ask_ns, m.until_ns) for m in self._missing.values()), default=None)

@@ -1,5 +1,6 @@
 """A payload hears once a second how its own video arrives, and nobody else's."""
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -7,10 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+from numbered_flight import encoded, packets, stamped
 
 from ground_station.stream.arrivals import Flow
 from ground_station.stream.counters import Counters
 from ground_station.stream.feedback import Feedback, StreamAccount
+from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
@@ -271,6 +274,41 @@ def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryL
             time.sleep(0.01)
         time.sleep(0.2)
         assert 3 <= len(ear.reports) <= 12  # ten a second at most
+    ear.close()
+
+
+def test_an_idr_is_asked_for_when_mending_failed_and_not_before(
+    listener: TelemetryListener,
+) -> None:
+    ear = Ear(listener, "one")
+    datagrams = packets([stamped(unit, n) for n, unit in enumerate(encoded(12))], ssrc=5)
+    shown: list[int] = []
+    with (
+        MultiStreamReceiver(
+            0, owner=lambda *_: "one", on_frame=lambda _, frame: shown.append(frame.sequence)
+        ) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        Feedback(listener, receiver.stream_of, period_s=0.05),
+    ):
+        ear.telemetry.gate(gate(10, 5))
+        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=99))
+        whole = len(packets([stamped(encoded(12)[0], 0)]))
+        for number, datagram in enumerate(datagrams[: whole + 2]):
+            sender.sendto(datagram, ("127.0.0.1", receiver.port))
+            assert number == 0 or until(lambda: receiver.streams())
+        assert until(lambda: (stream := receiver.stream_of("one")) and stream.rtx_ssrc == 99)
+        missed_s = time.monotonic()
+        for datagram in datagrams[whole + 3 :]:
+            sender.sendto(datagram, ("127.0.0.1", receiver.port))
+        asked = ear.wait(lambda report: report.wants_idr)
+        waited_s = time.monotonic() - missed_s
+        stream = receiver.stream_of("one")
+        assert asked is not None and waited_s > 0.1 and stream is not None
+        # All of it was withheld at once, when the one packet was given up.
+        assert stream.counters.packets_asked == stream.counters.packets_lost == 1
+        assert until(lambda: len(shown) + stream.counters.withheld == 12)
+        assert stream.counters.withheld >= 10
+        assert sum(report.wants_idr for report in ear.reports) == 1
     ear.close()
 
 

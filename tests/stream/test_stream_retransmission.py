@@ -167,6 +167,31 @@ def test_what_comes_tells_the_round_trip_and_what_comes_twice_that_it_is_longer_
     assert not missing.came(7, 0, again=True)  # nobody waits for it
 
 
+def test_where_packets_overtake_each_other_they_are_asked_for_later() -> None:
+    counters = Counters()
+    missing = Retransmission(counters)
+    missing.offered = True
+    missing.round_trip.hint(10 * MS, 0)
+    for number in range(40):
+        begin_ns = number * 1000 * MS
+        missing.missed(number, 1, 0, begin_ns)
+        for now in range(8):
+            missing.due(begin_ns + now * MS)
+        assert missing.came(number, begin_ns + 8 * MS, again=False)
+    assert counters.packets_asked == 1  # the first, before it was known
+    for number in range(40, 80):  # no longer
+        begin_ns = number * 1000 * MS
+        missing.missed(number, 1, 0, begin_ns)
+        asked = next(now for now in range(30) if missing.due(begin_ns + now * MS))
+        assert missing.came(number, begin_ns + (asked + 10) * MS, again=True)
+    assert asked <= 1
+    # However late some were, a frame is not waited for without a question.
+    missing.missed(80, 1, 0, 10**12)
+    assert missing.came(80, 10**12 + 140 * MS, again=False)
+    missing.missed(81, 1, 0, 2 * 10**12)
+    assert missing.next_ns() == 2 * 10**12 + 30 * MS
+
+
 def test_a_round_trip_from_telemetry_counts_until_there_is_one_of_its_own() -> None:
     trip = RoundTrip()
     assert trip.timeout_ns == LIVE_NS
