@@ -95,3 +95,33 @@ def test_nothing_passes_in_an_outage_and_all_does_behind_it() -> None:
             assert to.recv(16) == b"here"
             assert link.first_s is not None and time.monotonic() - link.first_s >= 0.3
             assert link.counts.lost >= 1
+
+
+@pytest.mark.parametrize(("loss", "least", "most"), [(0.0, 100, 100), (0.3, 50, 90)])
+def test_what_comes_back_goes_to_the_sender_as_late_and_as_lost(
+    loss: float, least: int, most: int
+) -> None:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
+    ):
+        for side in (to, out):
+            side.bind(("127.0.0.1", 0))
+            side.settimeout(LIMIT_S)
+        with ImpairedLink(to.getsockname()[1], Impairment(delay_s=0.02), seed=1) as link:
+            out.sendto(b"there", ("127.0.0.1", link.port))
+            _, relay = to.recvfrom(100)
+            link.impair(Impairment(loss=loss, delay_s=0.02))
+            began_s = time.monotonic()
+            for number in range(100):
+                to.sendto(bytes([number]), relay)
+            back = [out.recv(100)]
+            assert time.monotonic() - began_s >= 0.02
+            out.settimeout(0.5)
+            try:
+                while True:
+                    back.append(out.recv(100))
+            except TimeoutError:
+                pass
+            assert least <= len(back) == link.returned <= most and back == sorted(back)
+            assert link.counts.received == 1

@@ -33,6 +33,7 @@ from ground_station.stream.feedback import Feedback
 from ground_station.stream.multi_stream import MultiStreamReceiver, Stream
 from ground_station.stream.retransmission import LIVE_NS, Retransmission, RoundTrip
 from ground_station.stream.telemetry import TelemetryListener
+from pi_firmware import retransmission as payloads
 from pi_firmware.link import Link
 from pi_firmware.retransmission import Budget, rtx_ssrc
 from pi_firmware.settings import LinkSettings
@@ -437,6 +438,39 @@ def test_a_nack_without_the_key_costs_nothing_and_with_it_no_more_than_the_budge
             assert until(lambda: flown.air.counts.received > came)
             time.sleep(0.5)
         assert flown.air.counts.received - came <= 2 * (64 << 10) // 600
+
+
+def test_a_flood_at_the_payloads_port_is_read_slowly_and_what_is_asked_for_after_it_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken: list[int] = []
+    take = payloads.Retransmission.take
+
+    def counted(self: payloads.Retransmission, datagram: bytes) -> int:
+        taken.append(take(self, datagram))
+        return taken[-1]
+
+    monkeypatch.setattr(payloads.Retransmission, "take", counted)
+    with flying() as flown:
+        send(flown, 5)
+        assert until(lambda: len(flown.frames) == 5)
+        retransmission = flown.link._retransmission
+        assert retransmission is not None
+        address = ("127.0.0.1", retransmission._sockets[0].getsockname()[1])
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            began_s = time.monotonic()
+            for _ in range(5000):
+                stranger.sendto(b"\x81\xcd" + bytes(30), address)
+            time.sleep(0.3)
+            assert 20 <= len(taken) <= 40 + 200 * (time.monotonic() - began_s)
+            newest = _heard(flown)[0].sequence
+
+            def asked_and_sent() -> bool:
+                stranger.sendto(rtcp.nack(1, 77, [newest]), address)
+                time.sleep(0.02)
+                return 1 in taken
+
+            assert until(asked_and_sent)
 
 
 def _heard(flown: Flown) -> list[rtp.Packet]:
