@@ -13,7 +13,8 @@ from ground_station.stream.counters import Counters
 LIVE_NS = 150_000_000
 """What a frame is waited for at most: nearly all poses are held to be here so soon after capture,
 and what waits longer would not be shown sooner than the IDR that is asked for in its place."""
-_MOST_MISSING = 512
+_MOST_MISSING = 256
+"""So that one datagram asks for all: its entries are of four bytes (RFC 4585, 6.2.1)."""
 _ONE_ENTRY = 17
 """Packets that one entry of a NACK asks for (RFC 4585, 6.2.1)."""
 _SILENT_NS = 2 * LIVE_NS

@@ -569,3 +569,13 @@ def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames() -> None:
 
 def _datagrams(stream: Stream) -> int:
     return stream.counters.packets + stream.counters.retransmissions
+
+
+def test_however_much_is_missing_one_datagram_asks_for_it() -> None:
+    missing = Retransmission(Counters())
+    missing.offered = True
+    for number in range(0, 2000, 20):
+        missing.missed(number, 3, 0, 0)
+    asked = missing.due(0)
+    assert len(asked) == 256
+    assert len(SrtcpProtector("a", KEY).protect(rtcp.nack(1, 77, asked))) <= 1200

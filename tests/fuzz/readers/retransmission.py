@@ -52,7 +52,8 @@ def fuzz(data: bytes) -> None:
         }
         # Whatever comes: several gaps, one behind another, each missed later than the one before.
         assert all(now_ns - since <= 2 * LIVE_NS + 255 * _MS for since in held_since.values())
-        assert len(retransmission._missing) <= 512 and len(retransmission._ambiguous) <= 512
+        assert len(retransmission._missing) <= 256 and len(retransmission._ambiguous) <= 256
+        assert len(rtcp.nack(1, 7, asked)) <= 1100
         sequence = (sequence + (not how & 8)) & 0xFFFF
     assert given <= taken and counters.packets_mended <= counters.packets_asked
     assert counters.packets_mended <= counters.retransmissions
