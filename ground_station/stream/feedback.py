@@ -70,6 +70,9 @@ class Awaited:
     def flow(self) -> None:
         """Nothing comes."""
 
+    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
+        """Nothing is asked for."""
+
 
 @dataclass(frozen=True)
 class Tally:

@@ -98,3 +98,9 @@ class Receiver:
         """How it arrives of late."""
         stream = self._stream()
         return stream.flow() if stream else None
+
+    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
+        """Hears what `Feedback` tells a stream."""
+        stream = self._stream()
+        if stream is not None:
+            stream.retransmits(rtx_ssrc, round_trip_s)
