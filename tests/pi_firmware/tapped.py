@@ -41,6 +41,7 @@ class Tap:
         self._socket.bind((host, 0))
         self._socket.settimeout(0.1)
         self.host, self.port = self._socket.getsockname()
+        self._sender: tuple[str, int] | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -54,10 +55,18 @@ class Tap:
         self._thread.join()
         self._socket.close()
 
-    def packets(self) -> list[rtp.Packet]:
-        """Those of the datagrams that are RTP of our video, whatever they carry."""
+    def packets(self, *, again: bool = False) -> list[rtp.Packet]:
+        """Those of the datagrams that are RTP of our video, whatever they carry.
+
+        `again`: those that were sent again, and no others.
+        """
         parsed = (rtp.parse(datagram, 0) for datagram in list(self.datagrams))
-        return [packet for packet in parsed if packet is not None]
+        return [packet for packet in parsed if packet is not None and packet.again == again]
+
+    def answer(self, datagram: bytes) -> None:
+        """Sends this to where the newest datagram came from."""
+        assert self._sender is not None
+        self._socket.sendto(datagram, self._sender)
 
     def frames(self) -> list[Frame]:
         """The frames in plain RTP; none in what is encrypted."""
@@ -69,10 +78,12 @@ class Tap:
     def _run(self) -> None:
         while True:
             try:
-                self.datagrams.append(self._socket.recv(65535))
+                datagram, self._sender = self._socket.recvfrom(65535)
             except TimeoutError:
                 if self._closing.is_set():
                     return
+            else:
+                self.datagrams.append(datagram)
 
 
 def start(settings: Mapping[str, object]) -> subprocess.Popen[str]:

@@ -27,6 +27,7 @@ SEEN_BY: dict[str, tuple[str, ...]] = {
         "link.ssrc",
         "link.mtu_bytes",
     ),
+    "live::test_what_was_sent_of_late_and_nothing_older_is_sent_again": ("link.history_s",),
     "live::test_the_battery_is_the_gauges_and_is_read_so_often": (
         "battery.uri",
         "battery.period_s",

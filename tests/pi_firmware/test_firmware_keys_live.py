@@ -23,7 +23,7 @@ from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
 from ground_station.stream.rtp import AccessUnit, Depacketizer
 from pi_firmware import settings
-from pi_firmware.wire import keys, messages
+from pi_firmware.wire import keys, messages, rtcp, video
 from pi_firmware.wire.telemetry import Session, open_session
 
 KINDS: dict[str, type[messages.Message]] = {
@@ -46,6 +46,7 @@ CONFIGURED: dict[str, object] = {
     "link.host": "127.0.0.2",
     "link.ssrc": 4242,
     "link.mtu_bytes": 300,
+    "link.history_s": 0.6,
     "battery.uri": "i2c:ina219@fake:0x40?percentage=0.5&load_A=0.2",
     "battery.period_s": 0.2,
     "battery.low_percentage": 0.7,
@@ -108,6 +109,7 @@ class Live:
             until(lambda: self.has("camera-restarted") and self.has("streaming-again"))
             until(lambda: self.autopilot_heard, lambda: self.put(keys.POSE, pose()))
             until(lambda: len(self.lossy()) > 3, lambda: self.put(keys.LINK, self.report()))
+            until(lambda: len(self.tap.packets(again=True)) > 3, self.ask_again)
             self.answer = commands.ask(
                 self.session, self.payload_id, "bitrate", {"kbps": 50}, LIMIT_S
             )
@@ -121,6 +123,12 @@ class Live:
         finally:
             self.process.kill()
             self.process.wait()
+
+    def ask_again(self) -> None:
+        """Asks for the newest packet, and for one of seconds ago, as if they had been lost."""
+        first, newest = (self.tap.packets()[place].sequence for place in (0, -1))
+        self.tap.answer(rtcp.nack(1, int(str(self.asked["link.ssrc"])), [first]))
+        self.tap.answer(rtcp.nack(1, int(str(self.asked["link.ssrc"])), [newest]))
 
     def endpoints(self) -> list[str]:
         """Where the program says that its telemetry listens, in the second line if it does."""
@@ -240,7 +248,19 @@ def test_packets_go_where_they_should_as_they_should(live: Live) -> None:
     assert (live.tap.host, live.tap.port) == (live.asked["link.host"], live.asked["link.port"])
     assert len(live.tap.frames()) > 20
     assert {packet.ssrc for packet in live.tap.packets()} == {live.asked["link.ssrc"]}
-    assert max(map(len, live.tap.datagrams)) == live.asked["link.mtu_bytes"]
+    # What is sent again is larger, and must fit, too.
+    sizes = [len(datagram) for datagram in live.tap.datagrams if datagram[1] & 0x7F == 96]
+    assert max(sizes) == int(str(live.asked["link.mtu_bytes"])) - video.OSN_BYTES
+
+
+def test_what_was_sent_of_late_and_nothing_older_is_sent_again(live: Live) -> None:
+    sent = {packet.sequence: packet for packet in live.tap.packets()}
+    again = live.tap.packets(again=True)
+    assert again and all(sent[packet.sequence].payload == packet.payload for packet in again)
+    (ssrc,) = {packet.ssrc for packet in again}
+    assert live.heard.of(keys.HEALTH)[-1].rtx_ssrc == ssrc != live.asked["link.ssrc"]
+    # The flight had lasted for longer than link.history_s when its first packet was asked for.
+    assert live.tap.packets()[0].sequence not in {packet.sequence for packet in again}
 
 
 def test_the_battery_is_the_gauges_and_is_read_so_often(live: Live) -> None:
