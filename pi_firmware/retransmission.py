@@ -16,6 +16,7 @@ from typing import Any
 from pi_firmware import gstreamer
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import rtcp, video
+from pi_firmware.wire.errors import StreamError
 
 HISTORY_BYTES = 1 << 20
 """The history's size at most: a second of 8 Mbit/s."""
@@ -72,7 +73,7 @@ class Retransmission:
     """Reads what is asked for at the sockets of a running pipeline; `start` and `stop` it.
 
     With a `key` (30 bytes) it is SRTCP of that key or nothing. Whoever asks, it goes to where the
-    video goes, and never more of it than `budget` has.
+    video goes, and never more of it than `budget` has. Raises `StreamError` with one line.
     """
 
     def __init__(self, pipeline: Any, link: LinkSettings, ssrc: int, key: bytes | None) -> None:
@@ -82,8 +83,12 @@ class Retransmission:
         self._ssrc, self._packet_bytes = ssrc, link.mtu_bytes
         self._unprotector: Any = None
         if key is not None:
-            from pi_firmware.wire.srtcp import SrtcpUnprotector  # 8 MB that plain video saves
-
+            try:
+                from pi_firmware.wire.srtcp import SrtcpUnprotector  # 8 MB that plain video saves
+            except ImportError as error:
+                raise StreamError(
+                    f"link.history_s: {error} (Debian package python3-cryptography); 0 does without"
+                ) from None
             self._unprotector = SrtcpUnprotector(key)
         self.budget = Budget()
         self._closing = threading.Event()

@@ -7,6 +7,7 @@ import json
 import random
 import socket
 import struct
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,7 @@ from pi_firmware.link import Link
 from pi_firmware.retransmission import Budget, rtx_ssrc
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import rtcp
+from pi_firmware.wire.errors import StreamError
 from pi_firmware.wire.srtcp import SrtcpProtector, SrtcpUnprotector
 
 KEY = bytes(range(30))
@@ -579,3 +581,12 @@ def test_however_much_is_missing_one_datagram_asks_for_it() -> None:
     asked = missing.due(0)
     assert len(asked) == 256
     assert len(SrtcpProtector("a", KEY).protect(rtcp.nack(1, 77, asked))) <= 1200
+
+
+def test_a_card_without_cryptography_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pi_firmware.wire.srtcp", None)
+    with pytest.raises(StreamError, match=r"^link\.history_s: .*python3-cryptography") as caught:
+        Link(LinkSettings(), 77, KEY)
+    assert "\n" not in str(caught.value)
+    Link(LinkSettings(history_s=0.0), 77, KEY).stop()
+    Link(LinkSettings(), 77).stop()
