@@ -12,6 +12,7 @@ import secrets
 import socket
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 from pi_firmware import gstreamer, retransmission
@@ -87,6 +88,9 @@ class Link:
                 raise StreamError(
                     f"link.ssrc is {link.ssrc}; with SRTP it must be 0, as each start needs another"
                 )
+        if link.history_s and (missing := retransmission.unavailable(encrypted=encrypted)):
+            print(f"pi_firmware: {missing}; nothing is sent again", file=sys.stderr, flush=True)
+            link = replace(link, history_s=0.0)
         self._pipeline = gstreamer.launch(description(link, ssrc, encrypted=encrypted))
         if encrypted:
             element = self._pipeline.get_by_name("srtp")

@@ -6,6 +6,7 @@ is: at the address that the video leaves from (RFC 5761).
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import select
 import socket
@@ -33,6 +34,17 @@ def rtx_ssrc(ssrc: int) -> int:
     """The SSRC of what is sent again: as random as the stream's own, and never the same or 0."""
     other = ssrc ^ 0x8000_0000
     return other or 1
+
+
+def unavailable(*, encrypted: bool) -> str:
+    """What is not installed, as on a card of before there was this; "" when all of it is."""
+    try:
+        gstreamer.require(("rtprtxsend",), "link.history_s")
+    except StreamError as error:
+        return str(error)
+    if encrypted and importlib.util.find_spec("cryptography") is None:
+        return "link.history_s: Python has no 'cryptography' here (package python3-cryptography)"
+    return ""
 
 
 def description(link: LinkSettings, ssrc: int) -> str:
@@ -73,7 +85,7 @@ class Retransmission:
     """Reads what is asked for at the sockets of a running pipeline; `start` and `stop` it.
 
     With a `key` (30 bytes) it is SRTCP of that key or nothing. Whoever asks, it goes to where the
-    video goes, and never more of it than `budget` has. Raises `StreamError` with one line.
+    video goes, and never more of it than `budget` has.
     """
 
     def __init__(self, pipeline: Any, link: LinkSettings, ssrc: int, key: bytes | None) -> None:
@@ -83,12 +95,8 @@ class Retransmission:
         self._ssrc, self._packet_bytes = ssrc, link.mtu_bytes
         self._unprotector: Any = None
         if key is not None:
-            try:
-                from pi_firmware.wire.srtcp import SrtcpUnprotector  # 8 MB that plain video saves
-            except ImportError as error:
-                raise StreamError(
-                    f"link.history_s: {error} (Debian package python3-cryptography); 0 does without"
-                ) from None
+            from pi_firmware.wire.srtcp import SrtcpUnprotector  # 8 MB that plain video saves
+
             self._unprotector = SrtcpUnprotector(key)
         self.budget = Budget()
         self._closing = threading.Event()

@@ -22,6 +22,7 @@ _BOARDS = ("qemu", "zero2w", "zerow")
 
 # Which package of Debian, or else which distribution of the lock, brings a module.
 _BROUGHT_BY = {
+    "cryptography": "python3-cryptography",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "gi": "python3-gi",
     "google": "protobuf",
