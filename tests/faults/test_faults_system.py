@@ -136,4 +136,4 @@ def test_a_network_that_comes_late_and_goes(recording: Path, tmp_path: Path) -> 
     received = account.received
     assert received is not None and received.packets == account.link.passed
     assert received.packets_lost == account.witness.gaps > 100
-    assert received.failed == received.garbage == received.dropped == 0
+    assert received.failed == received.garbage == 0
