@@ -139,7 +139,6 @@ def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
     assert np.abs(again.wTc - before.wTc).max() < 1e-6
 
 
-@pytest.mark.xfail(strict=True, reason="equal bays confirm each other's rotations, and fold")
 def test_pictures_in_no_order_of_equal_bays_are_placed_or_doubted(corridor, tmp_path):
     rng = np.random.default_rng(0)
     order = rng.permutation(len(corridor.images.names))
