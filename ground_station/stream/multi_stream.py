@@ -244,6 +244,8 @@ class MultiStreamReceiver:
         self._closing.set()
         self._thread.join()
         self._socket.close()
+        for ssrc in list(self._candidates):
+            self._forget(ssrc)
         for stream in self.streams():
             stream.end()
         for stream in self.streams():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import signal
 import socket
@@ -35,6 +36,7 @@ from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.log import RateLimitedHandler
 from ground_station.service.foxglove.topics import json_topic
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
+from pi_firmware.wire import messages
 
 RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))
 SCHEMAS = {
@@ -216,8 +218,9 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
     stand: SimpleNamespace,
 ) -> None:
     station = stand.station
-    battery = {"schema": "blimp.battery/1.1", "time_ns": 5, "voltage": 3.9}
-    note = PayloadMessage(True, 1, battery=battery, health={"uptime_s": 3.0}, rate_hz=30.0)
+    battery = messages.Battery(5, 3.9)
+    health = messages.Health(6, uptime_s=3.0)
+    note = PayloadMessage(True, 1, battery=battery, health=health, rate_hz=30.0)
     event = EventMessage(CAPTURE_NS, "localizer", "warning", "map-refused", "why")
     recording = RecordingMessage(True, "a.mcap", 1.0)
     kept = (
@@ -256,7 +259,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
     assert list(calibration.K) == camera.matrix.ravel().tolist()
     assert list(calibration.D) == camera.distortion.tolist()
     assert calibration.P[0] == camera.fx_px and len(calibration.P) == 12
-    assert told[f"/{PAYLOAD}/battery"][1] == battery
+    assert told[f"/{PAYLOAD}/battery"][1] == dataclasses.asdict(battery)
     assert told[f"/{PAYLOAD}/status"][1]["rate_hz"] == 30.0
     log_ns, said = told["/events"]
     assert log_ns == CAPTURE_NS and (said["payload"], said["text"]) == (PAYLOAD, "why")
