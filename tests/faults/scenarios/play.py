@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx
 
+from pi_firmware.wire.messages import Health
 from scenarios.burden import Burden
 from scenarios.camera import Cameras
 from scenarios.judge import TRACKING, Verdict, judge
@@ -174,9 +175,8 @@ def _lacks(world: World, since_s: float) -> str:
         return "no page"
 
 
-def _talks(health: dict[str, object] | None, world: World) -> bool:
+def _talks(health: Health | None, world: World) -> bool:
     """Whether what was heard last is of the payload's newest process, and not of one before it."""
-    uptime_s = health.get("uptime_s") if health else None
-    if not isinstance(uptime_s, float | int):
+    if health is None:
         return False
-    return time.monotonic() - uptime_s > world.run.began_s - _NOISE_S
+    return time.monotonic() - health.uptime_s > world.run.began_s - _NOISE_S
