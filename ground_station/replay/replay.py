@@ -53,7 +53,7 @@ class ReplaySettings:
     """How many frames are kept with their matches, for the report."""
     stepped: bool = False
     """Each frame as soon as there is room, and no clock decides what becomes of it: the same poses,
-    bit for bit, however fast the machine. False: in real time, where the newest frame wins."""
+    bit for bit, however fast the machine. False: in real time, as the service takes them."""
     payload: tuple[str, ...] = ()
     """More of the firmware's settings, each "key=value" as `--set` takes them."""
 

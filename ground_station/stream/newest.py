@@ -10,17 +10,24 @@ T = TypeVar("T")
 
 
 class Newest(Generic[T]):
-    """Keeps the `most` newest items, from any thread; `skipped` counts those that nobody took."""
+    """Keeps up to `most` items in their order; where there is no room, the newest only.
+
+    So a moment's delay loses none, and whoever stays behind is not late for ever. From any thread;
+    `skipped` counts those that nobody took.
+    """
 
     def __init__(self, most: int = 1) -> None:
         self.skipped = 0
-        self._items: deque[T] = deque(maxlen=most)
+        self._most = most
+        self._items: deque[T] = deque()
         self._there = threading.Condition()
 
     def put(self, item: T) -> None:
-        """Takes one, in place of the oldest where there is no room."""
+        """Takes one."""
         with self._there:
-            self.skipped += len(self._items) == self._items.maxlen
+            if len(self._items) >= self._most:
+                self.skipped += len(self._items)
+                self._items.clear()
             self._items.append(item)
             self._there.notify()
 

@@ -159,7 +159,7 @@ def test_hostile_access_units_of_the_own_stream_do_not_end_it() -> None:
     units = flight_units()
     noise = [b"\x00\x00\x01\x65" + rng.randbytes(900) for _ in range(10)]
     noise += [units[0][:40] + rng.randbytes(400) for _ in range(10)]
-    with Receiver(0, queue_frames=FRAMES) as receiver:
+    with Receiver(0, queue_frames=2 * FRAMES) as receiver:
         send(packets([*units[:5], *noise, *units]), receiver)
         assert until(lambda: receiver.counters.access_units == 25 + FRAMES)
         frames = all_frames(receiver)

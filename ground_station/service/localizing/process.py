@@ -1,4 +1,4 @@
-"""The localizer process's loop: the newest frame wins, and what is not taken is counted.
+"""The localizer process's loop: who falls behind takes the newest frame, and counts the others.
 
 Of a payload that waits for poses (`Run.stepped`) each frame is taken in its turn.
 """
@@ -37,6 +37,8 @@ RESTART = 3
 """Exit status: only a new process can help."""
 
 _POLL_S = 0.2
+_QUEUED = 4
+"""Frames that wait while one takes longer, as when a keyframe lands: 0.1 s at 30 Hz."""
 _ANSWER_S = 3.0
 """A question for a map waits this long for it to be loaded; a larger one is told by an event."""
 _WAITING_EVERY_S = 1.0
@@ -67,7 +69,7 @@ class Localizing:
             lambda name, text: self._event(bus_messages.WARNING, name, text)
         )
         # A payload that waits for poses has fewer frames on their way than the ring has slots.
-        most = SLOTS if run.stepped else 1
+        most = SLOTS if run.stepped else _QUEUED
         self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, most)
         self._loader.begin(Path(run.station.map.folder))
         bus.serve(bus.process, self._do)
