@@ -57,12 +57,15 @@ class LiveFrames:
             owner=_whoever_comes,
             on_frame=lambda _, frame: newest.put(frame),
             max_streams=1,
-        ):
+        ) as receiver:
             until_s = time.monotonic() + self._seconds
             given = 0
             while (left_s := until_s - time.monotonic()) > 0:
                 received = newest.take(min(left_s, 0.5))
                 if received is None:
+                    told = [stream.problem for stream in receiver.streams()]
+                    if problem := receiver.failure or "".join(told):
+                        raise InputError(f"{self._uri}: {problem}")
                     continue
                 if not given:
                     until_s = time.monotonic() + self._seconds

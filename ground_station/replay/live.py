@@ -173,7 +173,8 @@ def run(
         if result.payload.ended:
             told = result.payload.frames
             taken = len(estimates) + result.dropped
-            if taken >= told["received"] >= told["sent"] or idle_s > _DRAIN_S:
+            here = told["received"] >= told.get("sent", 0)  # without its counts: all that came
+            if (here and taken >= told["received"]) or idle_s > _DRAIN_S:
                 break
         elif not payload.running() and idle_s > _DRAIN_S:
             break

@@ -123,7 +123,7 @@ class Bus:
         self._declared.append(self._session.declare_subscriber(key, received))
 
     def newest(self, kind: str, of: type[N], payload_id: str = "*", most: int = 1) -> Newest[N]:
-        """Where the newest messages of a kind lie, `most` of them."""
+        """Where up to `most` messages of a kind wait; see `Newest` for what is let go of."""
         newest: Newest[N] = Newest(most)
         self.subscribe(kind, of, lambda _, message: newest.put(message), payload_id)
         return newest

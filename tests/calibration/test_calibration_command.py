@@ -182,6 +182,31 @@ def test_a_live_stream_gives_frames_with_their_capture_times() -> None:
     assert all(frame.image.shape == (480, 640) for frame in frames)
 
 
+def test_a_stream_that_cannot_be_shown_says_why() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    stop = threading.Event()
+
+    def send() -> None:
+        number = 0
+        unit = stamped(encoded(2)[1], 1)  # refers to what came before, and has no parameter sets
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not stop.wait(0.05):
+                for datagram in packets([unit], first=number):
+                    sender.sendto(datagram, ("127.0.0.1", port))
+                    number += 1
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        with pytest.raises(InputError, match=f":{port}: .*no parameter sets"):
+            list(LiveFrames(f"udp://127.0.0.1:{port}", 60.0))
+    finally:
+        stop.set()
+        thread.join()
+
+
 def test_a_silent_port_is_said() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

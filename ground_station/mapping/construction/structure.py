@@ -136,7 +136,8 @@ class _Reconstruction:
         gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
         if moved:
             notes.append(
-                f"{moved} images stood where the images beside them do not see the same; "
+                f"{moved} {'image' if moved == 1 else 'images'} stood where other images see "
+                "something else; "
                 f"{len(gone)} are left out, the others have other places now"
             )
         return Structure(

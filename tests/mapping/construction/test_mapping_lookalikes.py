@@ -83,7 +83,7 @@ def test_plain_structure_from_motion_folds_the_corridor_and_the_judged_one_does_
     assert off.max() < 0.02
     assert len(off) == len(corridor.images.names)
     assert judged.dropped == [] and judged.sizes == [len(off)]
-    assert "stood where the images beside them do not see the same" in judged.notes[0]
+    assert "stood where other images see something else" in judged.notes[0]
 
 
 def test_single_images_in_a_place_that_looks_like_theirs_are_placed_anew(tmp_path):
