@@ -21,7 +21,7 @@ def picture():
 def test_descriptors_are_the_square_roots_of_opencvs_normalised_histograms(picture):
     found = extractors.create("rootsift", 300).extract(picture)
     sift = cv2.SIFT.create(
-        nfeatures=300, contrastThreshold=0.02, edgeThreshold=10, enable_precise_upscale=True
+        nfeatures=300, contrastThreshold=0.006, edgeThreshold=10, enable_precise_upscale=True
     )
     keypoints, histograms = sift.detectAndCompute(picture, None)
     expected = np.sqrt(histograms / histograms.sum(axis=1, keepdims=True))
@@ -40,6 +40,19 @@ def test_descriptors_have_unit_norm_and_the_strongest_come_first(picture):
     assert found.descriptors.dtype == found.keypoints_px.dtype == np.float32
     assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-5)
     assert (np.diff(found.scores) <= 0).all()
+
+
+def test_a_faint_wall_has_features_that_are_found_again_beside_the_sensors_noise(picture):
+    wall = 120 + 0.05 * (picture.astype(float) - 128)  # a few grey levels of texture
+    noise = np.random.default_rng(1)
+    extractor = extractors.create("rootsift", 300)
+    first, second = (
+        extractor.extract((wall + noise.normal(0, 1.0, wall.shape)).round().astype(np.uint8))
+        for _ in range(2)
+    )
+    assert min(len(first), len(second)) > 200
+    apart = np.linalg.norm(first.keypoints_px[:, None] - second.keypoints_px[None], axis=2)
+    assert np.median(apart.min(axis=1)) < 1.0
 
 
 def test_the_same_picture_gives_the_same_features(picture):

@@ -10,8 +10,11 @@ import numpy.typing as npt
 
 from ground_station.features.extractor import Features, check_image
 
-_CONTRAST_THRESHOLD = 0.02
-"""Half of OpenCV's: indoor walls are faint, and the strongest `max_features` are kept anyway."""
+_CONTRAST_THRESHOLD = 0.006
+"""So low that `max_features` decides, not contrast: indoor walls are faint. Beside 0.02, neighbours
+in a simulated walk through rooms had 1.9 times as many right matches (of the poorest tenth of the
+pairs 4 times), in the red kitchen 1.2 times and in a corridor as many, of matches as often right.
+"""
 
 
 class RootSift:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
@@ -44,10 +43,6 @@ room) as with 1e-6, in half the time."""
 _NEARLY_ALL = 0.95
 """Share of the images that the global method must place for `auto` to be content with it."""
 
-_DOUBTFUL = 0.5
-"""Of a model whose largest group without contradictions is a smaller share, nothing is believed."""
-_TRIES = 3
-"""How often images that were contradicted are placed anew."""
 
 Pairs = Mapping[Pair, TwoView]
 
@@ -81,14 +76,20 @@ def reconstruct(
     `work` is a folder for its files. What an earlier, killed run of the same inputs left there is
     gone on from. Raises `MapError` when structure from motion finds no model.
     """
-    return _Reconstruction(images, camera, settings, threads, work).run(pairs)
+    return _Reconstruction(images, pairs, camera, settings, threads, work).run()
 
 
 class _Reconstruction:
     """The steps of one build; each keeps its files in a folder of its own."""
 
     def __init__(
-        self, images: Images, camera: Camera, settings: MappingSettings, threads: int, work: Path
+        self,
+        images: Images,
+        pairs: Pairs,
+        camera: Camera,
+        settings: MappingSettings,
+        threads: int,
+        work: Path,
     ) -> None:
         self._images, self._camera, self._sfm, self._work = images, camera, settings.sfm, work
         self._counts = [len(pixels) for pixels in images.pinhole_px]
@@ -99,26 +100,28 @@ class _Reconstruction:
             settings.sfm.min_tri_angle_deg,
             len(images.names),
         )
+        self._ordered = chains.in_order(self._sequence, pairs)
+        near = chains.in_front(pairs, images.pinhole_px, camera.matrix, threads)
+        self._links = chains.links(self._counts, self._sequence, self._ordered, near)
+        self._pairs: Pairs = {
+            pair: near[pair] if pair in self._links else view for pair, view in pairs.items()
+        }
 
-    def run(self, pairs: Pairs) -> Structure:
+    def run(self) -> Structure:
         """Models, their judgement, and another try where the chain contradicts them."""
-        ordered = chains.in_order(self._sequence, pairs)
-        near = chains.in_front(
-            pairs, self._images.pinhole_px, self._camera.matrix, self._wanted.threads
-        )
-        links = chains.links(self._counts, self._sequence, ordered, near)
-        pairs = {pair: near[pair] if pair in links else view for pair, view in pairs.items()}
+        links, pairs = self._links, self._pairs
         models, notes = self._solve("all", pairs)
-        wrong = self._misplaced(models[0], links, pairs)
+        spare: list[colmap.Reconstruction] = []
+        wrong = self._misplaced(models[0], pairs)
         moved, placed = len(wrong), set(models[0].reg_image_ids())
         missing = {k for link in links for k in link} - {image_id - 1 for image_id in placed}
         doubtful = len(wrong) + len(missing) > _FOLDED * len(self._counts)
         if doubtful and links and pairs.keys() - links:
-            trusted = self._trusted(links, pairs)
-            again, said = self._solve("trusted", trusted)
-            still = self._misplaced(again[0], links, trusted)
-            if again[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
-                models, notes, wrong, pairs = again, said, still, trusted
+            trusted = self._trusted(pairs)
+            spare, said = self._solve("trusted", trusted)
+            still = self._misplaced(spare[0], trusted)
+            if spare[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
+                models, notes, wrong, pairs, spare = spare, said, still, trusted, []
         better = {k for k, rival in self._rivals(models[0], pairs).items() if rival.better} - wrong
         wrong |= better
         moved += len(better)
@@ -128,10 +131,9 @@ class _Reconstruction:
             colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
             pairs = loops.among(pairs, pairs.keys() - lies)
             models, notes = self._solve("replaced", pairs, start=models[0])
-            wrong = self._misplaced(models[0], links, pairs)
-            colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
-        self._drop_implausible(models[0], ordered)
-        models, doubts = self._consistent(models, pairs)
+            self._drop_misplaced(models[0], pairs)
+        self._drop_implausible(models[0])
+        models, notes, doubts = self._consistent(models, notes, spare, pairs)
         doubts += elsewhere.doubt(self._rivals(models[0], pairs), self._images.names)
         gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
         if moved:
@@ -150,13 +152,18 @@ class _Reconstruction:
         )
 
     def _consistent(
-        self, models: list[colmap.Reconstruction], pairs: Pairs
-    ) -> tuple[list[colmap.Reconstruction], list[str]]:
-        """Models without images that the rotations of pairs contradict; what stays in doubt.
+        self,
+        models: list[colmap.Reconstruction],
+        notes: list[str],
+        spare: list[colmap.Reconstruction],
+        pairs: Pairs,
+    ) -> tuple[list[colmap.Reconstruction], list[str], list[str]]:
+        """Models without images that the rotations of pairs contradict, with notes and doubts.
 
-        Where that leaves little of the first, the global method, which starts nowhere, is asked,
-        too. Groups that contradict each other become models of their own, which are joined again
-        where a similarity does it without a contradiction.
+        Where that breaks the first, or it holds too few images, `spare` models of another try and
+        those of the global method, which starts nowhere, are broken up alike, and what is kept are
+        the largest pieces of all. They are joined again where a similarity does it without a
+        contradiction.
         """
         confirmed = contradictions.rotations(
             pairs, self._images.pinhole_px, self._camera.matrix, self._wanted.threads
@@ -170,9 +177,10 @@ class _Reconstruction:
             sets = [part for group in groups for part in bridges.separated(placed.among(group))]
             if len(sets) == 1:
                 return [model]
-            large = [part for part in sets if len(part) >= self._wanted.smallest]
             pieces = []
-            for part in large:
+            for part in sets:
+                if len(part) < self._wanted.smallest:
+                    continue
                 # Without the others it is another model, of which pieces may come loose.
                 piece = self._kept(model, part)
                 adjustment.adjust(
@@ -181,53 +189,49 @@ class _Reconstruction:
                 )  # fmt: skip
                 drop_misfits(piece, self._sfm)
                 pieces += split(piece)
-            return sorted(pieces, key=lambda piece: -piece.num_reg_images())
+            return pieces
 
-        def sizes(found: list[colmap.Reconstruction]) -> list[int]:
-            return [each.num_reg_images() for each in found]
-
-        pieces = split(models[0])
-        if not pieces or pieces[0].num_reg_images() < _DOUBTFUL * models[0].num_reg_images():
-            models, _ = self._solve("global", pairs, method="global")
-            others = split(models[0])
-            pieces = max(
-                pieces, others, key=lambda found: [each.num_reg_images() for each in found]
-            )
-        tries, bridged = 0, pairs
-        while len(pieces) > 1 and tries < _TRIES:
-            # What links two pieces is what bends them; as models of their own they may be joined.
-            piece_of = {
-                image_id - 1: number
-                for number, piece in enumerate(pieces)
-                for image_id in piece.reg_image_ids()
-            }
-            bridged = loops.among(
-                bridged,
-                {(i, j) for i, j in bridged if piece_of.get(i, -1) == piece_of.get(j, -1)},
-            )
-            models, _ = self._solve(f"again-{tries}", bridged, joining=pairs, start=pieces[0])
-            pieces, tries = split(models[0]), tries + 1
+        pieces = [piece for model in models for piece in split(model)]
+        linked = {k for pair in pairs for k in pair}
+        broken = pieces[:1] != models[:1]
+        if not broken and models[0].num_reg_images() >= _NEARLY_ALL * len(linked):
+            return models, notes, []
+        for model in [*spare, *self._solve("global", pairs, method="global")[0]]:
+            self._drop_misplaced(model, pairs)
+            self._drop_implausible(model)
+            pieces += split(model)
+        pieces = self._covering(pieces)
         if not pieces:
             raise MapError(
                 "structure from motion contradicts what pairs of images say of each other: the "
                 "images show too little, or the camera file is of another camera"
             )
-        found = sorted(
-            [*pieces, *(piece for model in models[1:] for piece in split(model))],
-            key=lambda piece: -piece.num_reg_images(),
-        )
-        kept: list[colmap.Reconstruction] = []
-        placed: set[int] = set()
-        for piece in found:
-            new = {*piece.reg_image_ids()} - placed
-            if not kept or len(new) >= self._wanted.smallest:
-                kept.append(piece)
-                placed |= new
-        doubts = [
+        work = self._work / "all"
+        mapping = Incremental(work / "database.db", work, self._wanted, lambda: None)
+        joined, notes = self._merged(mapping, [colmap.copied(each) for each in pieces], pairs)
+        if len(split(joined[0])) == 1:
+            return joined, notes, []
+        return pieces, [], [
             f"{len(pieces)} pieces fit each other only against what pairs of their images say: "
             "they are kept apart"
-        ]
-        return kept, doubts if len(pieces) > 1 else []
+        ]  # fmt: skip
+
+    def _covering(self, pieces: list[colmap.Reconstruction]) -> list[colmap.Reconstruction]:
+        """The pieces that have all images, in turn the one that adds the most."""
+        kept: list[colmap.Reconstruction] = []
+        placed: set[int] = set()
+
+        def new(piece: colmap.Reconstruction) -> int:
+            return len({*piece.reg_image_ids()} - placed)
+
+        while pieces:
+            piece = max(pieces, key=new)
+            if kept and new(piece) < self._wanted.smallest:
+                break
+            kept.append(piece)
+            placed |= {*piece.reg_image_ids()}
+            pieces = [other for other in pieces if other is not piece]
+        return kept
 
     @staticmethod
     def _kept(model: colmap.Reconstruction, group: set[int]) -> colmap.Reconstruction:
@@ -236,11 +240,11 @@ class _Reconstruction:
         colmap.drop_images(copy, sorted({*copy.reg_image_ids()} - {k + 1 for k in group}))
         return copy
 
-    def _trusted(self, links: set[Pair], pairs: Pairs) -> Pairs:
+    def _trusted(self, pairs: Pairs) -> Pairs:
         """The pairs that agree with a model made of links alone."""
-        models, _ = self._solve("chain", loops.among(pairs, links), joining=pairs)
+        models, _ = self._solve("chain", loops.among(pairs, self._links), joining=pairs)
         parts = [self._placed(model) for model in models]
-        return loops.among(pairs, loops.believed(parts, self._sequence, links, pairs))
+        return loops.among(pairs, loops.believed(parts, self._sequence, self._links, pairs))
 
     def _solve(
         self,
@@ -315,17 +319,19 @@ class _Reconstruction:
             self._placed(model), pairs, self._images.pinhole_px, self._camera.matrix
         )
 
-    def _misplaced(self, model: colmap.Reconstruction, links: set[Pair], pairs: Pairs) -> set[int]:
+    def _misplaced(self, model: colmap.Reconstruction, pairs: Pairs) -> set[int]:
+        links = self._links & pairs.keys()
         return lookalikes.misplaced(self._placed(model), links, pairs, self._images.pinhole_px)
 
-    def _drop_implausible(
-        self, reconstruction: colmap.Reconstruction, ordered: npt.NDArray[np.bool_]
-    ) -> None:
+    def _drop_misplaced(self, model: colmap.Reconstruction, pairs: Pairs) -> None:
+        colmap.drop_images(model, [k + 1 for k in sorted(self._misplaced(model, pairs))])
+
+    def _drop_implausible(self, reconstruction: colmap.Reconstruction) -> None:
         """Drops images that are further off than the camera moves; of those in order only."""
         model = colmap.to_arrays(reconstruction)
         rays = model.position[model.point] - model.wTc[model.image, :3, 3]
         depth = float(np.median(np.linalg.norm(rays, axis=1))) if len(rays) else 0.0
-        judged = np.flatnonzero(ordered[model.image_id - 1])
+        judged = np.flatnonzero(self._ordered[model.image_id - 1])
         keep = plausible_frames(
             self._images.time_ns[model.image_id[judged] - 1],
             model.wTc[judged, :3, 3],

@@ -83,7 +83,7 @@ def corridor() -> geometry.Corridor:
 
 def _reconstruction(corridor, work) -> structure._Reconstruction:
     return structure._Reconstruction(
-        corridor.images, corridor.camera, MappingSettings(), threads=1, work=work
+        corridor.images, corridor.pairs, corridor.camera, MappingSettings(), threads=1, work=work
     )
 
 

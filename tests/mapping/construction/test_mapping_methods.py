@@ -6,6 +6,7 @@ import dataclasses
 
 import corridor_geometry as geometry
 import numpy as np
+import pycolmap
 import pytest
 
 from ground_station.map import colmap
@@ -57,3 +58,21 @@ def test_auto_falls_back_where_the_global_method_leaves_images_out(corridor, tmp
             "auto",
             tmp_path / "nothing",
         )
+
+
+def test_a_bent_end_is_taken_from_the_method_that_starts_nowhere(corridor, tmp_path, monkeypatch):
+    run = Incremental.run
+
+    def bent(self, start=None):
+        models = run(self, start)
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.3, 0.0])), np.zeros(3))
+        for image_id in range(21, 31):
+            frame = models[0].frame(models[0].image(image_id).frame_id)
+            frame.rig_from_world = turn * frame.rig_from_world
+        return models
+
+    monkeypatch.setattr(Incremental, "run", bent)
+    found = _reconstruct(corridor, "incremental", tmp_path)
+    off = geometry.error_m(corridor, found.reconstruction)
+    assert len(off) == 30 and off.max() < 0.03
+    assert found.doubts == [] and found.parts == []
