@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.experiments import tables
 from ground_station.experiments.report import PRINTED, conditions
-from ground_station.files import write_json, write_text
+from ground_station.files import finite, write_text
+from ground_station.presentation.readme import Block
 
-BEGIN = "<!-- experiments: made by `blimp experiments --accept`; do not edit -->"
-END = "<!-- experiments: end -->"
+BLOCK = Block(
+    "<!-- experiments: made by `blimp experiments --accept`; do not edit -->",
+    "<!-- experiments: end -->",
+)
 NAME = "accepted.json"
-"""Of the file beside `experiments.toml` that holds the run which README shows."""
+"""Of the file beside `experiments.toml` that holds what README shows of the accepted run."""
+_OF_EXPERIMENT = ("name", "title", "level")
+_OF_CASE = ("name", "title", "thesis", "worse")
+_OF_PRESET = {
+    "failed": None,
+    "localized": None,
+    "position_m": ("mean", "std", "n"),
+    "rotation_deg": ("mean", "std", "n"),
+    "consistency": ("inside_95",),
+}
+"""The figures that the table shows, and what is kept of each; None: all of it."""
 
 
 def render(document: dict[str, Any]) -> str:
@@ -33,15 +47,8 @@ def render(document: dict[str, Any]) -> str:
     return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 
 
-def table_in(readme: str) -> str | None:
-    """What stands between the markers; None without them."""
-    if BEGIN not in readme or END not in readme:
-        return None
-    return readme.split(BEGIN, 1)[1].split(END, 1)[0].strip("\n") + "\n"
-
-
 def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
-    """Makes a run the one that README shows, and keeps its figures without the single frames.
+    """Makes a run the one that README shows, and keeps the figures that stand there.
 
     A map that could not be built is a result. Raises `InputError` for a quick run, for one in which
     something was not measured or its process ended, and for a README without the markers.
@@ -56,35 +63,35 @@ def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
                         f"{e['title']}, {case['title']}, {preset}: {row['accidents'][0]}; "
                         "such a run is not accepted"
                     )
-    text = readme.read_text()
-    if table_in(text) is None:
-        raise InputError(f"{readme}: has no line '{BEGIN}' with '{END}' after it")
-    before, rest = text.split(BEGIN, 1)
-    after = rest.split(END, 1)[1]
-    write_json(accepted, without_frames(document))
-    write_text(readme, f"{before}{BEGIN}\n{render(document)}{END}{after}")
+    kept = shown(document)
+    BLOCK.write(readme, render(kept))
+    # A line for each row: what changed from one run to the next can be read.
+    lines = json.dumps(finite(kept), allow_nan=False).replace('{"name"', '\n{"name"')
+    write_text(accepted, lines + "\n")
 
 
-def without_frames(document: dict[str, Any]) -> dict[str, Any]:
-    """The same without the runs one by one: what a table needs."""
-    return document | {
-        "experiments": [
-            e
-            | {
-                "cases": [
-                    case
-                    | {
-                        "presets": {
-                            preset: {k: v for k, v in row.items() if k != "runs"}
-                            for preset, row in case["presets"].items()
-                        }
-                    }
-                    for case in e["cases"]
-                ]
-            }
-            for e in document["experiments"]
+def shown(document: dict[str, Any]) -> dict[str, Any]:
+    """What README's table and its check need of a run."""
+    kept: dict[str, Any] = {key: document[key] for key in ("quick", "seeds", "worse", "claims")}
+    kept["experiments"] = [_part(e, _OF_EXPERIMENT) for e in document["experiments"]]
+    for experiment, e in zip(kept["experiments"], document["experiments"], strict=True):
+        experiment["cases"] = [
+            _part(case, _OF_CASE)
+            | {"presets": {preset: _figures(row) for preset, row in case["presets"].items()}}
+            for case in e["cases"]
         ]
+    return kept
+
+
+def _figures(row: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: row[name] if parts is None or row[name] is None else _part(row[name], parts)
+        for name, parts in _OF_PRESET.items()
     }
+
+
+def _part(table: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    return {name: table[name] for name in names}
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -35,18 +35,18 @@ def document(tmp_path):
     return summary.summarise(declared, Plan({}, {}, runs), store, about)
 
 
-def test_an_accepted_run_stands_in_readme_and_is_kept_without_its_frames(tmp_path, document):
+def test_an_accepted_run_stands_in_readme_and_only_its_figures_there_are_kept(tmp_path, document):
     page = tmp_path / "README.md"
-    page.write_text(f"before\n{readme.BEGIN}\n{readme.END}\nafter\n")
+    page.write_text(f"before\n{readme.BLOCK.begin}\n{readme.BLOCK.end}\nafter\n")
     readme.accept(document, page, tmp_path / "accepted.json")
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("\nafter\n")
     kept = readme.read(tmp_path / "accepted.json")
-    assert readme.table_in(text) == readme.render(kept) == readme.render(document)
+    assert readme.BLOCK.read(text) == readme.render(kept) == readme.render(document)
     assert "| Light: noon | 20.0 cm | 10.00 cm, 1.00°, 100.0 % localized | 1.00 cm" in text
     assert "100.0 % localized | 95.0 % |" in text  # of the default's poses, inside their 95 %
     assert "| blur (px) | 2: 10.0 cm of 67 % | 2: 1.0 cm |" in text
-    assert "series" not in (tmp_path / "accepted.json").read_text()
+    assert "landmarks" not in (tmp_path / "accepted.json").read_text()
     readme.accept(document, page, tmp_path / "accepted.json")
     assert page.read_text() == text
 
@@ -56,7 +56,7 @@ def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_p
     page.write_text("nothing")
     with pytest.raises(InputError, match="has no line"):
         readme.accept(document, page, accepted)
-    page.write_text(f"{readme.BEGIN}\n{readme.END}\n")
+    page.write_text(f"{readme.BLOCK.begin}\n{readme.BLOCK.end}\n")
     with pytest.raises(InputError, match="quick"):
         readme.accept(document | {"quick": True}, page, accepted)
     broken = json.loads(json.dumps(document))
@@ -69,7 +69,7 @@ def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_p
 
 def test_a_map_that_could_not_be_built_is_a_result_and_stands_in_readme(tmp_path, document):
     page = tmp_path / "README.md"
-    page.write_text(f"{readme.BEGIN}\n{readme.END}\n")
+    page.write_text(f"{readme.BLOCK.begin}\n{readme.BLOCK.end}\n")
     row = document["experiments"][0]["cases"][0]["presets"]["default"]
     row |= {"failed": ["no two images overlap"], "localized": None, "position_m": None}
     readme.accept(document, page, tmp_path / "accepted.json")
@@ -79,7 +79,7 @@ def test_a_map_that_could_not_be_built_is_a_result_and_stands_in_readme(tmp_path
 
 
 def test_readme_shows_the_accepted_run_of_the_shipped_experiments_or_none():
-    shown = readme.table_in(declaration.SHIPPED.with_name("README.md").read_text())
+    shown = readme.BLOCK.read(declaration.SHIPPED.with_name("README.md").read_text())
     if shown is None:
         assert not ACCEPTED.exists()
         return

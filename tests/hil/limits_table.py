@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import GroundStationError
-from ground_station.files import write_json, write_text
+from ground_station.files import write_json
+from ground_station.presentation.readme import Block
 
-BEGIN = "<!-- limits: made by `make limits` and its --accept; do not edit -->"
-END = "<!-- limits: end -->"
+BLOCK = Block(
+    "<!-- limits: made by `make limits` and its --accept; do not edit -->",
+    "<!-- limits: end -->",
+)
 ACCEPTED = Path(__file__).with_name("limits_accepted.json")
 README = Path(__file__).resolve().with_name("README.md")
 QUIET_CORES = 0.2
@@ -63,13 +66,6 @@ def _spread(shares: list[float] | None) -> str:
     return f"{least:g} %" if least == most else f"{least:g} to {most:g} %"
 
 
-def table_in(readme: str) -> str | None:
-    """What stands between the markers; None without them."""
-    if BEGIN not in readme or END not in readme:
-        return None
-    return readme.split(BEGIN, 1)[1].split(END, 1)[0].strip("\n") + "\n"
-
-
 def accept(document: dict[str, Any], readme: Path = README, accepted: Path = ACCEPTED) -> None:
     """Makes a run the one that README shows.
 
@@ -87,10 +83,6 @@ def accept(document: dict[str, Any], readme: Path = README, accepted: Path = ACC
             )
     if not document["axes"]:
         raise GroundStationError("limits: nothing was measured: not accepted")
-    text = readme.read_text()
-    if table_in(text) is None:
-        raise GroundStationError(f"{readme}: the lines {BEGIN!r} and {END!r} are not in it")
     kept = {name: value for name, value in document.items() if name != "trials"}
-    before, rest = text.split(BEGIN, 1)
+    BLOCK.write(readme, render(kept))
     write_json(accepted, kept)
-    write_text(readme, f"{before}{BEGIN}\n{render(kept)}{END}{rest.split(END, 1)[1]}")

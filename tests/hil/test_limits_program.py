@@ -11,7 +11,7 @@ import limits_table
 import pytest
 from limits_axes import AXES, Conditions, chosen
 from limits_stand import Flight, Measured, TrialError
-from limits_table import BEGIN, END, accept, render, table_in
+from limits_table import BLOCK, accept, render
 
 from ground_station.errors import GroundStationError
 from pi_firmware.settings import Settings
@@ -98,7 +98,7 @@ def test_a_trial_that_fails_is_no_limit_and_the_other_axes_go_on(tmp_path: Path)
 
 def readme(folder: Path, table: str = "old\n") -> Path:
     path = folder / "README.md"
-    path.write_text(f"before\n{BEGIN}\n{table}{END}\nafter\n")
+    path.write_text(f"before\n{BLOCK.begin}\n{table}{BLOCK.end}\nafter\n")
     return path
 
 
@@ -112,8 +112,8 @@ def test_an_accepted_run_is_the_table_between_the_markers(tmp_path: Path) -> Non
     run = measured(tmp_path / "limits.json")
     accept(run, path, kept)
     text = path.read_text()
-    assert text.startswith("before\n") and text.endswith(f"{END}\nafter\n")
-    assert table_in(text) == render(document(kept)) == render(run)
+    assert text.startswith("before\n") and text.endswith(f"{BLOCK.end}\nafter\n")
+    assert BLOCK.read(text) == render(document(kept)) == render(run)
     assert "trials" not in document(kept) and kept.stat().st_size < 8000
     accept(run, path, kept)
     assert path.read_text() == text
@@ -134,13 +134,13 @@ def test_a_run_that_was_disturbed_or_cut_short_is_not_accepted(tmp_path: Path) -
 def test_a_readme_without_the_markers_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "README.md"
     path.write_text("no table\n")
-    with pytest.raises(GroundStationError, match="are not in it"):
+    with pytest.raises(GroundStationError, match="has no line"):
         accept(measured(tmp_path / "limits.json"), path, tmp_path / "accepted.json")
     assert path.read_text() == "no table\n" and not (tmp_path / "accepted.json").exists()
 
 
 def test_the_table_in_the_readme_is_that_of_the_accepted_run() -> None:
-    table = table_in(limits_table.README.read_text())
+    table = BLOCK.read(limits_table.README.read_text())
     assert (table is not None) == limits_table.ACCEPTED.exists()
     if table is not None:
         assert table == render(document(limits_table.ACCEPTED))
