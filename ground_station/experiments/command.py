@@ -10,6 +10,7 @@ examples:
   blimp experiments                       all of them; stopped and started again it goes on
   blimp experiments illumination motion   some of them
   blimp experiments --quick               one seed, short flights, small maps: to see that all works
+  blimp experiments illumination redkitchen --features wren mine    your features beside ours
   blimp experiments --list
 
 What is flown stands in experiments.toml beside this command's module; --file takes another. Flights
@@ -25,6 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--list", action="store_true", help="say which there are, and nothing else")
     add("--file", type=Path, metavar="TOML", help="experiments (default: the shipped)")
     add("--quick", action="store_true", help="one seed, short flights, maps of few images")
+    add("--features", nargs="+", metavar="NAME",
+        help="extractors or models for the maps (default: as each row says)")  # fmt: skip
     add("--jobs", type=int, default=0, metavar="N", help="side by side (0: one a core)")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR",
         help="folder of real video, redkitchen/ (../shared/data)")  # fmt: skip
@@ -66,6 +69,10 @@ def run(args: argparse.Namespace) -> int:
     if not 0 <= args.jobs <= 256:
         raise InputError(f"--jobs is {args.jobs}; allowed: 0 to 256")
     declared = declaration.load(args.file or declaration.SHIPPED, args.names or None)
+    if args.features:
+        if args.accept:
+            raise InputError("--accept is for the rows as they are declared, without --features")
+        declared = declaration.with_features(declared, args.features)
     if args.list:
         for experiment in declared.experiments:
             print(f"{experiment.name:16} {experiment.title} ({len(experiment.cases)} rows)")

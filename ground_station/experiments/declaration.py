@@ -245,6 +245,32 @@ def without_missing(declared: Declaration, data: Path) -> tuple[Declaration, lis
     return dataclasses.replace(declared, experiments=kept), lines
 
 
+def with_features(declared: Declaration, names: list[str]) -> Declaration:
+    """Each row with each of these features in place of its own; what only they told apart is one.
+
+    Claims and the thesis's figures are of the features that the file names, and are left out.
+    """
+
+    def row(case: Case, features: str, **said: Any) -> Case:
+        map_ = dataclasses.replace(case.map, features=features)
+        return dataclasses.replace(case, map=map_, thesis=Figures(), **said)
+
+    experiments = []
+    for experiment in declared.experiments:
+        cases = experiment.cases
+        alike = [row(case, "", name="", title="") for case in cases]
+        if all(one == alike[0] for one in alike):
+            rows = [row(cases[0], name, name=name, title=name) for name in names]
+        else:
+            rows = [
+                row(case, name, name=f"{case.name}-{name}", title=f"{case.title}, {name}")
+                for case in cases
+                for name in names
+            ]
+        experiments.append(dataclasses.replace(experiment, cases=rows))
+    return dataclasses.replace(declared, experiments=experiments, claims=[])
+
+
 def _experiment(name: str, table: Any, default: Table, where: str) -> Experiment:
     where = f"{where}: experiment '{name}'"
     if not isinstance(table, Mapping):

@@ -132,3 +132,27 @@ def test_settings_are_changed_through_the_checks_of_their_file():
         declaration.changed(settings, {"gate": {"min_entropy_bits": 9}}, "here")
     with pytest.raises(ConfigError, match="unknown key 'gait'"):
         declaration.changed(settings, {"gait": {}}, "here")
+
+
+def test_other_features_take_the_place_of_each_rows_own(tmp_path):
+    text = (
+        SMALL
+        + """
+[experiment.descriptor.case.sift]
+title = "RootSIFT"
+[experiment.descriptor.case.orb]
+map.features = "orb"
+"""
+    )
+    declared = declaration.with_features(load(tmp_path, text), ["wren", "orb"])
+    light, descriptor = declared.experiments
+    assert [(case.name, case.title, case.map.features) for case in light.cases] == [
+        ("noon-wren", "noon, wren", "wren"),
+        ("noon-orb", "noon, orb", "orb"),
+        ("sunset-wren", "at sunset, wren", "wren"),
+        ("sunset-orb", "at sunset, orb", "orb"),
+    ]
+    assert light.cases[0].thesis.position_m is None and not declared.claims
+    assert [(case.title, case.map.features) for case in descriptor.cases] == [
+        ("wren", "wren"), ("orb", "orb"),
+    ]  # fmt: skip

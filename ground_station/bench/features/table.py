@@ -14,8 +14,8 @@ _NONE = "-"
 def table(rows: dict[str, dict[str, Any]]) -> list[str]:
     """Lines of the table: one row an extractor, a column only where some extractor has a figure.
 
-    A row is what `command.run` collects: `dimension`, and where they were measured `homographies`,
-    `poses`, `flights` and `time`.
+    A row is what `command.run` collects: `dimension`, and where they were measured `homographies`
+    and `time`.
     """
     scenes = dict.fromkeys(
         scene for row in rows.values() for scene in row.get("homographies", {}).get("scenes", {})
@@ -27,22 +27,13 @@ def table(rows: dict[str, dict[str, Any]]) -> list[str]:
         ("correct at 3 px", lambda row: _percent(row, "homographies", "accuracy")),
         *((scene, _scene(scene)) for scene in scenes),
         ("homography 1, 3, 5 px", _homography),
-        ("kitchen, median", lambda row: _length(row, "poses", "median_m", 1e3, "mm")),
-        ("found", lambda row: _found(row, "poses")),
-        ("sunset, RMSE", lambda row: _length(row, "flights", "rmse_m", 1e2, "cm")),
-        ("followed", lambda row: _found(row, "flights")),
         ("ms", lambda row: _number(row, "time", "ms", ".1f")),
         ("of RootSIFT's", lambda row: _number(row, "time", "ratio", ".2f")),
     ]
     lines = [[title for title, _ in head]]
     lines += [[cell(row) for _, cell in head] for row in rows.values()]
     used = [k for k in range(len(head)) if any(line[k] != _NONE for line in lines[1:])]
-    result = columns([[line[k] for k in used] for line in lines])
-    for row in rows.values():
-        for kind in ("homographies", "poses", "flights"):
-            if reason := row.get(kind, {}).get("failed"):
-                result.append(f"{row['name']}, {kind}: {reason}")
-    return result
+    return columns([[line[k] for k in used] for line in lines])
 
 
 def _value(row: dict[str, Any], kind: str, key: str) -> float | None:
@@ -67,16 +58,6 @@ def _scene(scene: str) -> Callable[[dict[str, Any]], str]:
 def _homography(row: dict[str, Any]) -> str:
     shares = row.get("homographies", {}).get("homography", {})
     return ", ".join(f"{100 * share:.0f}" for share in shares.values()) + " %" if shares else _NONE
-
-
-def _length(row: dict[str, Any], kind: str, key: str, scale: float, unit: str) -> str:
-    value = _value(row, kind, key)
-    return _NONE if value is None else f"{scale * value:.2f} {unit}"
-
-
-def _found(row: dict[str, Any], kind: str) -> str:
-    figures = row.get(kind, {})
-    return f"{figures['localized']} of {figures['judged']}" if "judged" in figures else _NONE
 
 
 def _number(row: dict[str, Any], kind: str, key: str, form: str) -> str:
