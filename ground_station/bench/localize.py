@@ -36,6 +36,7 @@ def add_arguments(localize: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `InputError` for a value out of range."""
     from ground_station.bench import steps
+    from ground_station.bench.machine import machine
     from ground_station.errors import InputError
     from ground_station.files import write_json
     from ground_station.localization import growth
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if not recording.is_file():
         raise InputError(f"{recording}: the map's flight is needed to measure whole frames")
     result: dict[str, Any] = {
-        "machine": steps.machine(),
+        "machine": machine(),
         "seed": args.seed,
         "repetitions": args.repetitions,
         "association": steps.association(args.seed, args.repetitions),

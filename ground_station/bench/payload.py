@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from ground_station.bench import figures
-    from ground_station.bench.steps import machine
+    from ground_station.bench.machine import machine
     from ground_station.errors import InputError
     from ground_station.files import write_json
 

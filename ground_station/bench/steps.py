@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,14 +53,6 @@ def medians_ms(repetitions: int, *works: Callable[[], object]) -> list[float]:
             work()
             row[k] = 1e3 * (time.perf_counter() - begin)
     return [float(median) for median in np.median(spans[1:], axis=0)]
-
-
-def machine() -> dict[str, Any]:
-    """The cores this process may use, and the threads BLAS was given."""
-    return {
-        "cores": len(os.sched_getaffinity(0)),
-        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
-    }
 
 
 def association(seed: int, repetitions: int) -> dict[str, Any]:

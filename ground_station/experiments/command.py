@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
     from dataclasses import replace
 
-    from ground_station.bench.steps import machine
+    from ground_station.bench.machine import machine
     from ground_station.errors import InputError
     from ground_station.experiments import (
         claims,

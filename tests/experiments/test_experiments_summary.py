@@ -8,7 +8,7 @@ import math
 import kept_runs
 import pytest
 
-from ground_station.bench.steps import machine
+from ground_station.bench.machine import machine
 from ground_station.experiments import declaration, report, summary, tables
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store

@@ -30,7 +30,7 @@ from soaking.arguments import MOST_HOURS, Parser, number, on_interrupt
 from soaking.judging import rows as slope_rows
 from soaking.measures import CLOCK, LATENCY, MEMORY, Measure, Windows
 from soaking.processes import Watch
-from soaking.table import Row, show
+from soaking.table import Row
 from soaking.trend import trend
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "stream"))
@@ -253,9 +253,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.again is not None:
             table, drawn = report.again(options.again)
-            show(table)
             print(drawn)
-            return 0 if all(row.holds for row in table) else 1
+            return report.conclude(table, (), 0.0, {}, None)
         return run(options)
     except GroundStationError as error:
         print(f"soak: {error}", file=sys.stderr)
@@ -268,12 +267,8 @@ def run(options: Any) -> int:
     fly(flown, options, on_interrupt())
     table = rows(flown, options)
     print(f"\n{flown.flown_s / 3600:.3g} of {options.hours:g} hours at {RATE_HZ:g} Hz")
-    show(table)
-    if options.out is not None:
-        told = about(options, flown)
-        report.write(options.out, flown.measures, settled_s(options), told, table)
-        print(report.draw(options.out, flown.measures, settled_s(options), told["title"]))
-    return 0 if all(row.holds for row in table) else 1
+    settled, told = settled_s(options), about(options, flown)
+    return report.conclude(table, flown.measures, settled, told, options.out)
 
 
 if __name__ == "__main__":

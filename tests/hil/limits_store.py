@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import platform
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +13,11 @@ from limits_axes import Axis, Level
 from limits_search import BORNE, Found
 from limits_stand import Flight, Measured
 
+from ground_station.bench.machine import machine
 from ground_station.errors import GroundStationError
 from ground_station.files import write_json
 
 SCHEMA = 1
-
-
-def machine() -> dict[str, Any]:
-    """The machine that measures, before it does: cores, model, load (proc(5))."""
-    model = ""
-    try:
-        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-        model = found.group(1).strip() if found else ""
-    except OSError:
-        pass
-    return {
-        "cores": len(os.sched_getaffinity(0)),
-        "model": model or platform.machine(),
-        "load_before": round(os.getloadavg()[0], 2),
-        "date": datetime.now(UTC).date().isoformat(),
-    }
 
 
 class Store:

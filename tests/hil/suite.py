@@ -228,6 +228,8 @@ def _write(args: argparse.Namespace, done: list[Any], began: str, payload: str) 
 
 def table(done: Sequence[Any]) -> str:
     """One line a case, with the figures that a pilot looks at."""
+    from ground_station.presentation.text import columns
+
     head = ("case", "result", "coverage", "TRACKING", "position", "lost", "p50", "recovery", "took")
     names = ("coverage", "tracking", "position_rmse_m", "lost", "latency_p50_ms", "recovery_s")
     lines = [head]
@@ -236,11 +238,7 @@ def table(done: Sequence[Any]) -> str:
         found = [_figure(figures, name) for name in names]
         result = "skipped" if case.skipped else "ok" if case.passed else "FAILED"
         lines.append((case.name, result, *found, f"{case.seconds:.0f} s"))
-    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
+    return "\n".join(columns(lines))
 
 
 def _figure(figures: dict[str, str], name: str) -> str:

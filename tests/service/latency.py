@@ -21,7 +21,9 @@ from pathlib import Path
 
 import numpy as np
 from intake_stand import eventually
-from standing import Estimates, Process, Row, Service, Viewer, conclude, process
+from soaking.report import conclude
+from soaking.table import Row
+from standing import Estimates, Process, Service, Viewer, process
 
 VIEWERS = 2
 MEDIAN_MS, P99_MS = 60.0, 150.0
@@ -221,7 +223,7 @@ def main() -> int:
         f"{measured.seconds:.0f} s, {arguments.payloads} payload(s) at {arguments.rate_hz:g} Hz,"
         f" two viewers{beside}"
     )
-    return conclude(table, asdict(measured), arguments.out)
+    return conclude(table, (), 0.0, asdict(measured), arguments.out)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from soaking.arguments import MOST_HOURS, Parser, number, on_interrupt
 from soaking.judging import rows as slope_rows
 from soaking.measures import CLOCK, LATENCY, MEMORY, Measure, Window, Windows
 from soaking.processes import Watch
-from soaking.table import Row, show
+from soaking.table import Row
 from standing import Service, Viewer
 
 from ground_station.errors import GroundStationError
@@ -342,9 +342,9 @@ def about(flown: Flown, options: Any) -> dict[str, Any]:
     }
 
 
-def keep(flown: Flown, options: Any, table: Sequence[Row] = ()) -> None:
+def keep(flown: Flown, options: Any) -> None:
     """Writes what there is."""
-    report.write(options.out, flown.measures, settled_s(options), about(flown, options), table)
+    report.write(options.out, flown.measures, settled_s(options), about(flown, options))
 
 
 def parser() -> Parser:
@@ -365,15 +365,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         fly(options, flown, on_interrupt())
         table = rows(flown, options)
         print(f"\n{flown.flown_s / 3600:.3g} of {options.hours:g} hours")
-        show(table)
-        if options.out is not None:
-            keep(flown, options, table)
-            title = about(flown, options)["title"]
-            print(report.draw(options.out, flown.measures, settled_s(options), title))
+        settled, told = settled_s(options), about(flown, options)
+        return report.conclude(table, flown.measures, settled, told, options.out)
     except GroundStationError as error:
         print(f"soak: {error}", file=sys.stderr)
         return 2
-    return 0 if all(row.holds for row in table) else 1
 
 
 if __name__ == "__main__":

@@ -22,16 +22,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import intake_stand  # noqa: F401 - it says where the other rooms' helpers are
 import numpy as np
 from localizing_stand import LIMIT_S, PAYLOAD, SAMPLE, localizer, station, until
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "faults"))
-
 from soaking import report
 from soaking.arguments import MOST_HOURS, Parser, number, on_interrupt
 from soaking.judging import rows as slope_rows
 from soaking.processes import Watch
-from soaking.table import Row, show
+from soaking.table import Row
 
 from ground_station.errors import GroundStationError
 from ground_station.localization.estimate import State
@@ -142,17 +140,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, flown = parser.parse_args(arguments), Flown()
     try:
         fly(options, flown, on_interrupt())
-        table = rows(flown, options)
-        show(table)
-        if options.out is not None:
-            title = f"Soak: one stream of {options.hours:g} h, stepped; simulated flight"
-            measures, settled = flown.watch.measures, settled_s(options)
-            report.write(options.out, measures, settled, {"title": title}, table)
-            print(report.draw(options.out, measures, settled, title))
+        title = f"Soak: one stream of {options.hours:g} h, stepped; simulated flight"
+        return report.conclude(
+            rows(flown, options),
+            flown.watch.measures,
+            settled_s(options),
+            {"title": title},
+            options.out,
+        )
     except GroundStationError as error:
         print(f"soak: {error}", file=sys.stderr)
         return 2
-    return 0 if all(row.holds for row in table) else 1
 
 
 if __name__ == "__main__":

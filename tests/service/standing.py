@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -360,25 +360,3 @@ class Estimates:
         if note.capture_ns is not None and note.position_m is not None:
             latency_ms = 1e-6 * (note.done_ns - note.capture_ns)
             self.latency_ms.setdefault(payload_id, []).append(latency_ms)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a table: a figure, its bound in words, and whether it holds."""
-
-    name: str
-    value: str
-    bound: str = ""
-    holds: bool = True
-
-
-def conclude(rows: list[Row], measured: dict[str, Any], out: Path | None) -> int:
-    """Prints a table, writes it with what was measured; the exit status, 1: a bound is missed."""
-    for row in rows:
-        verdict = ("ok" if row.holds else "MISSED") if row.bound else ""
-        print(f"{row.name:34} {row.value:>30}  {row.bound:20} {verdict}")
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        document = measured | {"rows": [asdict(row) for row in rows]}
-        out.write_text(json.dumps(document, indent=1) + "\n")
-    return 0 if all(row.holds for row in rows) else 1

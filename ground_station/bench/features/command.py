@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     What has no data is left out with a line that names it; asked for by `--only`, it is an error.
     """
     from ground_station.bench.features.table import table
-    from ground_station.bench.steps import machine
+    from ground_station.bench.machine import machine
     from ground_station.errors import InputError
     from ground_station.files import write_json
 

@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
 def _campus(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
+    from ground_station.bench.machine import machine
     from ground_station.bench.maps import scale
-    from ground_station.bench.steps import machine
     from ground_station.files import write_json
     from ground_station.mapping.settings import load_settings
 
@@ -75,8 +75,8 @@ def _campus(args: argparse.Namespace) -> int:
 
 def _study(args: argparse.Namespace) -> int:
     """Builds every set with every feature and seed; 1 where a map is folded and did not say so."""
+    from ground_station.bench.machine import machine
     from ground_station.bench.maps import study
-    from ground_station.bench.steps import machine
     from ground_station.errors import InputError
     from ground_station.files import write_json
     from ground_station.mapping.settings import load_settings

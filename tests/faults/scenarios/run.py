@@ -24,6 +24,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from ground_station.files import write_json
 from scenarios import disk
 from scenarios.camera import Cameras
 from scenarios.judge import INVARIANTS, Verdict
@@ -219,9 +220,7 @@ def _write(
         "verdicts": [dataclasses.asdict(verdict) for verdict in verdicts],
         "scenarios": [json.loads(as_json(scenario)) for scenario in scenarios],
     }
-    part = out.with_name(out.name + ".part")
-    part.write_text(json.dumps(document, indent=1) + "\n")
-    part.replace(out)
+    write_json(out, document)
 
 
 if __name__ == "__main__":

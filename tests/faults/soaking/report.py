@@ -12,7 +12,7 @@ from ground_station.errors import GroundStationError
 from ground_station.files import write_json
 from soaking.judging import rows as slope_rows
 from soaking.measures import Measure, from_document
-from soaking.table import Row
+from soaking.table import Row, show
 
 
 def write(
@@ -31,6 +31,22 @@ def write(
         "measures": [measure.document() for measure in measures],
     }
     write_json(out, document)
+
+
+def conclude(
+    rows: Sequence[Row],
+    measures: Sequence[Measure],
+    settled_s: float,
+    about: Mapping[str, Any],
+    out: Path | None,
+) -> int:
+    """Prints the table, writes and draws what was measured; 1 when a bound is missed, else 0."""
+    show(rows)
+    if out is not None:
+        write(out, measures, settled_s, about, rows)
+        if measures:
+            print(draw(out, measures, settled_s, about["title"]))
+    return 0 if all(row.holds for row in rows) else 1
 
 
 def draw(out: Path, measures: Sequence[Measure], settled_s: float, title: str) -> Path:

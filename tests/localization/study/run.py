@@ -27,7 +27,7 @@ from study.feeding import feed, feed_paced
 from study.growing import grown
 from study.row import Line, Row, Study
 
-from ground_station.bench.steps import machine
+from ground_station.bench.machine import machine
 from ground_station.errors import GroundStationError
 from ground_station.files import write_json
 from ground_station.localization.settings import LocalizerSettings, load_preset
