@@ -1,19 +1,16 @@
-"""Rows about a flight that goes on: rate, accuracy, shutter, covariance, the red kitchen."""
+"""Rows about a flight that goes on: accuracy, shutter, covariance."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from study.feeding import Flight, Run, close, feed, load_flight, make_localizer
+from study.feeding import Flight, Run, close, feed, make_localizer
 from study.metrics import (
     consistency,
     largest,
@@ -27,40 +24,11 @@ from study.plain import PlainLocalizer
 from study.row import Line, Row, Study, seeds, start_from_truth, thesis, ungated
 
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
-from ground_station.map.store import Map, load
+from ground_station.map.store import Map
 from ground_station.recording.frames import Frame
-from ground_station.recording.open import open_input
 
 PLAIN_STEP = 5
-KITCHEN = slice(500, 1000)
-_TURNS = 3
-
-
-def throughput(study: Study) -> Row:
-    """From the file to poses, decoding included, as fast as it can; the median of three turns."""
-    flight_about = load_flight(study.demo, 1)
-    turns: list[dict[str, float]] = []
-    for _ in range(_TURNS):
-        source = open_input(study.demo)
-        assert source.camera is not None
-        localizer = make_localizer(study.map_, source.camera, study.settings)
-        begin = time.perf_counter()
-        run = feed(localizer, islice(source, study.limit))
-        close(localizer)
-        took_ms = 1e3 * np.diff([begin, *run.done_s])
-        p50, p99 = np.percentile(took_ms, [50, 99])
-        rate = 1e3 / took_ms.mean()
-        turns.append({"frames": len(took_ms), "rate_hz": rate, "p50_ms": p50, "p99_ms": p99})
-    rate = float(np.median([turn["rate_hz"] for turn in turns]))
-    p99 = float(np.median([turn["p99_ms"] for turn in turns]))
-    p50 = float(np.median([turn["p50_ms"] for turn in turns]))
-    cores = len(os.sched_getaffinity(0))
-    figure = f"{rate:.1f} frames/s; {p50:.1f} ms median, {p99:.1f} ms p99 on {cores} cores"
-    bound = ">= 30 frames/s, p99 <= 50 ms"
-    line = Line("throughput", bound, figure, rate >= 30 and p99 <= 50, flight_about.about)
-    return Row([line], {"turns": turns, "cores": cores})
 
 
 def accuracy(run: Run, flight: Flight) -> dict[str, Any]:
@@ -250,85 +218,3 @@ def _line_of(
         f"error/sigma {axes}"
     )
     return Line(what, bound, figure, bool(low <= found["inside_95"] <= high), about)
-
-
-def kitchen(study: Study) -> Row:
-    """The red kitchen's query pass as a 30 Hz stream without a first pose."""
-    folder = study.kitchen
-    flight = load_flight(f"{folder / 'frames'}@{folder / 'camera.toml'}", None, "500:1000")
-    map_ = load(study.kitchen_map)
-    localizer = make_localizer(map_, flight.camera, study.settings)
-    run = study.feed(localizer, flight.frames)
-    close(localizer)
-    truth = read_tum(Path(folder) / "pseudo_groundtruth.txt")
-    judged = [
-        (k, truth.nearest(frame.time_ns))
-        for k, frame in enumerate(run.frames)
-        if abs(int(truth.time_ns[truth.nearest(frame.time_ns)]) - frame.time_ns) < 5_000_000
-    ]
-    ours = np.array([k for k, _ in judged], np.intp)
-    metres, degrees = pose_errors(run.wTc[ours], truth.wTc[[j for _, j in judged]])
-    index = np.array([frame.index for frame in run.frames])
-    tracking = run.says(State.TRACKING)
-    first = int(index[tracking.argmax()]) if tracking.any() else None
-    after = index[ours] >= 516
-    within = (metres <= 0.02) & (degrees <= 1.0)
-    # A frame that was dropped is not among the run's, and has failed.
-    wanted = sum(
-        1 for frame in flight.frames if frame.index >= 516 and _is_near(truth.time_ns, frame)
-    )
-    share = float(within[after].sum() / max(wanted, 1))
-    median_m = float(np.nanmedian(np.where(after, metres, np.nan)))
-    median_deg = float(np.nanmedian(np.where(after, degrees, np.nan)))
-    met = (
-        first is not None and first <= 515 and share >= 0.98
-        and median_m <= 0.006 and median_deg <= 0.25
-    )  # fmt: skip
-    said = tracking[ours]
-    data: dict[str, Any] = {
-        "first_tracking_frame": first,
-        "judged": wanted,
-        "share_2cm_1deg": share,
-        "median_m": median_m,
-        "median_deg": median_deg,
-        "rmse_m": rmse(metres[after]),
-        "max_tracking_m": largest(metres[said]),
-        "max_tracking_deg": largest(degrees[said]),
-        "missed": [
-            [int(i), float(m), float(d), run.estimates[k].state.value, run.estimates[k].reason]
-            for i, m, d, k, ok in zip(index[ours], metres, degrees, ours, within, strict=True)
-            if i >= 516 and not ok
-        ],
-        "dropped": run.dropped,
-        "states": {state.value: int(run.says(state).sum()) for state in State},
-        "frame_ms": {"median": float(np.median(run.took_ms)), "mean": float(np.mean(run.took_ms))},
-    }
-    figure = (
-        f"TRACKING at {first}; {share:.1%} of {wanted} within 2 cm and 1 deg; "
-        f"median {1e3 * median_m:.1f} mm, {median_deg:.3f} deg"
-    )
-    bound = "TRACKING by 515; >= 98 %; <= 6 mm, <= 0.25 deg"
-    mine = [k for k in ours if index[k] >= 516]
-    plain, took = fly_plainly(map_, flight.camera, [run.frames[k] for k in mine])
-    m, deg = pose_errors(plain, truth.wTc[[j for k, j in judged if index[k] >= 516]])
-    data["plain"] = {
-        "share_2cm_1deg": float(((m <= 0.02) & (deg <= 1.0)).sum() / max(wanted, 1)),
-        "median_m": float(np.nanmedian(m)),
-        "median_deg": float(np.nanmedian(deg)),
-        "frame_ms": {"median": float(np.median(took)), "mean": float(np.mean(took))},
-    }
-    beside = (
-        f"{data['plain']['share_2cm_1deg']:.1%}; median {1e3 * np.nanmedian(m):.1f} mm, "
-        f"{np.nanmedian(deg):.3f} deg; {np.mean(took):.0f} ms"
-    )
-    return Row(
-        [
-            Line("red kitchen, query pass", bound, figure, met, "real"),
-            Line("  SIFT, all landmarks, RANSAC (the same map)", "", beside, None, "real"),
-        ],
-        data,
-    )
-
-
-def _is_near(times_ns: np.ndarray, frame: Any) -> bool:
-    return bool(np.abs(times_ns - frame.time_ns).min() < 5_000_000)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from study.feeding import Feed, Flight, Run, close, feed, load_flight, make_localizer
@@ -47,8 +46,6 @@ class Study:
     fast: Sequence[str]
     flights: Sequence[str]
     others: Sequence[str]
-    kitchen: Path
-    kitchen_map: Path
     feed: Feed = feed
     limit: int | None = None
     jumps: int = 200

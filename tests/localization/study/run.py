@@ -6,6 +6,7 @@
 
 Flights are recordings of `blimp simulate`, which hold their truth and seed; other buildings may
 also be `FOLDER@CAMERA.toml`. Each row prints its bound, its figure and the seeds of its flights.
+What it costs is in `blimp bench localize`, the red kitchen in `blimp experiments redkitchen`.
 """
 
 from __future__ import annotations
@@ -36,21 +37,17 @@ from pi_firmware.wire import config
 from pi_firmware.wire.errors import BlimpError
 
 ROWS = {
-    "throughput": accuracy.throughput,
     "demo": accuracy.demo,
     "fast": accuracy.fast,
     "kidnapping": recovering.kidnapping,
     "blackout": recovering.blackout,
     "others": recovering.other_buildings,
     "covariance": accuracy.covariance,
-    "kitchen": accuracy.kitchen,
     "single": recovering.single_frames,
 }
 NEEDS = {"fast": "fast", "kidnapping": "flights", "blackout": "flights", "covariance": "flights",
          "single": "flights", "others": "others"}  # fmt: skip
 """Rows that cannot be run without flights of the user's."""
-
-_DATA = Path(__file__).resolve().parents[3] / "../shared/data/redkitchen"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -65,9 +62,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--flights", nargs="*", default=[],
                    help="flights to jump between and to judge the covariance on")  # fmt: skip
     p.add_argument("--others", nargs="*", default=[], help="flights of other buildings")
-    p.add_argument("--kitchen", type=Path, default=_DATA, help="folder of the red kitchen")
-    p.add_argument("--kitchen-map", type=Path, default=Path("out/rk"),
-                   help="its map: built of frames 0:500:5, registered by --trajectory")  # fmt: skip
     p.add_argument("--paced", action="store_true",
                    help="give each frame at its time; else as fast as they are taken")  # fmt: skip
     p.add_argument("--settings", metavar="FILE.toml", help="instead of the preset default")
@@ -106,8 +100,6 @@ def study_of(args: argparse.Namespace) -> Study:
         fast=args.fast,
         flights=args.flights,
         others=args.others,
-        kitchen=args.kitchen,
-        kitchen_map=args.kitchen_map,
         feed=feed_paced if args.paced else feed,
         limit=args.limit,
         jumps=args.jumps,
