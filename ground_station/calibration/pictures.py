@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
-from ground_station.presentation.theme import Theme, themed
+from ground_station.presentation.theme import Theme, sheet, themed
 
 WIDTH_IN = 6.6
 _SMALL = 8.5
@@ -56,8 +55,7 @@ def residuals(result: Result, theme: Theme) -> Figure:
 
 def per_view(result: Result, theme: Theme) -> Figure:
     """The RMS of each view, in order of the inputs, and the median."""
-    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained", facecolor=theme.paper)
-    FigureCanvasAgg(figure)
+    figure = sheet((WIDTH_IN, 2.6), theme)
     axes = figure.subplots()
     themed(axes, theme, _SMALL)
     order = np.lexsort(
@@ -77,9 +75,7 @@ def per_view(result: Result, theme: Theme) -> Figure:
 
 def _picture(result: Result, theme: Theme) -> tuple[Figure, Axes]:
     w, h = result.size_px
-    figure = Figure(figsize=(WIDTH_IN, 0.5 + 6.0 * h / w), layout="constrained")
-    figure.set_facecolor(theme.paper)
-    FigureCanvasAgg(figure)
+    figure = sheet((WIDTH_IN, 0.5 + 6.0 * h / w), theme)
     axes = figure.subplots()
     themed(axes, theme, _SMALL)
     axes.set_aspect("equal")

@@ -142,15 +142,7 @@ def synchronize(
             f"no estimated pose is within {max_diff_s:g} s of a true one "
             f"(estimate: {_span(estimate)}; truth: {_span(truth)})"
         )
-    return _select(estimate, i), _select(truth, j)
-
-
-def _select(trajectory: Trajectory, indices: Indices) -> Trajectory:
-    return Trajectory(
-        trajectory.time_ns[indices],
-        trajectory.position_m[indices],
-        trajectory.quaternion_xyzw[indices],
-    )
+    return estimate[i], truth[j]
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
@@ -18,7 +17,7 @@ from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend, themed
+from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend, sheet, themed
 
 Array = npt.NDArray[np.float64]
 
@@ -37,10 +36,10 @@ def trajectory_plot(
     if floorplan is not None:
         show_floorplan(axes, floorplan, theme)
     if truth is not None and len(truth):
-        x, y = _broken(truth)
+        x, y = broken_path(truth)
         axes.plot(x, y, color=theme.truth, linewidth=2.6, alpha=0.55, label="true path")
     if estimate is not None and len(estimate):
-        x, y = _broken(estimate)
+        x, y = broken_path(estimate)
         axes.plot(x, y, color=theme.estimate, linewidth=1.1, label="estimated path")
         axes.plot(
             *estimate.position_m[0, :2], "o", color=theme.estimate, markersize=6, label="first pose"
@@ -77,7 +76,7 @@ def error_plot(
         (lower, np.asarray(rotation_deg), rotation_limit_deg, "rotation error, °", theme.second),
     )
     for axes, values, limit, label, colour in rows:
-        axes.plot(*_broken_series(time_s, values), color=colour, linewidth=1.1)
+        axes.plot(*broken(time_s, values), color=colour, linewidth=1.1)
         axes.set_ylabel(label)
         if limit is not None:
             axes.axhline(
@@ -114,21 +113,25 @@ def latency_plot(
 def evaluation(result: Evaluation, align: str = "none") -> Figure:
     """Path, position error and rotation error of one alignment on one sheet."""
     errors = result.errors[align]
-    figure = Figure(figsize=(8.0, 9.6), layout="constrained", facecolor=LIGHT.paper)
-    FigureCanvasAgg(figure)
+    figure = sheet((8.0, 9.6), LIGHT)
     path, upper, lower = figure.subplots(3, 1, height_ratios=[3, 1, 1])
     aligned = _aligned(result.estimate, errors.alignment)
     seconds = (result.estimate.time_ns - result.estimate.time_ns[0]) / 1e9
-    path.plot(*_broken(result.truth), color=LIGHT.truth, linewidth=2.6, alpha=0.55, label="truth")
     path.plot(
-        *_broken(aligned), color=LIGHT.estimate, linewidth=1.1, label=f"estimate, aligned: {align}"
+        *broken_path(result.truth), color=LIGHT.truth, linewidth=2.6, alpha=0.55, label="truth"
+    )
+    path.plot(
+        *broken_path(aligned),
+        color=LIGHT.estimate,
+        linewidth=1.1,
+        label=f"estimate, aligned: {align}",
     )
     path.set_aspect("equal", adjustable="datalim")
     path.set_xlabel("x, m")
     path.set_ylabel("y, m")
-    upper.plot(*_broken_series(seconds, errors.position_m * 100), color=LIGHT.estimate, lw=1.1)
+    upper.plot(*broken(seconds, errors.position_m * 100), color=LIGHT.estimate, lw=1.1)
     upper.set_ylabel("position, cm")
-    lower.plot(*_broken_series(seconds, errors.rotation_deg), color=LIGHT.second, lw=1.1)
+    lower.plot(*broken(seconds, errors.rotation_deg), color=LIGHT.second, lw=1.1)
     lower.set_ylabel("rotation, °")
     lower.set_xlabel("time, s")
     for axes in (path, upper, lower):
@@ -170,14 +173,12 @@ def _aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
     )
 
 
-def _broken(trajectory: Trajectory) -> tuple[Array, Array]:
-    """x and y with a NaN in every pause, which the line then leaves out."""
-    x, y = trajectory.position_m[:, 0], trajectory.position_m[:, 1]
-    gaps = np.flatnonzero(np.diff(trajectory.time_ns) > GAP_S * 1e9) + 1
-    return np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
+def broken(time_s: npt.ArrayLike, *rows: npt.ArrayLike) -> list[Array]:
+    """Times and rows of values (N,), each with a NaN in every pause, which the line leaves out."""
+    gaps = np.flatnonzero(np.diff(np.asarray(time_s, np.float64)) > GAP_S) + 1
+    return [np.insert(np.asarray(row, np.float64), gaps, np.nan) for row in (time_s, *rows)]
 
 
-def _broken_series(time_s: npt.ArrayLike, values: npt.ArrayLike) -> tuple[Array, Array]:
-    t, v = np.asarray(time_s, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    gaps = np.flatnonzero(np.diff(t) > GAP_S) + 1
-    return np.insert(t, gaps, np.nan), np.insert(v, gaps, np.nan)
+def broken_path(trajectory: Trajectory) -> list[Array]:
+    """x and y with a NaN in every pause."""
+    return broken(trajectory.time_ns / 1e9, *trajectory.position_m[:, :2].T)[1:]

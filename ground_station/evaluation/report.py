@@ -17,10 +17,11 @@ import numpy.typing as npt
 from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
+from ground_station.evaluation.figures import Row
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import load_floorplan
 from ground_station.presentation.pages import Shown, data_uri, shown, write_page
-from ground_station.presentation.text import columns
+from ground_station.presentation.text import columns, flat
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -52,24 +53,6 @@ _LEGEND = [
 
 
 @dataclass(frozen=True)
-class Bound:
-    """A promise and what was measured: `value` must be `at_most` (or else at least) `limit`."""
-
-    name: str
-    value: float | None
-    limit: float
-    unit: str
-    at_most: bool = True
-
-    @property
-    def met(self) -> bool:
-        """False when nothing was measured, and for a NaN."""
-        if self.value is None:
-            return False
-        return self.value <= self.limit if self.at_most else self.value >= self.limit
-
-
-@dataclass(frozen=True)
 class MatchPicture:
     """A frame with its matches drawn (`draw_matches`), (H, W, 3) RGB uint8."""
 
@@ -92,7 +75,7 @@ class ReportData:
     title: str
     verdict: list[str]
     simulated: bool
-    bounds: list[Bound] = field(default_factory=list)
+    bounds: list[Row] = field(default_factory=list)
     frames: Mapping[str, int] = field(default_factory=dict)
     ate: Mapping[str, Mapping[str, float] | None] = field(default_factory=dict)
     stage_ms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -116,12 +99,12 @@ class ReportData:
     @property
     def passed(self) -> bool:
         """Whether every bound is met."""
-        return all(bound.met for bound in self.bounds)
+        return all(bound.holds for bound in self.bounds)
 
     @property
     def outcome(self) -> str:
         """The bounds in one line; empty without any."""
-        missed = [bound.name for bound in self.bounds if not bound.met]
+        missed = [bound.name for bound in self.bounds if not bound.holds]
         if missed:
             return f"{len(missed)} of {len(self.bounds)} bounds missed: {', '.join(missed)}"
         return f"All {len(self.bounds)} bounds met" if self.bounds else ""
@@ -139,12 +122,11 @@ def write_report(path: str | Path, data: ReportData) -> None:
         title=data.title,
         data=data,
         frame_rows=_frame_rows(data.frames),
-        bound_rows=_bound_rows(data.bounds),
         ate_rows=_ate_rows(data.ate),
         time_rows=_time_rows(data),
         figures=_figures(data),
         pictures=[(_jpeg(picture.image), picture.caption) for picture in data.pictures],
-        settings=_flat(data.settings),
+        settings=flat(data.settings),
         legend=_LEGEND,
     )
 
@@ -157,8 +139,8 @@ def summary_table(data: ReportData) -> str:
         ("time, ms", [["", "median", "99th pct."], *map(list, _time_rows(data))]),
         (
             "bounds",
-            [[n, v, f"allowed: {a}", "met" if m else "MISSED"]
-             for n, v, a, m in _bound_rows(data.bounds)],
+            [[b.name, b.measured, f"allowed: {b.allowed}", "met" if b.holds else "MISSED"]
+             for b in data.bounds],
         ),
     ]  # fmt: skip
     lines = [data.title + (" (simulated flight)" if data.simulated else "")]
@@ -212,19 +194,6 @@ def _frame_rows(frames: Mapping[str, int]) -> list[tuple[str, str, str, str]]:
             _FRAME_MEANINGS.get(name, ""),
         )
         for name in names
-    ]
-
-
-def _bound_rows(bounds: list[Bound]) -> list[tuple[str, str, str, bool]]:
-    """Name, measured, allowed, whether met."""
-    return [
-        (
-            bound.name,
-            "not measured" if bound.value is None else f"{bound.value:.4g} {bound.unit}",
-            f"{'at most' if bound.at_most else 'at least'} {bound.limit:g} {bound.unit}",
-            bound.met,
-        )
-        for bound in bounds
     ]
 
 
@@ -296,17 +265,6 @@ def _figures(data: ReportData) -> list[Shown]:
             ),
         )
     return figures
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested settings as dotted keys and texts."""
-    rows: list[tuple[str, str]] = []
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            rows += _flat(value, f"{prefix}{key}.")
-        else:
-            rows.append((f"{prefix}{key}", str(value)))
-    return rows
 
 
 def _jpeg(image: Image) -> str:

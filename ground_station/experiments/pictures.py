@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ground_station.evaluation.plots import show_floorplan
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import Theme, themed
+from ground_station.presentation.theme import Theme, sheet, themed
 
 _MOST_PATHS = 4
 _LEAST_M, _MOST_M = 0.002, 0.5
@@ -187,8 +186,7 @@ def _broken(
 def _figure(
     rows: int, columns: int, size_inches: tuple[float, float], theme: Theme
 ) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=size_inches, layout="constrained", facecolor=theme.paper)
-    FigureCanvasAgg(figure)
+    figure = sheet(size_inches, theme)
     grid = figure.subplots(rows, columns, squeeze=False, sharex="col" if columns == 1 else False)
     axes = list(grid.ravel())
     for one in axes:

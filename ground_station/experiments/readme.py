@@ -12,6 +12,7 @@ from ground_station.experiments import tables
 from ground_station.experiments.report import PRINTED, conditions
 from ground_station.files import finite, write_text
 from ground_station.presentation.readme import Block
+from ground_station.presentation.text import markdown
 
 BLOCK = Block(
     "<!-- experiments: made by `blimp experiments --accept`; do not edit -->",
@@ -42,7 +43,7 @@ def render(document: dict[str, Any]) -> str:
         for case in e["cases"]:
             title, printed = f"{e['title']}: {case['title']}", tables.printed(case)
             rows.append([title, printed, *_presets(case), tables.inside(case)])
-    parts = [tables.markdown(table).rstrip() for table in (rows, series) if len(table) > 1]
+    parts = [markdown(table).rstrip() for table in (rows, series) if len(table) > 1]
     said = f"{conditions(document)} {PRINTED}"
     return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 

@@ -10,6 +10,8 @@ from ground_station.experiments.quick import FLIGHT_S, IMAGES
 from ground_station.files import write_json, write_text
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
+from ground_station.presentation.text import flat
+from ground_station.presentation.text import markdown as markdown_table
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
 QUICK = (
@@ -67,7 +69,7 @@ def markdown(document: dict[str, Any]) -> str:
         title = f"### {experiment['title']}"
         question = experiment["question"]
         parts.append(title + (f"\n\n{question}" if question else ""))
-        parts += [tables.markdown(table) for table in tables.every(experiment)]
+        parts += [markdown_table(table) for table in tables.every(experiment)]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
 
@@ -124,18 +126,6 @@ def _localized(case: dict[str, Any], preset: str) -> bool:
 
 def _setting(case: dict[str, Any]) -> tuple[str, str]:
     """A case and what it was made of, as one line of keys and values."""
-    words = []
-    for table in ("flight", "map", "alter", "localizer"):
-        for key, value in _flat(case[table], f"{table}."):
-            words.append(f"{key} = {value}")
+    made_of = flat({table: case[table] for table in ("flight", "map", "alter", "localizer")})
+    words = [f"{key} = {value}" for key, value in made_of.items() if value not in ("", 0, 0.0)]
     return str(case["title"]), "; ".join(words)
-
-
-def _flat(table: dict[str, Any], prefix: str) -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for key, value in table.items():
-        if isinstance(value, dict):
-            rows += _flat(value, f"{prefix}{key}.")
-        elif value not in ("", 0, 0.0):
-            rows.append((prefix + key, value))
-    return rows

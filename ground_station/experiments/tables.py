@@ -80,14 +80,6 @@ def _times(experiment: dict[str, Any]) -> list[list[str]]:
     return [head, *rows]
 
 
-def markdown(table: list[list[str]]) -> str:
-    """A table in Markdown."""
-    head, *rows = [[escaped(cell) for cell in line] for line in table]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    lines += [f"| {' | '.join(row)} |" for row in rows]
-    return "\n".join(lines) + "\n"
-
-
 def text(experiment: dict[str, Any]) -> str:
     """The tables for a console."""
     lines = ["  " + line for table in every(experiment) for line in columns(table)]
@@ -118,11 +110,6 @@ def verdict(document: dict[str, Any]) -> str:
     alone = [f"{others} more rows have one preset only."] if others else []
     broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
     return " ".join([said, *alone, *broken])
-
-
-def escaped(cell: str) -> str:
-    """A cell as Markdown takes it."""
-    return cell.replace("|", "/").replace("\n", " ")
 
 
 def printed(case: dict[str, Any]) -> str:

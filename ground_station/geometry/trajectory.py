@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,12 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def __getitem__(self, chosen: slice | npt.NDArray[Any]) -> Trajectory:
+        """The poses of some indices, or of those that an array of N booleans marks."""
+        return Trajectory(
+            self.time_ns[chosen], self.position_m[chosen], self.quaternion_xyzw[chosen]
+        )
 
     @classmethod
     def from_poses(cls, time_ns: npt.ArrayLike, wTc: npt.ArrayLike) -> Trajectory:

@@ -84,10 +84,7 @@ def compare(map_: Map, estimate: Trajectory, truth: Trajectory, step: int = 1) -
             f"the truth has a pose every {1e3 * apart_s[0]:.3g} ms, the estimate every "
             f"{1e3 * apart_s[1]:.3g} ms; one for each frame is needed"
         )
-    chosen = np.arange(0, len(truth), step)
-    part = Trajectory(
-        truth.time_ns[chosen], truth.position_m[chosen], truth.quaternion_xyzw[chosen]
-    )
+    part = truth[::step]
     i, j = associate(estimate.time_ns, part.time_ns, _MAX_DIFF_S)
     if not len(i):
         raise InputError("no estimated pose is of the time of a true one")

@@ -7,14 +7,13 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
 from ground_station.map.store import Map
-from ground_station.presentation.theme import Theme, themed
+from ground_station.presentation.theme import Theme, sheet, themed
 
 F64 = npt.NDArray[np.float64]
 
@@ -45,11 +44,7 @@ def from_above(
     low, high = _bounds(position, place) if plan is None else _corners(plan)
     sides = (high - low) * _LONGEST_IN / max(float((high - low).max()), 1e-9)
     width, height = (max(float(side), _LEAST_IN) for side in sides)
-    figure = Figure(
-        figsize=(width + _LABELS_IN, height + _LABELS_IN), layout="constrained",
-        facecolor=theme.paper,
-    )  # fmt: skip
-    FigureCanvasAgg(figure)
+    figure = sheet((width + _LABELS_IN, height + _LABELS_IN), theme)
     axes: Axes = figure.subplots()
     themed(axes, theme, 8)
     some = slice(None, None, max(1, -(-len(position) // _MOST_POINTS)))

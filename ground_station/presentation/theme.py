@@ -36,12 +36,18 @@ LIGHT = Theme("#ffffff", "#1d2329", "#d7dce1", "#1d2329", "#0072b2", "#d55e00", 
 DARK = Theme("#171b20", "#e4e8ec", "#3a424b", "#f2f2f2", "#56b4e9", "#e69f00", "#f0e442")
 
 
+def sheet(size_inches: tuple[float, float], theme: Theme) -> Figure:
+    """An empty figure on that theme's paper."""
+    figure = Figure(figsize=size_inches, layout="constrained", facecolor=theme.paper)
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def figure_of(
     rows: int, size_inches: tuple[float, float], theme: Theme
 ) -> tuple[Figure, list[Axes]]:
     """A figure in that theme and its axes, one below the other with the same x."""
-    figure = Figure(figsize=size_inches, layout="constrained", facecolor=theme.paper)
-    FigureCanvasAgg(figure)
+    figure = sheet(size_inches, theme)
     axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     for one in axes:
         themed(one, theme)

@@ -67,7 +67,7 @@ def run(
     document = result.document() | {
         "seeds": seeds,
         "map": {"build_s": map_s, **map_.info.built, "registration": map_.info.registration},
-        "bounds": [asdict(bound) | {"met": bound.met} for bound in data.bounds],
+        "bounds": [asdict(bound) for bound in data.bounds],
         "simulated": True,
     }
     write_json(out / "results.json", document)

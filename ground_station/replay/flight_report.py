@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.evaluation.report import Bound, MatchPicture, ReportData, draw_matches
+from ground_station.evaluation.figures import AT_LEAST, AT_MOST, Row
+from ground_station.evaluation.report import MatchPicture, ReportData, draw_matches
 from ground_station.geometry import poses
 from ground_station.map.store import Map
 from ground_station.replay.replay import ReplayResult
@@ -22,7 +23,7 @@ def report_data(
     result: ReplayResult,
     map_: Map,
     *,
-    bounds: Sequence[Bound] = (),
+    bounds: Sequence[Row] = (),
     simulated: bool,
     floorplan: Path | None,
     seeds: dict[str, int],
@@ -34,7 +35,7 @@ def report_data(
     latency = result.live.latency_ms()
     errors = result.evaluation.errors["none"] if result.evaluation else None
     error_ns = result.evaluation.truth.time_ns if result.evaluation else np.empty(0)
-    limits = {bound.name: bound.limit for bound in bounds}
+    limits = {bound.name: bound.bound for bound in bounds}
     document = result.document()
     return ReportData(
         title=title,
@@ -104,20 +105,21 @@ def notes(result: ReplayResult) -> list[str]:
     return lines
 
 
-def judge(result: ReplayResult, limits: dict[str, float]) -> list[Bound]:
+def judge(result: ReplayResult, limits: dict[str, float]) -> list[Row]:
     """The bounds with what was measured. `limits` by the names above; shares in per cent."""
     accounts = result.live.accounts()
     captured, gated = accounts["captured"], accounts["gated"]
     rmse = result.evaluation.errors["none"].rmse() if result.evaluation else {}
     taken = captured - gated - accounts["dropped"]
     values = {
-        GATED: (100 * gated / captured if captured else None, "%", True),
-        LOCALIZED: (100 * accounts["localized"] / taken if taken else None, "%", False),
-        POSITION: (rmse.get("position_m"), "m", True),
-        ROTATION: (rmse.get("rotation_deg"), "°", True),
+        GATED: (100 * gated / captured if captured else None, "%", AT_MOST),
+        LOCALIZED: (100 * accounts["localized"] / taken if taken else None, "%", AT_LEAST),
+        POSITION: (rmse.get("position_m"), "m", AT_MOST),
+        ROTATION: (rmse.get("rotation_deg"), "°", AT_MOST),
     }
     return [
-        Bound(name, values[name][0], limit, *values[name][1:]) for name, limit in limits.items()
+        Row.bounded(name, *values[name][:2], limit, values[name][2])
+        for name, limit in limits.items()
     ]
 
 
@@ -128,7 +130,7 @@ def _within(result: ReplayResult) -> Any:
     times = [frame.estimate.time_ns for frame in result.live.frames]
     truth = result.truth
     keep = (truth.time_ns >= min(times)) & (truth.time_ns <= max(times))
-    return type(truth)(truth.time_ns[keep], truth.position_m[keep], truth.quaternion_xyzw[keep])
+    return truth[keep]
 
 
 def _picture(image: Any, note: EstimateMessage, result: ReplayResult, map_: Map) -> MatchPicture:

@@ -203,7 +203,7 @@ def test_shares_count_both_limits_and_frames_without_an_estimate() -> None:
 
 def test_coverage_is_the_share_of_frames_with_a_pose() -> None:
     truth = path_of_n(10, 1)
-    part = Trajectory(truth.time_ns[2:7], truth.position_m[2:7], truth.quaternion_xyzw[2:7])
+    part = truth[2:7]
     assert ate.coverage(part, truth.time_ns) == 0.5
     assert ate.coverage(truth, truth.time_ns) == 1.0
     assert ate.coverage(part, truth.time_ns[:0]) == 0.0

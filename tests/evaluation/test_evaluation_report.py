@@ -19,8 +19,8 @@ from parsed_page import Page
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.evaluation import plots
+from ground_station.evaluation.figures import AT_LEAST, Row
 from ground_station.evaluation.report import (
-    Bound,
     MatchPicture,
     ReportData,
     draw_matches,
@@ -64,7 +64,10 @@ def full_data(floorplan: Path) -> ReportData:
         title="Atrium & <sample>",
         verdict=["Localized live at 5 Hz.", "Second line."],
         simulated=True,
-        bounds=[Bound("position error", 0.035, 0.1, "m"), Bound("localized", 99, 95, "%", False)],
+        bounds=[
+            Row.bounded("position error", 0.035, "m", 0.1),
+            Row.bounded("localized", 99, "%", 95, AT_LEAST),
+        ],
         frames={"captured": 1500, "gated": 15, "sent": 1485, "received": 1480, "lost": 5,
                 "localized": 1470, "late": 3},
         ate={"none": row, "se3": row, "sim3": None},
@@ -137,8 +140,8 @@ def test_the_page_tells_a_pilot_everything(tmp_path: Path, floorplan: Path) -> N
 
 def test_a_missed_bound_is_said_first_and_by_name(tmp_path: Path, floorplan: Path) -> None:
     data = full_data(floorplan)
-    data.bounds = [*data.bounds, Bound("rotation error", float("nan"), 0.6, "°")]
-    data.bounds += [Bound("latency", None, 100, "ms")]
+    data.bounds = [*data.bounds, Row.bounded("rotation error", float("nan"), "°", 0.6)]
+    data.bounds += [Row.bounded("latency", None, "ms", 100)]
     assert not data.passed
     words = " ".join(written(tmp_path / "r.html", data).words.split())
     said = "✗ 2 of 4 bounds missed: rotation error, latency"
@@ -223,7 +226,7 @@ def test_the_floor_plan_lies_where_its_origin_says(tmp_path: Path, floorplan: Pa
 def test_lines_break_where_nothing_was_estimated() -> None:
     whole = circle()
     keep = np.r_[0:40, 60:100]
-    part = Trajectory(whole.time_ns[keep], whole.position_m[keep], whole.quaternion_xyzw[keep])
+    part = whole[keep]
     figure = plots.trajectory_plot(whole, part)
     truth, estimate = (np.asarray(line.get_xdata()) for line in figure.axes[0].lines[:2])
     assert len(truth) == 100 and not np.isnan(truth).any()

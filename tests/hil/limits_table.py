@@ -8,6 +8,7 @@ from typing import Any
 from ground_station.errors import GroundStationError
 from ground_station.files import write_json
 from ground_station.presentation.readme import Block
+from ground_station.presentation.text import markdown
 
 BLOCK = Block(
     "<!-- limits: made by `make limits` and its --accept; do not edit -->",
@@ -24,7 +25,7 @@ def render(document: dict[str, Any]) -> str:
     machine, seeds = document["machine"], document["seeds"]
     others = [axis["others_cores_most"] or 0.0 for axis in document["axes"].values()]
     model = str(machine["model"]).replace("|", "/")
-    lines = [
+    said = (
         f"Borne is the highest level at which at least {100 * document['borne_from']:g} % of the"
         f" captured frames are TRACKING in each of {len(seeds)} runs of"
         f" {document['duration_s']:g} s, counted from the first TRACKING one, and at all easier"
@@ -32,11 +33,9 @@ def render(document: dict[str, Any]) -> str:
         f" by `make limits` with a simulated flight ({document['flight'].split(',')[0]}) on"
         f" {machine['cores']} cores ({model}), {machine['date']}, load"
         f" {machine['load_before']:g} before; others used {max(others, default=0.0):.2f} cores at"
-        " most meanwhile. Of a link only the video's packets are burdened.",
-        "",
-        "| burden | borne | TRACKING there | not borne | TRACKING there |",
-        "|---|---|---|---|---|",
-    ]
+        " most meanwhile. Of a link only the video's packets are burdened."
+    )
+    rows = [("burden", "borne", "TRACKING there", "not borne", "TRACKING there")]
     notes: list[str] = []
     for axis in document["axes"].values():
         shares = axis["shares"]
@@ -48,14 +47,12 @@ def render(document: dict[str, Any]) -> str:
             )
             name += " (see below)"
         least = "more was not tried" if axis["last"] else "none of those tried"
-        lines.append(
-            f"| {name} | {borne or 'nothing'} | {_spread(shares.get(borne))}"
-            f" | {refused or least} | {_spread(shares.get(refused))} |"
-        )
+        at_borne, at_refused = _spread(shares.get(borne)), _spread(shares.get(refused))
+        rows.append((name, borne or "nothing", at_borne, refused or least, at_refused))
     held = sorted({by for axis in document["axes"].values() for by in axis["held_by"]})
     if held:
         notes.append(f"The processor was held back by {' and '.join(held)}.")
-    return "\n".join([*lines, *(["", " ".join(notes)] if notes else [])]) + "\n"
+    return "\n".join([f"{said}\n", markdown(rows), *([" ".join(notes) + "\n"] if notes else [])])
 
 
 def _spread(shares: list[float] | None) -> str:

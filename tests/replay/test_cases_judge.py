@@ -14,10 +14,10 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ground_station.evaluation.figures import AT_LEAST, AT_MOST, Row, holds_at
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.replay.cases import accounting, frames, golden, judge, measure
 from ground_station.replay.cases.case import load_case
-from ground_station.replay.cases.judge import AT_LEAST, AT_MOST, Row
 from ground_station.replay.cases.limits import NAMES, Limits
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
@@ -241,22 +241,22 @@ def test_telemetry_must_be_there_in_range_and_a_number(
 @settings(deadline=None, max_examples=200)
 @given(st.floats(1e-9, 1e9), st.floats(1e-9, 1e9), st.sampled_from([AT_MOST, AT_LEAST]))
 def test_no_rounding_turns_a_miss_into_a_pass(value: float, bound: float, sense: str) -> None:
-    holds = judge.holds_at(value, bound, sense)
+    holds = holds_at(value, bound, sense)
     row = Row("x", value, "m", bound, holds, sense)
     shown, allowed = (float(text.split()[-2]) for text in (row.measured, row.allowed))
     assert allowed == bound
-    assert judge.holds_at(shown, allowed, sense) == holds
+    assert holds_at(shown, allowed, sense) == holds
     assert (shown == allowed) == (value == bound)
 
 
 @pytest.mark.parametrize("bound", [0.05, 0.1, 1.0, 0.95])
 def test_the_next_number_beyond_a_bound_misses_and_shows_so(bound: float) -> None:
     beyond = float(np.nextafter(bound, 2.0))
-    assert judge.holds_at(bound, bound, AT_MOST) and not judge.holds_at(beyond, bound, AT_MOST)
+    assert holds_at(bound, bound, AT_MOST) and not holds_at(beyond, bound, AT_MOST)
     assert Row("x", beyond, "m", bound, False).measured != f"{bound:g} m"
     for value in (None, float("nan")):
-        assert not judge.holds_at(value, bound, AT_MOST)
-        assert not judge.holds_at(value, bound, AT_LEAST)
+        assert not holds_at(value, bound, AT_MOST)
+        assert not holds_at(value, bound, AT_LEAST)
 
 
 def accepted(outcome: Outcome, **terms: Any) -> Reference:

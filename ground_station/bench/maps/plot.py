@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ground_station.presentation.theme import LIGHT, themed
+from ground_station.presentation.theme import LIGHT, figure_of
 
 _SIGNS = "osD^vXP"
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -22,9 +21,7 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
     `rows` as `scale.measured` gives them; a line each for threads and for so many processes. A
     dashed line shows time that grows as the images do, another the memory allowed.
     """
-    figure = Figure(figsize=(8.0, 7.2), layout="constrained", facecolor=LIGHT.paper)
-    FigureCanvasAgg(figure)
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = figure_of(2, (8.0, 7.2), LIGHT)
     for k, processes in enumerate(dict.fromkeys(row["processes"] for row in rows)):
         mine = [row for row in rows if row["processes"] == processes]
         x = [row["images"] for row in mine]
@@ -43,7 +40,6 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
     upper.plot(x, linear, "--", color=LIGHT.limit, lw=1.2, label="linear")
     lower.axhline(most_gb, color=LIGHT.limit, linestyle="--", lw=1.2, label="allowed")
     for axes, name in ((upper, "time, s"), (lower, "peak memory, GB")):
-        themed(axes, LIGHT)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylabel(name)

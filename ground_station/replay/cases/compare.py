@@ -12,11 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.errors import InputError
+from ground_station.evaluation.figures import AT_LEAST
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
+from ground_station.presentation.text import flat
 from ground_station.replay.cases import accounting, measure, same
-from ground_station.replay.cases.judge import AT_LEAST, BOUNDS
+from ground_station.replay.cases.judge import BOUNDS
 from ground_station.replay.cases.measure import Errors, Figure
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
@@ -159,23 +161,13 @@ def compare(a: Outcome, b: Outcome, allowed: Allowed | None = None) -> Compariso
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Dotted keys whose values differ, with both; "—" where one has none."""
-    flat_a, flat_b = _flat(a), _flat(b)
+    flat_a, flat_b = ({key: str(value) for key, value in flat(of).items()} for of in (a, b))
     keys = sorted(set(flat_a) | set(flat_b))
     return [
         (key, flat_a.get(key, "—"), flat_b.get(key, "—"))
         for key in keys
         if flat_a.get(key) != flat_b.get(key)
     ]
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    found: dict[str, str] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{key}.")
-        else:
-            found[f"{prefix}{key}"] = str(value)
-    return found
 
 
 _OF_RUN = ("recording", "map", "map_sha256", "preset", "init", "stepped", "rate_hz", "seed",

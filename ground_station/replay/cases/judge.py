@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal
 
 import numpy as np
 
 from ground_station.evaluation import ate
+from ground_station.evaluation.figures import AT_LEAST, AT_MOST, EXACTLY, Row
 from ground_station.replay.cases import accounting, measure, telemetry
 from ground_station.replay.cases.case import Case
 from ground_station.replay.cases.golden import Golden
@@ -19,39 +18,6 @@ from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.same import first_difference
 from ground_station.replay.cases.truth import Reference, reference_of
 from pi_firmware.wire.errors import BlimpError
-
-AT_MOST, AT_LEAST, EXACTLY = "at most", "at least", "exactly"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One figure and what became of it.
-
-    `bound` is what it was held against, `sense` from which side. `holds` is None where nothing was
-    asked. `told` says what it was taken from, or why it could not be.
-    """
-
-    name: str
-    value: float | None
-    unit: str
-    bound: float | None = None
-    holds: bool | None = None
-    sense: str = AT_MOST
-    told: str = ""
-
-    @property
-    def measured(self) -> str:
-        """The value for a person, with digits enough to be on its side of the bound."""
-        if self.value is None:
-            return "not measured" if self.unit else ""
-        return f"{digits(self.value, self.bound)} {self.unit}".strip()
-
-    @property
-    def allowed(self) -> str:
-        """What was asked, for a person; "" for nothing or a plain condition."""
-        if self.bound is None:
-            return ""
-        return f"{self.sense} {number(self.bound)} {self.unit}".strip()
 
 
 @dataclass(frozen=True)
@@ -83,24 +49,6 @@ class Judged:
     def passed(self) -> bool:
         """False for an error; a case that was skipped has neither passed nor failed: True."""
         return not self.error and not self.missed
-
-
-def digits(value: float, bound: float | None) -> str:
-    """A number in four digits, or in as many as leave it on its own side of the bound."""
-    for count in range(4, 17):
-        text = f"{value:.{count}g}"
-        shown = float(text)
-        if 1e4 <= abs(shown) < 1e15:
-            text = format(Decimal(text), "f")
-        if bound is None or (shown < bound, shown > bound) == (value < bound, value > bound):
-            return text
-    return repr(value)
-
-
-def number(value: float) -> str:
-    """A number as a person wrote it."""
-    text = f"{value:g}"
-    return text if float(text) == value else repr(value)
 
 
 def judge(outcome: Outcome, case: Case, kind: str, again: Outcome | None = None) -> list[Row]:
@@ -190,16 +138,8 @@ def _bounds(limits: Limits, figures: dict[str, Figure]) -> list[Row]:
         bound = getattr(limits, name)
         if bound is not None:
             figure = figures[figure_name]
-            holds = holds_at(figure.value, bound, sense)
-            found.append(Row(name, figure.value, unit, bound, holds, sense, figure.told))
+            found.append(Row.bounded(name, figure.value, unit, bound, sense, figure.told))
     return found
-
-
-def holds_at(value: float | None, bound: float, sense: str) -> bool:
-    """Whether a value is on the right side, or on the bound; never for None and NaN."""
-    if value is None or math.isnan(value):
-        return False
-    return value <= bound if sense == AT_MOST else value >= bound
 
 
 def _unasked(limits: Limits, figures: dict[str, Figure], outcome: Outcome) -> list[Row]:
@@ -246,9 +186,8 @@ def _golden(outcome: Outcome, golden: Golden) -> list[Row]:
     missing = count / len(golden.poses)
     told = f"{len(found)} poses against the run {golden}"
     rows = [
-        Row("golden: missing", missing, "share", terms.missing_max,
-            holds_at(missing, terms.missing_max, AT_MOST), AT_MOST,
-            f"{count} of {len(golden.poses)} accepted poses")
+        Row.bounded("golden: missing", missing, "share", terms.missing_max,
+                    told=f"{count} of {len(golden.poses)} accepted poses")
     ]  # fmt: skip
     parts: Sequence[tuple[str, np.ndarray, str, float]] = (
         ("golden: position", found.position_m, "m", terms.tolerance_m),
@@ -257,7 +196,7 @@ def _golden(outcome: Outcome, golden: Golden) -> list[Row]:
     for name, values, unit, bound in parts:
         worst = float(values.max()) if len(values) else None
         why = told if worst is not None else "no pose at the time of an accepted one"
-        rows.append(Row(name, worst, unit, bound, holds_at(worst, bound, AT_MOST), AT_MOST, why))
+        rows.append(Row.bounded(name, worst, unit, bound, told=why))
     return rows
 
 

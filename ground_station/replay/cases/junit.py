@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from ground_station.evaluation.figures import Row
 from ground_station.files import write_bytes, write_json
-from ground_station.replay.cases.judge import Judged, Row
+from ground_station.replay.cases.judge import Judged
 
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """What XML 1.0 (2.2) has no way to say."""

@@ -47,14 +47,8 @@ def errors(outcome: Outcome, truth: Trajectory) -> Errors:
     i, j = ate.associate(estimate.time_ns, truth.time_ns)
     if not len(i):
         return Errors(ordered[:0], np.empty(0), np.empty(0))
-    found = ate.errors(_of(estimate, i), _of(truth, j))
+    found = ate.errors(estimate[i], truth[j])
     return Errors(ordered[i], found.position_m, found.rotation_deg)
-
-
-def _of(trajectory: Trajectory, k: npt.NDArray[np.intp]) -> Trajectory:
-    return Trajectory(
-        trajectory.time_ns[k], trajectory.position_m[k], trajectory.quaternion_xyzw[k]
-    )
 
 
 def figures(outcome: Outcome, reference: Reference | str | None) -> dict[str, Figure]:

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ground_station.evaluation.figures import digits
 from ground_station.presentation.pages import Shown, shown, write_page
 from ground_station.replay.cases import measure, pictures
 from ground_station.replay.cases.compare import Comparison, Line
 from ground_station.replay.cases.frames import UNKNOWN
-from ground_station.replay.cases.judge import Judged, digits
+from ground_station.replay.cases.judge import Judged
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.pictures import Series, Strip
 

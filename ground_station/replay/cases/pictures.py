@@ -12,16 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ground_station.evaluation import plots
-from ground_station.evaluation.plots import GAP_S
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, themed
+from ground_station.presentation.theme import LIGHT, Theme, sheet, themed
 
 Array = npt.NDArray[np.float64]
 
@@ -77,7 +75,7 @@ def path(
     figure.set_size_inches(WIDTH_IN, 4.9)
     axes = figure.axes[0]
     for k, (name, trajectory) in enumerate(under):
-        x, y = _broken(trajectory.time_ns / 1e9, trajectory.position_m[:, :2].T)
+        x, y = plots.broken_path(trajectory)
         style = "-" if k == 0 else "--"
         axes.plot(x, y, color=theme.truth, lw=3.2 - 2 * k, alpha=0.4, ls=style, label=name)
     if lost_m is not None and len(lost_m):
@@ -126,7 +124,7 @@ def over_time(
     shaded. Times are seconds from the flight's first frame."""
     rows = len(panels) + bool(strips)
     heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)] * bool(strips)
-    figure = _sheet((WIDTH_IN, sum(heights) + 0.7), theme)
+    figure = sheet((WIDTH_IN, sum(heights) + 0.7), theme)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (label, series, bound) in zip(grid, panels, strict=False):
         themed(axes, theme, _SMALL)
@@ -134,7 +132,7 @@ def over_time(
         top = max(_LEAST.get(label.rpartition(", ")[2], 1e-6), bound or 0.0)
         for one in series:
             colour, line = _style(one.style, theme)
-            t, v = _broken(one.time_s, one.values[None, :])
+            t, v = plots.broken(one.time_s, one.values)
             axes.plot(t, v, color=colour, ls=line, lw=1.2, label=one.label)
             top = max(top, float(np.nanmax(one.values, initial=0.0)))
         if bound is not None:
@@ -155,7 +153,7 @@ def distributions(
     panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], theme: Theme = LIGHT
 ) -> Figure:
     """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
-    figure = _sheet((WIDTH_IN, 2.9), theme)
+    figure = sheet((WIDTH_IN, 2.9), theme)
     grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axes, (label, sets) in zip(grid, panels, strict=True):
         themed(axes, theme, _SMALL)
@@ -208,12 +206,6 @@ def _stretches(strip: Strip) -> list[tuple[str, float, float]]:
     return found
 
 
-def _sheet(size_in: tuple[float, float], theme: Theme) -> Figure:
-    figure = Figure(figsize=size_in, layout="constrained", facecolor=theme.paper)
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _style(k: int, theme: Theme) -> tuple[str, str]:
     return (theme.estimate, "-") if k == 0 else (theme.second, "--")
 
@@ -231,10 +223,3 @@ def _legend_above(axes: Axes, theme: Theme) -> None:
             labelcolor=theme.ink, fontsize=_SMALL, handlelength=1.6, borderpad=0.0,
             columnspacing=1.2,
         )  # fmt: skip
-
-
-def _broken(time_s: Array, values: Array) -> list[Array]:
-    """Rows of values (R, N) with a NaN in every pause; of one row, the times before it."""
-    gaps = np.flatnonzero(np.diff(time_s) > GAP_S) + 1
-    rows = [np.insert(np.asarray(row, np.float64), gaps, np.nan) for row in values]
-    return rows if len(rows) > 1 else [np.insert(time_s.astype(np.float64), gaps, np.nan), *rows]

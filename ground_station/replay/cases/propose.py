@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ground_station.replay.cases.judge import AT_LEAST, BOUNDS, digits
+from ground_station.evaluation.figures import AT_LEAST, digits
+from ground_station.replay.cases.judge import BOUNDS
 from ground_station.replay.cases.measure import Figure
 
 

@@ -107,9 +107,7 @@ def within(truth: Trajectory | None, table: frames.Frames) -> Trajectory | None:
     if truth is None or not len(table):
         return None
     keep = (truth.time_ns >= table.time_ns.min()) & (truth.time_ns <= table.time_ns.max())
-    if not np.any(keep):
-        return None
-    return Trajectory(truth.time_ns[keep], truth.position_m[keep], truth.quaternion_xyzw[keep])
+    return truth[keep] if np.any(keep) else None
 
 
 def floorplan_of(map_: Map) -> FloorPlan | None:

@@ -25,6 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ground_station.files import write_json
+from ground_station.presentation.text import columns
 from scenarios import disk
 from scenarios.camera import Cameras
 from scenarios.judge import INVARIANTS, Verdict
@@ -192,16 +193,15 @@ def _chosen(arguments: argparse.Namespace) -> list[Scenario]:
 
 
 def _table(verdicts: Sequence[Verdict]) -> None:
-    print(
-        f"\n{'scenario':42} {' '.join(f'{name:10}' for name in INVARIANTS)} {'back':>7} burden off"
-    )
+    rows = [["scenario", *INVARIANTS, "back", "burden", "off"]]
     for verdict in verdicts:
-        cells = " ".join(f"{'BROKEN' if verdict.broken[n] else 'ok':10}" for n in INVARIANTS)
         back_s = verdict.figures.get("recovery_s")
         back = "never" if back_s is None else f"{back_s:.1f} s"
         off = f"{verdict.figures.get('off_m', float('nan')):.2f} m"
         burden = f"{verdict.figures.get('burden', 1.0):.1f}"
-        print(f"{verdict.name[:42]:42} {cells} {back:>7} {burden:>6} {off}")
+        held = ("BROKEN" if verdict.broken[name] else "ok" for name in INVARIANTS)
+        rows.append([verdict.name[:42], *held, back, burden, off])
+    print("", *columns(rows), sep="\n")
     holding = sum(verdict.holds for verdict in verdicts)
     print(
         f"{holding} of {len(verdicts)} hold; bounds: 0.5 m, back within {RECOVERED_S:g} s, or"
