@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from ground_station.localization.matching import (
     Matches,
     describe,
 )
-from ground_station.localization.relocalization import Relocalizer
+from ground_station.localization.relocalization import Relocalization, Relocalizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.thresholds import RIGHT_PX, DescriptorThresholds
 from ground_station.localization.tracking import Keyframe, spread_out
@@ -30,8 +31,8 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 
-_ALLOWED = 22.5
-"""Squared Mahalanobis distance from a prediction: 99.9 % of six degrees of freedom."""
+_ALLOWED = 32.9
+"""Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
 _CLOSER = 3
 """Solutions at most that are matched around once more."""
 _FOUND_RADIUS_PX = 15.0
@@ -44,7 +45,8 @@ class Located:
     """A frame solved from features of its own, or why not.
 
     Observations are in the order of the matches. `relocalized`: found in the whole map, away from
-    any prediction. `significance`: by how many standard deviations more landmarks are seen than by
+    any prediction; `wild`: near one, but of a camera that moves as nothing foretold.
+    `significance`: by how many standard deviations more landmarks are seen than by
     chance; 0 where that was not asked.
     """
 
@@ -53,6 +55,7 @@ class Located:
     observations: Observations
     features: int
     relocalized: bool = False
+    wild: bool = False
     significance: float = 0.0
 
     def teach(self, thresholds: DescriptorThresholds | None) -> None:
@@ -114,12 +117,14 @@ class Acquirer:
         estimator: Estimator,
         watch: Stopwatch,
         radius_px: float | None = None,
+        around: Kinematics | None = None,
     ) -> Located:
         """Matches around a prediction and solves; closer again, if the settings say, till it stays.
 
-        Without a radius it follows the prediction's covariance.
+        Without a radius it follows the prediction's covariance. It may be first matched `around`
+        another state.
         """
-        found = self._locate_once(seen, expected, expected, estimator, radius_px, watch)
+        found = self._locate_once(seen, around or expected, expected, estimator, radius_px, watch)
         closer_px = self._settings.association.refine_radius_px
         for _ in range(_CLOSER):
             state = found.solution.state
@@ -139,40 +144,65 @@ class Acquirer:
         self,
         seen: Described,
         time_ns: int,
-        expected: Kinematics | None,
+        expected: Sequence[Kinematics],
         estimator: Estimator,
         make: Callable[[], Estimator],
         watch: Stopwatch,
     ) -> Located:
         """The frame near its prediction, or else anywhere in the map.
 
-        Where a pose that was found anywhere is one that the prediction allows, it is solved with
-        that prediction; else with an estimator of `make`, which knows of nothing else.
+        `expected` are the predictions, the surest first; none before a start. Where one of them
+        allows what was found anywhere, it is solved with that prediction: only its velocity tells a
+        rolling shutter's shear from another place. Else it is solved with an estimator of `make`,
+        which knows of nothing else.
         """
         if self._relocalizer is None:
-            if expected is None:
+            if not expected:
                 return _nothing(seen, "no first pose")
-            return self.locate(seen, expected, estimator, watch)
-        if expected is not None and self.matcher.within_reach(expected):
-            near = self._verified(seen, self.locate(seen, expected, estimator, watch), watch)
+            return self.locate(seen, expected[0], estimator, watch)
+        if expected and self.matcher.within_reach(expected[0]):
+            near = self._verified(seen, self.locate(seen, expected[0], estimator, watch), watch)
             if near.solution.state is not None:
                 return near
-        found = self._relocalizer.find(seen.features, seen.normalized)
+        candidates = self._relocalizer.candidates(seen.features, seen.normalized)
         watch.lap("relocalization")
-        if isinstance(found, str):
-            return _nothing(seen, found)
-        sure = found.significance
-        if expected is not None and _allowed(expected, found.wTc):
-            around = replace(expected, wTc=found.wTc)
-            located = self._locate_once(seen, around, expected, estimator, _FOUND_RADIUS_PX, watch)
-            if located.solution.state is not None:
-                return replace(located, significance=sure)
+        if isinstance(candidates, str):
+            return _nothing(seen, candidates)
+        for prediction, found in itertools.product(expected, candidates):
+            located = self._agreed(seen, found, prediction, estimator, watch)
+            if located is not None:
+                wild = prediction is not expected[0]
+                return replace(located, wild=wild, significance=found.significance)
+        sole = self._relocalizer.alone(candidates)
+        if isinstance(sole, str):
+            return _nothing(seen, sole)
         estimator = make()
-        estimator.restart(time_ns, found.wTc)
+        estimator.restart(time_ns, sole.wTc)
         alone = estimator.predict(time_ns)
         assert alone is not None
         located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
-        return replace(located, relocalized=True, significance=sure)
+        return replace(located, relocalized=True, significance=sole.significance)
+
+    def _agreed(
+        self,
+        seen: Described,
+        found: Relocalization,
+        expected: Kinematics,
+        estimator: Estimator,
+        watch: Stopwatch,
+    ) -> Located | None:
+        """A find solved with a prediction, or None where that does not allow it.
+
+        Asked of its matches and not of its pose, which takes a rolling shutter for a global one.
+        """
+        settings = self._settings.pose
+        pixel = seen.features.keypoints_px[found.feature]
+        sights = self.matcher.sights(pixel, found.landmark, settings.sigma_px, expected, seen.taken)
+        solution = believed(estimator.solve(expected, sights, settings), self._settings)
+        if solution.state is None or not solution.innovation < _ALLOWED:
+            return None
+        located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX, solution.state)
+        return None if located.solution.state is None else located
 
     def keyframe(self, time_ns: int, image: Image, wTc: Array, found: Located) -> Keyframe:
         """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.
@@ -219,7 +249,7 @@ class Acquirer:
         self,
         time_ns: int,
         image: Image,
-        expected: Kinematics | None,
+        expected: Sequence[Kinematics],
         make: Callable[[], Estimator],
         taken: Conditions,
     ) -> Callable[[], Acquired]:
@@ -293,18 +323,6 @@ def believed(solution: Solution, settings: LocalizerSettings, least: int | None 
     if solution.state is None or inliers >= max(least, pose.min_inlier_share * total):
         return solution
     return no_solution(total, f"{inliers} inliers of {total} observations", solution.iterations)
-
-
-def _allowed(expected: Kinematics, wTc: Array) -> bool:
-    """Whether a prediction's own covariance lets the camera be at a pose (4, 4)."""
-    step = poses.log(poses.inverse(expected.wTc) @ wTc)
-    covariance = expected.covariance[:6, :6]
-    if not np.isfinite(covariance).all():
-        return False
-    try:
-        return bool(step @ np.linalg.solve(covariance, step) < _ALLOWED)
-    except np.linalg.LinAlgError:
-        return False
 
 
 def _nothing(seen: Described, reason: str) -> Located:

@@ -29,16 +29,22 @@ class Estimator(Protocol):
         """A pose (4, 4) from elsewhere with its covariance (6, 6), and no known velocity."""
         ...
 
-    def predict(self, time_ns: int) -> Kinematics | None:
-        """What is expected at a time; None when no pose was ever known."""
+    def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
+        """What is expected at a time; None when no pose was ever known.
+
+        `wild`: of a camera that moves as nothing foretold.
+        """
         ...
 
     def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
         """The state that explains the sights; changes nothing."""
         ...
 
-    def update(self, solution: Solution) -> Kinematics:
-        """Takes a solution for true and returns what is then believed of its time."""
+    def update(self, solution: Solution, wild: bool = False) -> Kinematics:
+        """Takes a solution for true and returns what is then believed of its time.
+
+        `wild`: it is one of the wild prediction.
+        """
         ...
 
     def smoothed(self) -> list[Kinematics]:
@@ -61,7 +67,7 @@ class PoseEstimator:
     def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
         self._motion.restart(time_ns, wTc)
 
-    def predict(self, time_ns: int) -> Kinematics | None:
+    def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
         wTc = self._motion.predict(time_ns)
         # Nothing is known of how good the prediction is.
         return None if wTc is None else Kinematics(time_ns, wTc, np.zeros(6), _UNKNOWN)
@@ -82,7 +88,7 @@ class PoseEstimator:
             iterations=found.iterations,
         )  # fmt: skip
 
-    def update(self, solution: Solution) -> Kinematics:
+    def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         assert solution.state is not None
         self._motion.update(solution.state.time_ns, solution.state.wTc)
         return solution.state
@@ -117,13 +123,13 @@ class FilterEstimator:
             full[:6, :6] = covariance
         self._smoother.restart(Kinematics(time_ns, wTc, np.zeros(6), full))
 
-    def predict(self, time_ns: int) -> Kinematics | None:
-        return self._smoother.predict(time_ns)
+    def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
+        return self._smoother.predict(time_ns, wild)
 
     def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
         return solve_rolling(predicted, sights, self._camera, settings)
 
-    def update(self, solution: Solution) -> Kinematics:
+    def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         state = solution.state
         assert state is not None
         latest = self._smoother.latest
@@ -131,7 +137,7 @@ class FilterEstimator:
             # A given pose's own frame: the solution already holds what was given.
             self._smoother.restart(state)
             return state
-        return self._smoother.update(state.time_ns, solution)
+        return self._smoother.update(state.time_ns, solution, wild)
 
     def smoothed(self) -> list[Kinematics]:
         return self._smoother.smoothed()

@@ -240,8 +240,9 @@ class Localizer:
 
     def _locate(self, attempt: Attempt, seen: Described) -> PoseEstimate:
         attempt.predicted = self._estimator.predict(attempt.time_ns)
+        expected = self._expected(attempt)
         found = self._acquirer.find(
-            seen, attempt.time_ns, attempt.predicted, self._estimator, self._fresh, attempt.watch
+            seen, attempt.time_ns, expected, self._estimator, self._fresh, attempt.watch
         )
         self._note(attempt, found)
         state = found.solution.state
@@ -250,7 +251,14 @@ class Localizer:
         if found.relocalized:
             sure = found.significance if self._within_speed(state, attempt) else 0.0
             self._begin_again(state, sure)
-        return self._solved(attempt, found.solution, relocalized=found.relocalized)
+        elif found.wild:
+            self._judge.found_again(attempt.time_ns, found.significance)
+        return self._solved(attempt, found.solution, relocalized=found.relocalized, wild=found.wild)
+
+    def _expected(self, attempt: Attempt) -> list[Kinematics]:
+        """What is predicted of a frame, and the same of a camera that moves as nothing foretold."""
+        wild = self._estimator.predict(attempt.time_ns, wild=True)
+        return [state for state in (attempt.predicted, wild) if state is not None]
 
     def _note(self, attempt: Attempt, found: Located) -> None:
         inliers = int(found.solution.inlier.sum())
@@ -322,7 +330,7 @@ class Localizer:
         if self._worker.busy or not self._may_search(attempt.time_ns):
             return
         self._last_search_ns = attempt.time_ns
-        expected = None if self._gone(attempt.time_ns) else attempt.predicted
+        expected = [] if self._gone(attempt.time_ns) else self._expected(attempt)
         self._worker.submit(
             self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
             attempt.time_ns,
@@ -373,7 +381,7 @@ class Localizer:
         if last_ns is None or expected is None:
             return True
         elapsed_s, start = (attempt.time_ns - last_ns) / 1e9, self.settings.start
-        step = poses.log(poses.inverse(expected.wTc) @ found.wTc)
+        step = poses.log(poses.inverse(expected.after(-elapsed_s)) @ found.wTc)
         turn, way = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
         most_s = _FASTEST * elapsed_s
         return bool(
@@ -393,10 +401,12 @@ class Localizer:
         solution: Solution,
         *,
         relocalized: bool = False,
+        wild: bool = False,
         followed: Followed | None = None,
     ) -> PoseEstimate:
-        believed = self._estimator.update(solution) if not relocalized or followed else None
-        state = believed or solution.state
+        state = solution.state
+        if not relocalized or followed:
+            state = self._estimator.update(solution, wild)
         assert state is not None
         self._seen = attempt.observations.landmark[solution.inlier]
         settings = self.settings.covariance

@@ -35,13 +35,15 @@ class Relocalization:
     """A pose (4, 4) and its inliers: `feature` (N,) and `landmark` (N,) indices.
 
     `significance`: by how many standard deviations more landmarks are where they should be than
-    chance puts there.
+    chance puts there. `open_by`: the position's standard deviation by the inliers alone, over
+    their depth.
     """
 
     wTc: Array
     feature: Indices
     landmark: Indices
     significance: float = 0.0
+    open_by: float = 0.0
 
 
 def match_all(
@@ -206,9 +208,8 @@ class _Search:
         if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)
-        if (open_by := self._sigma(wTc, landmark)) > _MAX_SIGMA:
-            return f"the inliers leave the position open by {open_by:.1%} of their depth"
-        return Relocalization(wTc, feature, landmark, support.significance)
+        open_by = self._sigma(wTc, landmark)
+        return Relocalization(wTc, feature, landmark, support.significance, open_by)
 
     def _sigma(self, wTc: Array, landmark: Indices) -> float:
         """Standard deviation of the position over the inliers' depth, at half the threshold."""
@@ -254,11 +255,18 @@ class Relocalizer:
     def find(self, features: Features, normalized: Array) -> Relocalization | str:
         """The pose of a frame anywhere in the map, or the reason why there is none.
 
+        Of two places that fit nearly as well, neither is believed. Takes what `candidates` takes.
+        """
+        found = self.candidates(features, normalized)
+        return found if isinstance(found, str) else self.alone(found)
+
+    def candidates(self, features: Features, normalized: Array) -> list[Relocalization] | str:
+        """The poses that a frame may have anywhere in the map, or the reason why there is none.
+
         `normalized` (F, 2) are the features undistorted, on the plane z = 1. The most alike
         keyframes are matched together, so that only what is unlike all the rest counts, and when
-        that fails (in a building that repeats itself) place by place; of two places that fit
-        nearly as well, neither is believed. A map without keyframes is one place. The same
-        frame gives the same answer.
+        that fails (in a building that repeats itself) place by place. A map without keyframes is
+        one place. The same frame gives the same answer.
         """
         if not len(features):
             return "no features"
@@ -276,13 +284,20 @@ class Relocalizer:
         ranked = self._index.ranked(features.descriptors, _RETRIEVED)
         together = self._try(self._index, search, self._index.seen_by(ranked))
         if not isinstance(together, str):
-            return together
+            return [together]
         found = []
         for place in self._index.places(ranked, _PLACES, _MIN_SHARED):
             alone = self._try(self._index, search, self._index.seen_by(place))
             if not isinstance(alone, str):
                 found.append(alone)
-        return _undisputed(found, self._same_m) if found else f"{together} in the most alike places"
+        return found or f"{together} in the most alike places"
+
+    def alone(self, found: list[Relocalization]) -> Relocalization | str:
+        """Which of some candidates is the place, where nothing else is known of it, or why none."""
+        best = _undisputed(found, self._same_m)
+        if isinstance(best, str) or best.open_by <= _MAX_SIGMA:
+            return best
+        return f"the inliers leave the position open by {best.open_by:.1%} of their depth"
 
     def _try(self, index: PlaceIndex, search: _Search, candidates: Indices) -> Relocalization | str:
         proposed = search.propose(candidates)
@@ -303,7 +318,10 @@ def _undisputed(found: list[Relocalization], same_m: float) -> Relocalization | 
     return best
 
 
-def _only_place(search: _Search) -> Relocalization | str:
+def _only_place(search: _Search) -> list[Relocalization] | str:
     everything = np.arange(len(search.landmarks))
     proposed = search.propose(everything)
-    return proposed if isinstance(proposed, str) else search.confirm(proposed[0], everything)
+    if isinstance(proposed, str):
+        return proposed
+    found = search.confirm(proposed[0], everything)
+    return found if isinstance(found, str) else [found]

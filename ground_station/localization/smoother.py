@@ -83,19 +83,23 @@ class FixedLagSmoother:
         self._left = []
         self._start(state)
 
-    def predict(self, time_ns: int) -> Kinematics | None:
+    def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
         """What the process expects at a time, from the newest state; None before a start.
 
-        Nothing is changed: a frame that gives no solution stretches the next one's prediction.
+        `wild`: with the densities at their limit, as a camera moves that nothing foretold. Nothing
+        is changed: a frame that gives no solution stretches the next one's prediction.
         Raises `ValueError` when the time is before the newest state's.
         """
         if self._latest is None:
             return None
+        if wild:
+            return self._advance(self._latest, time_ns, self._adaptation.limit).state
         return self._expect(self._latest, time_ns).state
 
-    def update(self, time_ns: int, solution: Solution) -> Kinematics:
+    def update(self, time_ns: int, solution: Solution, wild: bool = False) -> Kinematics:
         """Adds a solved frame and returns the newest state with its covariance, causal.
 
+        `wild`: it was solved with the wild prediction, so the densities become what it needs.
         `solution.information` and `.gradient` are of the frame's sights alone, at `solution.state`.
         When they can't be used, or the graph becomes singular, it restarts from the solution's own
         state and covariance; when that is not finite either, from the prediction. Raises
@@ -113,7 +117,7 @@ class FixedLagSmoother:
             raise ValueError(f"time {time_ns} ns is not after the newest, {latest.time_ns} ns")
         self._leave(time_ns)
         try:
-            return self._add(latest, state, solution)
+            return self._add(latest, state, solution, wild)
         except (_Refused, RuntimeError, np.linalg.LinAlgError, ValueError) as error:
             # GTSAM raises RuntimeError for a singular system, and its graph is then unusable.
             self.failures += 1
@@ -182,7 +186,9 @@ class FixedLagSmoother:
     def _advance(self, state: Kinematics, time_ns: int, density: Density) -> Step:
         return process.advance(state, time_ns, self.settings, density, self._up)
 
-    def _add(self, latest: Kinematics, state: Kinematics, solution: Solution) -> Kinematics:
+    def _add(
+        self, latest: Kinematics, state: Kinematics, solution: Solution, wild: bool
+    ) -> Kinematics:
         information = (solution.information + solution.information.T) / 2
         if not (np.isfinite(information).all() and np.isfinite(solution.gradient).all()):
             raise _Refused("the sights' information is not finite")
@@ -190,7 +196,7 @@ class FixedLagSmoother:
         error = process.difference(step.state, state)
         if not (np.isfinite(error).all() and np.isfinite(step.noise).all()):
             raise _Refused("the step from the last state is not finite")
-        if self._adaptation.learn(latest, step, error, information):
+        if self._adaptation.learn(latest, step, error, information, wild):
             step = self._advance(latest, state.time_ns, self.density)
         by_state, by_latest = _error_jacobians(error, step.transition)
         whiten = np.linalg.inv(np.linalg.cholesky(step.noise))
@@ -286,14 +292,26 @@ class _Adaptation:
     @property
     def density(self) -> Density:
         """Of the next step."""
-        rotation, translation = (float(f) for f in self._factor)
+        return self._times(*self._factor)
+
+    @property
+    def limit(self) -> Density:
+        """The highest that it is ever raised to."""
+        return self._times(self.settings.density_limit, self.settings.density_limit)
+
+    def _times(self, rotation: float, translation: float) -> Density:
         return Density(
-            rotation * self.settings.rotation_density_rad2_s3,
-            translation * self.settings.translation_density_m2_s3,
+            float(rotation * self.settings.rotation_density_rad2_s3),
+            float(translation * self.settings.translation_density_m2_s3),
         )
 
-    def learn(self, latest: Kinematics, step: Step, error: Array, information: Array) -> bool:
-        """Takes one frame's deviation (12,) into account; whether the densities have changed."""
+    def learn(
+        self, latest: Kinematics, step: Step, error: Array, information: Array, wild: bool
+    ) -> bool:
+        """Takes one frame's deviation (12,) into account; whether the densities have changed.
+
+        A `wild` one is no outlier, the whole map says so: it counts in full.
+        """
         limit = self.settings.density_limit
         dt_s = (step.state.time_ns - latest.time_ns) / 1e9
         # What is not carried on is no work of the densities.
@@ -303,12 +321,13 @@ class _Adaptation:
         # P⁻¹ − P⁻¹P⁺P⁻¹ with P⁺ = (P⁻¹ + I)⁻¹
         expected = precision - precision @ np.linalg.solve(precision + information, precision)
         pulled = precision @ error
-        share = min(0.5, dt_s / self.settings.density_time_s)
+        share = 1.0 if wild else min(0.5, dt_s / self.settings.density_time_s)
+        most = np.inf if wild else self._MOST
         for i, axes in enumerate((_ROTATION, _TRANSLATION)):
             noise = step.noise[axes[:, None], axes]
             seen = float(pulled[axes] @ noise @ pulled[axes])
             usual = float(np.sum(noise * expected[axes[:, None], axes]))
-            ratio = min(seen / usual, self._MOST) if usual > 1e-9 else 1.0
+            ratio = min(seen / usual, most) if usual > 1e-9 else 1.0
             self._factor[i] = np.clip(self._factor[i] * (1 + share * (ratio - 1)), 1.0, limit)
         return True
 

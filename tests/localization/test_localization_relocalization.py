@@ -152,6 +152,18 @@ def test_of_two_equal_places_neither_is_believed(building):
         assert isinstance(found, str) and "fit alike" in found
 
 
+def test_of_two_equal_places_both_are_named_for_who_knows_more(building):
+    """A prediction may decide what the picture alone does not."""
+    double = twice(building.map, 20.0)
+    relocalizer = Relocalizer(double, THESIS_CAMERA, SETTINGS, 0)
+    for wTc in building.path[:4]:
+        features = building.features(wTc)
+        normalized = THESIS_CAMERA.undistort(features.keypoints_px)
+        found = relocalizer.candidates(features, normalized)
+        assert len(found) > 1 and min(apart(one, wTc)[0] for one in found) < 0.03
+        assert "fit alike" in relocalizer.alone(found)
+
+
 def test_what_differs_between_two_alike_places_decides(building):
     double = twice(building.map, 20.0)
     rng = np.random.default_rng(6)

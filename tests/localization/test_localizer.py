@@ -267,6 +267,18 @@ def test_what_the_prediction_misses_is_found_in_the_same_frame(room, extractor):
         assert errors(found, path[k])[0] < 0.02
 
 
+def test_a_turn_that_nothing_foretold_is_no_new_beginning(room, extractor):
+    """A find that a wild camera may have reached keeps the motion known so far and adds to it."""
+    localizer = make(room, extractor)
+    _, path = room.path(30, rate_hz=10.0)
+    turned = poses.exp([0.0, np.deg2rad(6.0), 0.0, 0.0, 0.0, 0.0])
+    for k in range(30):
+        wTc = path[k] @ turned if k == 20 else path[k]
+        found = localizer.process_features(k * 100_000_000, room.features(wTc))
+        assert found.localized and errors(found, wTc)[0] < 0.02
+        assert found.state is State.TRACKING and found.relocalized == (k == 0)
+
+
 def test_a_find_that_the_camera_cannot_have_reached_waits_for_confirmation(room, extractor):
     localizer = make(room, extractor)
     times, path = room.path(300)
