@@ -26,6 +26,9 @@ from ground_station.features.model_info import SCALES, Model, ModelInfo
 
 _PAIRS, _SIZE, _SEED = 8, (240, 320), 7
 _FEATURES = 500
+_RULER_CONTRAST = 0.02
+"""The threshold of RootSIFT when its limits of distance were studied: fainter key points are a
+hundredth further apart, and the ruler must not move, for each model's file holds a ratio to it."""
 _SHARE = 0.9
 """Of the right matches: what is limited are the far ones."""
 _LEAST = 200
@@ -70,7 +73,8 @@ def _pairs() -> Pairs:
 
 @functools.cache
 def _rootsift() -> float:
-    return float(np.quantile(_right_distances(RootSift(_FEATURES), _pairs()), _SHARE))
+    ruler = RootSift(_FEATURES, _RULER_CONTRAST)
+    return float(np.quantile(_right_distances(ruler, _pairs()), _SHARE))
 
 
 def _right_distances(extractor: Extractor, pairs: Pairs) -> npt.NDArray[np.float64]:

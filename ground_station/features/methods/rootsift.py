@@ -24,14 +24,16 @@ class RootSift:
     dimension = 128
     distance_scale = 1.0
 
-    def __init__(self, max_features: int = 1500) -> None:
+    def __init__(
+        self, max_features: int = 1500, contrast_threshold: float = _CONTRAST_THRESHOLD
+    ) -> None:
         self.max_features = max_features
         # The model of a method without weights is its definition; a map made with another one
         # must be refused.
         self.sha256 = hashlib.sha256(b"rootsift/2 opencv-sift 128 hellinger").hexdigest()
         self._sift = cv2.SIFT.create(
             nfeatures=max_features,
-            contrastThreshold=_CONTRAST_THRESHOLD,
+            contrastThreshold=contrast_threshold,
             edgeThreshold=10,
             # Without it every key point lies a quarter of a pixel too far right and down.
             enable_precise_upscale=True,
