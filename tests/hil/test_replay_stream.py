@@ -89,9 +89,9 @@ def test_the_payloads_clock_is_measured_and_its_uncertainty_told(flown: ReplayRe
 
 def test_a_missed_bound_is_judged_so(flown: ReplayResult) -> None:
     bounds = flight_report.judge(flown, {flight_report.POSITION: 0.10, flight_report.GATED: 5.0})
-    assert all(bound.met for bound in bounds)
+    assert all(bound.holds for bound in bounds)
     missed = flight_report.judge(flown, {flight_report.POSITION: 1e-6})
-    assert not missed[0].met
+    assert not missed[0].holds
 
 
 def test_the_command_writes_results_and_report(tmp_path: Path) -> None:

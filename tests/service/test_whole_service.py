@@ -377,5 +377,6 @@ def test_a_payload_that_goes_and_comes_back_is_taken_up(tracked: Flying) -> None
         back_s = seconds(lambda: service.payload(NAME)["alive"] and service.tracking(NAME))
         assert viewer.connections == 1
     print(f"\npayload: gone in {gone_s:.1f} s, tracked {back_s:.1f} s after its start")
-    assert service.payload(NAME)["payload"]["ssrc"] != ssrc
+    # Its first health, which says so, may come after its first poses.
+    eventually(lambda: service.payload(NAME)["payload"]["ssrc"] != ssrc)
     assert service.processes() == before
