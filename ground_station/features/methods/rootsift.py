@@ -13,7 +13,8 @@ from ground_station.features.extractor import Features, check_image
 _CONTRAST_THRESHOLD = 0.006
 """So low that `max_features` decides, not contrast: indoor walls are faint. Beside 0.02, neighbours
 in a simulated walk through rooms had 1.9 times as many right matches (of the poorest tenth of the
-pairs 4 times), in the red kitchen 1.2 times and in a corridor as many, of matches as often right.
+pairs 4 times), in the red kitchen 1.2 times, of matches as often right; in a corridor as many, of
+which 83 % are right and not 86.
 """
 
 

@@ -41,7 +41,7 @@ _TOLERANCES = 1e-4, 1e-5
 100 images the centres were then as far from where 146 iterations end (a hundred-thousandth of the
 room) as with 1e-6, in half the time."""
 _NEARLY_ALL = 0.95
-"""Share of the images that the global method must place for `auto` to be content with it."""
+"""Share of the images that a model must have for no other method to be asked."""
 
 
 Pairs = Mapping[Pair, TwoView]
@@ -209,7 +209,7 @@ class _Reconstruction:
         work = self._work / "all"
         mapping = Incremental(work / "database.db", work, self._wanted, lambda: None)
         joined, notes = self._merged(mapping, [colmap.copied(each) for each in pieces], pairs)
-        if len(split(joined[0])) == 1:
+        if split(joined[0]) == joined[:1]:
             return joined, notes, []
         return pieces, [], [
             f"{len(pieces)} pieces fit each other only against what pairs of their images say: "
