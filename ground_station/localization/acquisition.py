@@ -23,7 +23,6 @@ from ground_station.localization.matching import (
 )
 from ground_station.localization.relocalization import Relocalization, Relocalizer
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.thresholds import RIGHT_PX, DescriptorThresholds
 from ground_station.localization.tracking import Keyframe, spread_out
 from ground_station.map.store import Map
 
@@ -57,13 +56,6 @@ class Located:
     relocalized: bool = False
     wild: bool = False
     significance: float = 0.0
-
-    def teach(self, thresholds: DescriptorThresholds | None) -> None:
-        """What a solved frame says about its landmarks' descriptors."""
-        if thresholds is not None and self.solution.state is not None:
-            matches = self.matches
-            right = self.observations.residual_px < RIGHT_PX
-            thresholds.learn(matches.landmark, matches.distance, right)
 
 
 @dataclass(frozen=True)

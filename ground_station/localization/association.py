@@ -28,9 +28,6 @@ _SLACK = 1e-4
 
 _LOW_BITS = np.uint64(0xFFFFFFFF)
 
-_GATE = 9.21
-"""The 99 % quantile of chi-square with two degrees of freedom."""
-
 
 @dataclass(frozen=True)
 class Associations:
@@ -54,8 +51,7 @@ def associate(
     candidate_descriptors: F32,
     settings: AssociationSettings,
     radius_px: float | Array | None = None,
-    max_distance: Array | F32 | None = None,
-    innovation_px2: Array | None = None,
+    max_distance: float | None = None,
     shows: Indices | None = None,
 ) -> Associations:
     """Pairs features (F, 2), (F, D) with expected landmarks (L, 2), (L, D), all unit descriptors.
@@ -64,29 +60,24 @@ def associate(
     descriptor distance, if that is below `max_descriptor_distance` and stands out from the second
     by `max_ratio`; of features that take the same landmark the nearest in descriptor keeps it.
 
-    `radius_px` may be one for each landmark (L,). `max_distance` (L,) gives each landmark a limit
-    of its own instead of `max_descriptor_distance`; beyond its limit over `max_ratio` it is no
-    rival either. `innovation_px2` (L, 2, 2), the covariance of a feature about each landmark's
-    projection, also drops pairs beyond its 99 % ellipse. A landmark whose radius, limit or
-    covariance is not finite is not paired.
+    `radius_px` may be one for each landmark (L,); one whose radius is not finite is not paired.
+    `max_distance` is asked instead of `max_descriptor_distance`.
 
     `shows` (L,) says which landmark, below L, each row describes, where some are described more
     than once: rows of one landmark are no rivals, the nearest counts, and `candidate` is then the
     landmark.
     """
     radius = np.asarray(settings.radius_px if radius_px is None else radius_px, np.float64)
-    limit = np.asarray(settings.max_descriptor_distance, np.float32)
-    if max_distance is not None:
-        limit = np.asarray(max_distance, np.float32)
     # NaN would spoil the largest of them; no pair is nearer than -1.
-    radius, limit = (np.where(np.isfinite(each), each, -1.0) for each in (radius, limit))
+    radius = np.where(np.isfinite(radius), radius, -1.0)
+    limit = np.float32(settings.max_descriptor_distance if max_distance is None else max_distance)
     if not len(feature_px) or not len(candidate_px):
         empty = np.empty(0, np.intp)
         return Associations(empty, empty, np.empty(0, np.float32))
     feature_descriptors = np.asarray(feature_descriptors, np.float32)
     candidate_descriptors = np.asarray(candidate_descriptors, np.float32)
     # A second landmark farther off than this can neither win nor spoil a winner's ratio.
-    farthest = np.clip(limit / settings.max_ratio, 0.0, 2.0)
+    farthest = min(max(float(limit) / settings.max_ratio, 0.0), 2.0)
     feature, candidate = _near_in_both(
         feature_px,
         _bounding(feature_descriptors),
@@ -96,23 +87,17 @@ def associate(
         1.0 - 0.5 * farthest**2 - _SLACK,
     )
     offset_px = feature_px.take(feature, axis=0) - candidate_px.take(candidate, axis=0)
-    near = _near(offset_px, candidate, radius, innovation_px2)
+    near = _near(offset_px, candidate, radius)
     feature, candidate = feature[near], candidate[near]
     apart = feature_descriptors.take(feature, axis=0)
     apart -= candidate_descriptors.take(candidate, axis=0)
     distance = np.sqrt(np.vecdot(apart, apart))
-    if limit.ndim:
-        plausible = distance <= farthest[candidate]
-        feature, candidate, distance = feature[plausible], candidate[plausible], distance[plausible]
-        limit = limit[candidate]
     order = _by_feature_and_distance(feature, distance, candidate)
     feature, candidate, distance = feature[order], candidate[order], distance[order]
-    limit = limit[order] if limit.ndim else limit
     if shows is not None:
         candidate = shows[candidate]
         kept = _nearest_of_each(feature, candidate, shows)
         feature, candidate, distance = feature[kept], candidate[kept], distance[kept]
-        limit = limit[kept] if limit.ndim else limit
     new = np.concatenate([[True], feature[1:] != feature[:-1]])[: len(feature)]
     wins = new & (distance < limit)
     if settings.max_ratio < 1.0:
@@ -177,11 +162,11 @@ def _near_in_both(
     candidate_px: Array,
     candidate_rows: F32,
     radius_px: float,
-    least_product: Array,
+    least_product: float,
 ) -> tuple[Indices, Indices]:
     """The pairs whose rows' product is large enough, of those within a radius and some others.
 
-    `least_product` is a number or one for each candidate. The pairs are in no order.
+    The pairs are in no order.
 
     Features are cut into bands of y and chunks of x. The landmarks around a chunk are consecutive
     in its band's order of x, so that each chunk is one small matrix product: far cheaper than all
@@ -196,15 +181,12 @@ def _near_in_both(
     edges = np.concatenate([[0], np.flatnonzero(np.diff(band[features])) + 1, [len(features)]])
     by_x = np.argsort(candidate_px[:, 0])
     xs, ys = candidate_px.take(by_x, axis=0).T
-    least = least_product.astype(np.float32)
     bands, hits, chunks, base = [], [], [], 0
     for begin, end in itertools.pairwise(edges.tolist()):
         top = float(band[features[begin]]) * height
         rows = np.flatnonzero((ys >= top - radius_px) & (ys <= top + height + radius_px))
         around = by_x[rows]
-        B, limit = candidate_rows.take(around, axis=0), least
-        if least.ndim:
-            limit = least[around, None]
+        B = candidate_rows.take(around, axis=0)
         starts = np.arange(begin, end, _CHUNK)
         stops = np.minimum(starts + _CHUNK, end)
         lefts = np.searchsorted(xs[rows], x[starts] - radius_px, "left")
@@ -213,7 +195,7 @@ def _near_in_both(
             starts.tolist(), stops.tolist(), lefts.tolist(), rights.tolist(), strict=True
         ):
             product = B[left:right] @ A[start:stop].T
-            hits.append(np.flatnonzero(product >= (limit[left:right] if least.ndim else limit)))
+            hits.append(np.flatnonzero(product >= np.float32(least_product)))
             chunks.append((len(hits[-1]), stop - start, start, base + left))
         bands.append(around)
         base += len(around)
@@ -226,18 +208,8 @@ def _near_in_both(
     )
 
 
-def _near(
-    offset_px: Array, candidate: Indices, radius_px: Array, innovation_px2: Array | None
-) -> npt.NDArray[np.bool_]:
-    """Whether offsets (N, 2) from candidates (N,) are within their radius and their ellipse."""
+def _near(offset_px: Array, candidate: Indices, radius_px: Array) -> npt.NDArray[np.bool_]:
+    """Whether offsets (N, 2) from candidates (N,) are within their radius."""
     radius = radius_px[candidate] if radius_px.ndim else radius_px
     near = np.einsum("ij,ij->i", offset_px, offset_px) <= np.copysign(radius**2, radius)
-    if innovation_px2 is None:
-        return near
-    S = np.asarray(innovation_px2, np.float64)[candidate]
-    u, v = offset_px.T
-    a, b, c = S[:, 0, 0], 0.5 * (S[:, 0, 1] + S[:, 1, 0]), S[:, 1, 1]
-    # rᵀS⁻¹r ≤ gate without the division; a matrix that is no covariance holds nothing.
-    determinant = a * c - b * b
-    square = c * u * u - 2 * b * u * v + a * v * v
-    return near & (a > 0) & (determinant > 0) & (square <= _GATE * determinant)
+    return np.asarray(near)

@@ -265,7 +265,6 @@ class Localizer:
         matches = found.matches
         attempt.counts = Counts(found.features, matches.projected, matches.associated, inliers)
         attempt.observations = found.observations
-        found.teach(self._matcher.thresholds)
         self._located = found
 
     def _gone(self, time_ns: int) -> bool:
@@ -344,7 +343,6 @@ class Localizer:
             return False
         attempt.watch.lap("wait")
         attempt.watch.stage_ms["background"] = landed.background_ms
-        landed.found.teach(self._matcher.thresholds)
         if landed.searched:
             self._refused = landed.reason if landed.keyframe is None else ""
         if landed.keyframe is None:

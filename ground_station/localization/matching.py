@@ -11,13 +11,13 @@ from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import Lens
-from ground_station.localization.association import associate
+from ground_station.localization.association import Associations, associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
+from ground_station.localization.chance import count_beyond_chance
 from ground_station.localization.kinematics import Kinematics, Sights
 from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.thresholds import DescriptorThresholds
 from ground_station.localization.verification import Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.map.modes import described
@@ -30,7 +30,7 @@ Indices = npt.NDArray[np.intp]
 _WIDTH_PX = 640.0
 """Of the pictures for which the settings name a search radius."""
 
-_APART = np.float32(1.2)
+_APART = 1.2
 """Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
 """
 
@@ -90,6 +90,8 @@ class Matcher:
     ) -> None:
         """`distance_scale` is the extractor's, by which all descriptor distances are divided."""
         self._scale = distance_scale if settings.association.scale_distances else 1.0
+        limit = settings.association.max_descriptor_distance
+        self._farthest = min(limit * self._scale, max(limit, _APART))
         self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
         self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
@@ -99,11 +101,6 @@ class Matcher:
         self._covisibility = (
             Covisibility(len(landmarks), keyframes)
             if settings.projection.covisibility and len(keyframes)
-            else None
-        )
-        self.thresholds = (
-            DescriptorThresholds(landmarks.spread / self._scale, settings.association)
-            if settings.association.learn_thresholds
             else None
         )
         self.radius_px = settings.association.radius_px * camera.width_px / _WIDTH_PX
@@ -133,27 +130,32 @@ class Matcher:
             if radius_px is None:
                 radius = self._radius_px(points, where, expected)
         watch.lap("projection")
-        limits: F32 = np.asarray(settings.association.max_descriptor_distance, np.float32)
-        if self.thresholds:
-            limits = self.thresholds.limits(projected.landmark)
         rows, mode = described(landmarks.descriptor, self._modes, projected.landmark)
         shows = None
         if mode is not None:  # a landmark's modes are looked for where it is itself
             shows = np.concatenate([np.arange(len(where)), mode])
-            where = where[shows]
-            radius = radius[shows] if isinstance(radius, np.ndarray) else radius
-            limits = limits[shows] if limits.ndim else limits
-        pairs = associate(
-            seen.pinhole_px,
-            seen.features.descriptors,
-            where,
-            rows,
-            settings.association,
-            radius,
-            np.minimum(limits * np.float32(self._scale), np.maximum(limits, _APART)),
-            shows=shows,
-        )
+
+        def pair(place: Indices) -> Associations:
+            """With each landmark looked for in the place of another of them (L,)."""
+            place = place if shows is None else place[shows]
+            return associate(
+                seen.pinhole_px,
+                seen.features.descriptors,
+                where[place],
+                rows,
+                settings.association,
+                radius[place] if isinstance(radius, np.ndarray) else radius,
+                self._farthest,
+                shows=shows,
+            )
+
+        own = np.arange(len(where))
+        pairs = pair(own)
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
+        if (share := settings.association.max_chance_share) < 1.0:
+            # What is found of landmarks in each other's places is found by chance.
+            by_chance = pair(np.roll(own, len(own) // 2)).distance
+            best = best[: count_beyond_chance(pairs.distance[best], by_chance, share)]
         watch.lap("association")
         return Matches(
             pairs.feature[best],

@@ -131,11 +131,13 @@ class AssociationSettings:
     max_ratio: float = config.key(
         1.0, "nearest over second nearest distance within the radius; 1: no test", low=0.1, high=1
     )
+    max_chance_share: float = config.key(
+        1.0,
+        "of the pairs; the farthest descriptors are left out until chance can have made no more",
+        low=0.001, high=1,
+    )  # fmt: skip
     refine_radius_px: float = config.key(
         0.0, "associate again this near after a first solution; 0: no", unit="px", low=0, high=500
-    )
-    learn_thresholds: bool = config.key(
-        False, "each landmark's largest distance is learned, up to max_descriptor_distance"
     )
 
 

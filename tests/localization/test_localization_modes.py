@@ -65,8 +65,8 @@ def test_association_compares_landmarks_and_not_their_looks(seed, ratio, radius,
     fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
     fp = lp[shows[own]] + rng.normal(0, 0.4 * radius, (50, 2))
     options = AssociationSettings(max_ratio=ratio)
-    limit = rng.uniform(0.4, 0.9, 60)
-    found = associate(fp, fd, lp[shows], rows, options, radius, limit[shows], shows=shows)
+    limit = rng.uniform(0.4, 0.9)
+    found = associate(fp, fd, lp[shows], rows, options, radius, limit, shows=shows)
 
     distance = _distances(fd, ld, modes)
     there = np.linalg.norm(fp[:, None] - lp[None], axis=2) <= radius
@@ -74,7 +74,7 @@ def test_association_compares_landmarks_and_not_their_looks(seed, ratio, radius,
     best = {}
     for i, row in enumerate(distance):
         j = int(np.argmin(row))
-        wins = row[j] < limit[j] and row[j] <= ratio * np.delete(row, j).min()
+        wins = row[j] < limit and row[j] <= ratio * np.delete(row, j).min()
         if wins and (j not in best or row[j] < best[j][0]):
             best[j] = (row[j], i)
     pairs = list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
