@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 import web_station as station
+from fastapi import FastAPI
 
 from ground_station.service import bus_messages
+from ground_station.service.web.recordings import Recordings, router
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -28,6 +32,11 @@ def write_recording(path, seconds=2.0):
         for at_ns in (0, int(seconds * 1e9)):
             mcap.add_message(channel, at_ns, b"{}", at_ns)
         mcap.finish()
+
+
+def open_files(path):
+    links = (os.path.realpath(link) for link in Path("/proc/self/fd").iterdir())
+    return [link for link in links if link == str(path)]
 
 
 def test_recordings_are_listed_with_size_and_duration(served, shelf):
@@ -115,14 +124,37 @@ def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypa
         assert (answer.status_code, answer.json()) == (409, {"detail": "a.mcap: no poses in it"})
 
 
-def test_what_grows_while_it_is_sent_ends_where_it_was(shelf, served):
-    from ground_station.service.web.recordings import _pieces
-
-    path = shelf / "a.mcap"
+def test_who_leaves_before_the_first_byte_leaves_nothing_open(tmp_path):
+    app = FastAPI()
+    app.include_router(router(Recordings(tmp_path, lambda: "")))
+    path = tmp_path / "a.mcap"
     path.write_bytes(b"x" * 1000)
-    descriptor = os.open(path, os.O_RDONLY)
-    pieces = _pieces(descriptor, 0, 1000)
+    sent = []
+
+    async def gone():
+        return {"type": "http.disconnect"}
+
+    async def send(message):
+        sent.append(message["type"])
+        await asyncio.sleep(0)  # where whoever has left is noticed
+
+    async def ask():
+        scope = {
+            "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "method": "GET",
+            "path": "/api/recordings/a.mcap", "query_string": b"", "headers": [],
+        }  # fmt: skip
+        for _ in range(5):
+            await app(scope, gone, send)
+
+    asyncio.run(ask())
+    assert sent.count("http.response.start") == 5
+    assert not open_files(path)
+
+
+def test_what_grows_while_it_is_sent_ends_where_it_was(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"x" * 1000)
+    pieces = Recordings(tmp_path, lambda: "").pieces("a.mcap", 0, 1000)
     path.write_bytes(b"y" * 5000)
     assert len(b"".join(pieces)) == 1000
-    with pytest.raises(OSError):
-        os.fstat(descriptor)
+    assert not open_files(path)

@@ -55,20 +55,42 @@ class Recordings:
             for status, name in found[:_FILES]
         ]
 
-    def open(self, name: str) -> tuple[int, int]:
-        """A descriptor of a recording and its size now; raises `NotFound`.
+    @contextlib.contextmanager
+    def open(self, name: str) -> Iterator[int]:
+        """The descriptor of a recording while it is read; raises `NotFound`.
 
         It is a regular file that lies in the folder itself: no link, no path.
         """
+        descriptor = -1
         if _NAME.fullmatch(name):
             flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
             with contextlib.suppress(OSError):
                 descriptor = os.open(self._folder / name, flags)
-                status = os.fstat(descriptor)
-                if stat.S_ISREG(status.st_mode):
-                    return descriptor, status.st_size
+        try:
+            if descriptor < 0 or not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise NotFound(f"there is no recording {name[:128]!r}")
+            yield descriptor
+        finally:
+            if descriptor >= 0:
                 os.close(descriptor)
-        raise NotFound(f"there is no recording {name[:128]!r}")
+
+    def size(self, name: str) -> int:
+        """How many bytes a recording has now; raises `NotFound`."""
+        with self.open(name) as descriptor:
+            return os.fstat(descriptor).st_size
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]:
+        """The bytes from begin to end, as far as they are there; the file may have grown since.
+
+        It opens the file only when the first is asked for: who leaves before holds nothing open.
+        """
+        with self.open(name) as descriptor:
+            while begin < end:
+                piece = os.pread(descriptor, min(_PIECE_BYTES, end - begin), begin)
+                if not piece:
+                    return
+                begin += len(piece)
+                yield piece
 
     def trajectory(self, name: str) -> str:
         """Poses of a recording as TUM text; raises a `BlimpError` with one line.
@@ -77,8 +99,7 @@ class Recordings:
         """
         from ground_station.recording.export import tum_lines
 
-        descriptor, _ = self.open(name)
-        os.close(descriptor)
+        self.size(name)
         if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
@@ -115,19 +136,6 @@ def _summed_up_s(path: Path) -> float | None:
     if figures is None or not figures.message_count:
         return None
     return round(1e-9 * (figures.message_end_time - figures.message_start_time), 3)
-
-
-def _pieces(descriptor: int, begin: int, end: int) -> Iterator[bytes]:
-    """The bytes from begin to end, as far as they are there; the file may have grown since."""
-    try:
-        while begin < end:
-            piece = os.pread(descriptor, min(_PIECE_BYTES, end - begin), begin)
-            if not piece:
-                return
-            begin += len(piece)
-            yield piece
-    finally:
-        os.close(descriptor)
 
 
 def _portion(header: str | None, size: int) -> tuple[int, int] | None:
@@ -171,12 +179,8 @@ def router(recordings: Recordings) -> APIRouter:
     )
     def download(file: FileName, request: Request) -> Response:
         """A recording's bytes as they are now, or a range of them."""
-        descriptor, size = recordings.open(file)
-        try:
-            part = _portion(request.headers.get("range"), size)
-        except HTTPException:
-            os.close(descriptor)
-            raise
+        size = recordings.size(file)
+        part = _portion(request.headers.get("range"), size)
         begin, end = part or (0, size)
         headers = {
             "content-length": str(end - begin),
@@ -186,7 +190,7 @@ def router(recordings: Recordings) -> APIRouter:
         if part:
             headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
         return StreamingResponse(
-            _pieces(descriptor, begin, end),
+            recordings.pieces(file, begin, end),
             206 if part else 200,
             headers,
             media_type="application/octet-stream",
