@@ -35,6 +35,8 @@ None: not known, or not taken. It is asked on the receiver's thread and has to r
 OnFrame = Callable[[str, ReceivedFrame], None]
 Send = Callable[[str, bytes, Address], None]
 """Sends RTCP to a payload at an address."""
+_Source = tuple[int, str | None]
+"""A stream's SSRC, and with keys the payload whose key it was made with."""
 
 _POLL_S = 0.05
 _BUSY_POLL_S, _IDLE_POLL_S = 0.01, 0.25
@@ -58,14 +60,15 @@ class Stream:
 
     def __init__(
         self,
-        ssrc: int,
+        source: _Source,
         payload_id: str,
         port: int,
         counters: Counters,
         on_frame: OnFrame,
         send: Send,
     ) -> None:
-        self.ssrc = ssrc
+        self.source = source
+        self.ssrc, self.key_owner = source
         self.rtx_ssrc: int | None = None
         """What comes with it is sent again (RFC 4588); None: nothing is."""
         self.payload_id = payload_id
@@ -76,7 +79,7 @@ class Stream:
         """Why its frames are not taken any more, in words."""
         self.began_ns = self.last_ns = time.monotonic_ns()
         self._counters = counters
-        self._assembly = Assembly(ssrc, counters)
+        self._assembly = Assembly(self.ssrc, counters)
         self._on_frame, self._send = on_frame, send
         self._address: Address | None = None
         self._sender_ssrc = 1 + secrets.randbelow(0xFFFFFFFF)
@@ -178,7 +181,6 @@ class Stream:
 class _Candidate:
     """A stream that nobody has vouched for: its first packets, held for when somebody does."""
 
-    key_owner: str | None
     first_ns: int
     last_ns: int
     asked_ns: int = 0
@@ -222,9 +224,9 @@ class MultiStreamReceiver:
             payload_id: SrtcpProtector(payload_id, key)
             for payload_id, key in (srtp_keys or {}).items()
         }
-        self._streams: dict[int, Stream] = {}
-        self._candidates: dict[int, _Candidate] = {}
-        self._accounts: dict[int, Counters] = {}
+        self._streams: dict[_Source, Stream] = {}
+        self._candidates: dict[_Source, _Candidate] = {}
+        self._accounts: dict[_Source, Counters] = {}
         self._changed = threading.Lock()
         self._closing = threading.Event()
         self._failure = ""
@@ -244,8 +246,8 @@ class MultiStreamReceiver:
         self._closing.set()
         self._thread.join()
         self._socket.close()
-        for ssrc in list(self._candidates):
-            self._forget(ssrc)
+        for source in list(self._candidates):
+            self._forget(source)
         for stream in self.streams():
             stream.end()
         for stream in self.streams():
@@ -301,28 +303,29 @@ class MultiStreamReceiver:
                 self._tidy(now_ns)
 
     def _take(self, datagram: bytes, now_ns: int, waited_ns: int, address: Address) -> None:
+        key_owner = None
         if self._unprotector is not None:
             plain = self._unprotector.unprotect(datagram)
             if plain is None:
                 return
-            datagram = plain
+            datagram, key_owner = plain, self._unprotector.sender
         packet = rtp.parse(datagram, now_ns, waited_ns)
         if packet is None:
             self._counters.garbage += 1
             return
-        stream = self._again(packet) if packet.again else self._streams.get(packet.ssrc)
+        source = packet.ssrc, key_owner
+        stream = self._again(source) if packet.again else self._streams.get(source)
         if stream is not None:
             stream.put(packet, address)
         elif packet.again:
             self._counters.other_streams += 1
         else:
-            self._hold(packet, address)
+            self._hold(source, packet, address)
 
-    def _again(self, packet: rtp.Packet) -> Stream | None:
+    def _again(self, source: _Source) -> Stream | None:
         """The stream of a retransmission, if its payload sent it; None for a stranger's."""
-        key_owner = self._unprotector.payload_id(packet.ssrc) if self._unprotector else None
         for stream in self._streams.values():
-            if stream.rtx_ssrc == packet.ssrc and key_owner in (None, stream.payload_id):
+            if source == (stream.rtx_ssrc, stream.key_owner):
                 return stream
         return None
 
@@ -336,10 +339,10 @@ class MultiStreamReceiver:
         with contextlib.suppress(OSError):  # closed meanwhile, or its network is gone
             self._socket.sendto(asked, socket.MSG_DONTWAIT, address)
 
-    def _hold(self, packet: rtp.Packet, address: Address) -> None:
+    def _hold(self, source: _Source, packet: rtp.Packet, address: Address) -> None:
         """Keeps a stranger's packet; beyond the limits the oldest is another stream's datagram."""
-        ssrc, now_ns = packet.ssrc, packet.arrival_ns
-        candidate = self._candidates.get(ssrc)
+        now_ns = packet.arrival_ns
+        candidate = self._candidates.get(source)
         if candidate is None:
             if len(self._candidates) >= _CANDIDATES:
                 # Whoever has shown the least goes first: random SSRCs push out one another.
@@ -347,8 +350,7 @@ class MultiStreamReceiver:
                     self._candidates, key=lambda known: len(self._candidates[known].packets)
                 )
                 self._forget(least)
-            key_owner = self._unprotector.payload_id(ssrc) if self._unprotector else None
-            candidate = self._candidates[ssrc] = _Candidate(key_owner, now_ns, now_ns)
+            candidate = self._candidates[source] = _Candidate(now_ns, now_ns)
         candidate.last_ns = now_ns
         candidate.packets.append(packet)
         candidate.address = address
@@ -356,25 +358,26 @@ class MultiStreamReceiver:
             candidate.packets.popleft()
             self._counters.other_streams += 1
         if now_ns - candidate.asked_ns >= _ASK_NS:
-            self._ask(ssrc, candidate, now_ns)
+            self._ask(source, candidate, now_ns)
 
-    def _ask(self, ssrc: int, candidate: _Candidate, now_ns: int) -> None:
+    def _ask(self, source: _Source, candidate: _Candidate, now_ns: int) -> None:
         """Begins the stream if somebody vouches for it now."""
         candidate.asked_ns = now_ns
         age_s = (now_ns - candidate.first_ns) / 1e9 if candidate.continuous else 0.0
-        owner = self._owner(ssrc, candidate.key_owner, age_s)
-        if owner is None or candidate.key_owner not in (None, owner):
+        ssrc, key_owner = source
+        owner = self._owner(ssrc, key_owner, age_s)
+        if owner is None or key_owner not in (None, owner):
             return
         if not self._make_room(owner, now_ns):
             return
-        del self._candidates[ssrc]
-        counters = self._accounts.pop(ssrc, None) or Counters()
-        self._accounts[ssrc] = counters
+        del self._candidates[source]
+        counters = self._accounts.pop(source, None) or Counters()
+        self._accounts[source] = counters
         if len(self._accounts) > _ACCOUNTS:
             del self._accounts[next(iter(self._accounts))]
-        stream = Stream(ssrc, owner, self.port, counters, self._on_frame, self._send)
+        stream = Stream(source, owner, self.port, counters, self._on_frame, self._send)
         with self._changed:
-            self._streams[ssrc] = stream
+            self._streams[source] = stream
         for packet in candidate.packets:
             stream.put(packet, candidate.address)
 
@@ -395,19 +398,19 @@ class MultiStreamReceiver:
 
     def _drop(self, stream: Stream) -> None:
         with self._changed:
-            self._streams.pop(stream.ssrc, None)
+            self._streams.pop(stream.source, None)
         stream.end()
 
-    def _forget(self, ssrc: int) -> None:
-        self._counters.other_streams += len(self._candidates.pop(ssrc).packets)
+    def _forget(self, source: _Source) -> None:
+        self._counters.other_streams += len(self._candidates.pop(source).packets)
 
     def _tidy(self, now_ns: int) -> None:
         """Asks for the strangers again, and lets go of who has been silent for long."""
-        for ssrc, candidate in list(self._candidates.items()):
+        for source, candidate in list(self._candidates.items()):
             if now_ns - candidate.last_ns > _CANDIDATE_NS:
-                self._forget(ssrc)
+                self._forget(source)
             elif now_ns - candidate.asked_ns >= _ASK_NS:
-                self._ask(ssrc, candidate, now_ns)
+                self._ask(source, candidate, now_ns)
         for stream in self.streams():
             if now_ns - stream.last_ns > _SILENT_NS:
                 self._drop(stream)
@@ -416,8 +419,7 @@ class MultiStreamReceiver:
 
     def _rename(self, stream: Stream) -> None:
         """A stream that was taken for another's, or nobody's, goes on as who says it is its own."""
-        key_owner = self._unprotector.payload_id(stream.ssrc) if self._unprotector else None
-        owner = self._owner(stream.ssrc, key_owner, 0.0)
+        owner = self._owner(stream.ssrc, stream.key_owner, 0.0)
         taken = {other.payload_id for other in self.streams()}
-        if owner is not None and owner not in taken and key_owner in (None, owner):
+        if owner is not None and owner not in taken and stream.key_owner in (None, owner):
             stream.payload_id = owner

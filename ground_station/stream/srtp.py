@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ground_station.stream.counters import Counters
+from ground_station.stream.rtp import MAX_JUMP
 from pi_firmware.wire import keys as names
 from pi_firmware.wire import video
 from pi_firmware.wire.errors import StreamError, TelemetryError
@@ -26,10 +27,11 @@ from pi_firmware.wire.srtp import TAG_BYTES, read_key
 
 FOLDER = "srtp"
 """Where the payloads' keys are in a ground station's certificate folder."""
-REPLAY_WINDOW = 4096
-"""Packets of which it is known whether they came: more than the reorderer ever waits for."""
+REPLAY_WINDOW = MAX_JUMP
+"""Packets of which it is known whether they came. The reorderer would take older ones for a new
+sender's."""
 STREAMS = 64
-"""Streams kept; each of them has authenticated itself, so that no flood fills them."""
+"""SSRCs kept; each of them has authenticated itself, so that no flood fills them."""
 SEARCH_RATE_HZ = 20_000
 """Tags computed a second, at most, to find ROCs, of 1.7 microseconds each where it was measured."""
 SEARCH_TAGS = 2048
@@ -98,7 +100,7 @@ def _made_with(begun: hmac.HMAC, roc: int, tag: bytes) -> bool:
 
 @dataclass
 class _Stream:
-    """What belongs to one SSRC: whose it is, its highest index, and which ones below it came."""
+    """One payload's with one SSRC: its keys, its highest index, and which ones below it came."""
 
     keys: SessionKeys
     highest: int
@@ -147,9 +149,9 @@ class Unprotector:
     `counters.replayed`. With `ssrc`, only that stream is looked at, and others go to
     `counters.other_streams`. Raises `StreamError` for a key of another length.
 
-    An SSRC belongs to the payload that first sends with it. What a payload sent in an earlier
-    flight is authentic, too: only `ssrc`, from telemetry, tells today's stream from one played
-    back to a receiver that has just started.
+    A stream is a payload's key with an SSRC, so that who sends with another's SSRC does not shut
+    it out. What a payload sent in an earlier flight is authentic, too: only `ssrc`, from telemetry,
+    tells today's stream from one played back to a receiver that has just started.
     """
 
     def __init__(
@@ -161,23 +163,20 @@ class Unprotector:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = counters or Counters()
+        self.sender: str | None = None
+        """The payload of the packet that was taken last."""
         self.tags_searched = 0
         """Tags computed so far to find ROCs."""
         self._keys = [
             SessionKeys(payload_id, master, SRTP_LABEL) for payload_id, master in keys.items()
         ]
         self._ssrc = ssrc
-        self._streams: dict[int, _Stream] = {}
+        self._streams: dict[int, dict[str, _Stream]] = {}
         # Apart, so that a flood of unknown streams does not keep a known one from coming back.
         self._to_join, self._to_follow = _Budget(clock), _Budget(clock)
         # One half for young streams, the other for older ones, and the payloads share both.
         self._rocs = max(1, SEARCH_TAGS // (2 * max(1, len(keys))))
         self._next_roc = self._rocs
-
-    def payload_id(self, ssrc: int) -> str | None:
-        """Which payload a stream has authenticated as; None for one that has not."""
-        stream = self._streams.get(ssrc)
-        return stream.keys.payload_id if stream else None
 
     def unprotect(self, datagram: bytes) -> bytes | None:
         """The RTP packet in a datagram; None, and counted, when it is not authentic and new."""
@@ -193,8 +192,10 @@ class Unprotector:
             self.counters.refused += 1
             return None
         stream, index = found
-        self._streams.pop(packet.ssrc, None)
-        self._streams[packet.ssrc] = stream  # behind those that were heard less lately
+        self.sender = stream.keys.payload_id
+        streams = self._streams.pop(packet.ssrc, {})
+        streams[self.sender] = stream
+        self._streams[packet.ssrc] = streams  # behind those that were heard less lately
         if len(self._streams) > STREAMS:
             del self._streams[next(iter(self._streams))]
         if not stream.accept(index):
@@ -205,26 +206,31 @@ class Unprotector:
 
     def _find(self, packet: _Packet) -> tuple[_Stream, int] | None:
         """The packet's stream and index, authenticated; None when it is not authentic."""
-        stream = self._streams.get(packet.ssrc)
-        if stream is None:
-            return self._join(packet)
-        index = stream.estimate(packet.sequence)
-        if _made_with(stream.keys.begin_tag(packet.authenticated), index >> 16, packet.tag):
-            return stream, index
+        streams = self._streams.get(packet.ssrc, {})
+        for stream in streams.values():
+            index = stream.estimate(packet.sequence)
+            if _made_with(stream.keys.begin_tag(packet.authenticated), index >> 16, packet.tag):
+                return stream, index
+        for stream in streams.values():
+            if (found := self._follow(packet, stream)) is not None:
+                return found
+        return self._join(packet, [own for own in self._keys if own.payload_id not in streams])
+
+    def _follow(self, packet: _Packet, stream: _Stream) -> tuple[_Stream, int] | None:
+        """A known stream after a silence of more than half a round of the sequence numbers."""
         if not self._to_follow.is_left():
             return None
-        # Forged, or the link was gone for more than half a round of the sequence numbers.
         first = (stream.highest - packet.sequence >> 16) + 1  # the least that is beyond the highest
         rocs = range(first, first + SEARCH_TAGS)
         found = self._search(packet, [stream.keys], rocs, self._to_follow)
         return (stream, found[1]) if found else None
 
-    def _join(self, packet: _Packet) -> tuple[_Stream, int] | None:
+    def _join(self, packet: _Packet, keys: Sequence[SessionKeys]) -> tuple[_Stream, int] | None:
         """A stream not heard before: mostly young; if not, older ones are tried by and by."""
-        if not self._to_join.is_left():
+        if not keys or not self._to_join.is_left():
             return None
         young, older = range(self._rocs), range(self._next_roc, self._next_roc + self._rocs)
-        found = self._search(packet, self._keys, chain(young, older), self._to_join)
+        found = self._search(packet, keys, chain(young, older), self._to_join)
         if found is None:
             self._next_roc = older.stop if older.stop < _ROC_LIMIT else young.stop
             return None

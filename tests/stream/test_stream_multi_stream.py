@@ -210,6 +210,20 @@ def test_with_keys_each_payload_is_its_own_and_nobody_elses() -> None:
         assert port.receiver.encrypted and len(port.receiver.streams()) == 2
 
 
+def test_a_payload_that_sends_with_anothers_ssrc_does_not_shut_it_out() -> None:
+    draw = random.Random(6)
+    keys = {"one": draw.randbytes(30), "two": draw.randbytes(30)}
+    with SrtpSender(keys["one"]) as first, SrtpSender(keys["two"]) as second:
+        squatting = first.protect(packets(units()[:3], ssrc=2))
+        own = second.protect(packets(units(), ssrc=2))
+    for before in (0, len(own) // 2):  # the owner's own first, or in the middle of them
+        with Port({2: "two"}, srtp_keys=keys) as port:
+            port.send([*own[:before], *squatting, *own[before:]])
+            assert until(lambda: port.shown("two") == [*range(FRAMES)])
+            (stream,) = port.receiver.streams()
+            assert stream.counters.packets == len(own) and "one" not in port.frames
+
+
 def test_there_are_only_so_many_streams_and_a_silent_one_gives_way() -> None:
     with Port({1: "one", 2: "two"}, max_streams=1) as port:
         port.send(packets(units(), ssrc=1))

@@ -9,7 +9,9 @@ import pytest
 from srtp_sender import SrtpSender
 
 from ground_station.keys.authority import Authority
+from ground_station.stream import rtp as rtp_stream
 from ground_station.stream import srtp
+from ground_station.stream.counters import Counters
 from ground_station.stream.srtp import Unprotector
 from pi_firmware.wire import srtcp
 from pi_firmware.wire.errors import StreamError
@@ -87,7 +89,7 @@ def test_what_was_protected_comes_out_byte_by_byte(sender: SrtpSender, first: in
     assert not any(q[12:] in p for p, q in zip(protected[5:], plain[5:], strict=True))
     unprotector = Unprotector({"blimp-0": OTHER_KEY, ID: KEY})
     assert [unprotector.unprotect(packet) for packet in protected] == plain
-    assert unprotector.payload_id(77) == ID and unprotector.payload_id(78) is None
+    assert unprotector.sender == ID
     assert unprotector.counters.refused == unprotector.counters.replayed == 0
 
 
@@ -276,7 +278,7 @@ def test_streams_are_bounded_and_those_heard_lately_are_kept(sender: SrtpSender)
         assert unprotector.unprotect(own) is not None
         assert unprotector.unprotect(other) is not None
     assert len(unprotector._streams) == srtp.STREAMS
-    assert unprotector.payload_id(1) == ID and unprotector.payload_id(1000) is None
+    assert 1 in unprotector._streams and 1000 not in unprotector._streams
 
 
 def test_an_earlier_part_played_back_does_not_keep_the_live_stream_away(
@@ -293,11 +295,35 @@ def test_an_earlier_part_played_back_does_not_keep_the_live_stream_away(
         assert unprotector.unprotect(replayed) is None
 
 
+def test_one_ssrc_in_two_payloads_hands_is_two_streams(sender: SrtpSender) -> None:
+    plain = [rtp(0xFFFE + number) for number in range(4)]
+    with SrtpSender(OTHER_KEY) as other:
+        squatting = other.protect(plain)
+    unprotector = Unprotector({"blimp-0": OTHER_KEY, ID: KEY})
+    for packet, theirs, own in zip(plain, squatting, sender.protect(plain), strict=True):
+        assert unprotector.unprotect(theirs) == packet and unprotector.sender == "blimp-0"
+        assert unprotector.unprotect(own) == packet and unprotector.sender == ID
+        assert unprotector.unprotect(own) is None
+
+
+def test_what_the_reorderer_takes_for_a_new_sender_is_too_old(sender: SrtpSender) -> None:
+    played_back = sender.protect(rtp(number) for number in range(20))
+    live = sender.protect(rtp(rtp_stream.MAX_JUMP + number) for number in range(1, 50))
+    unprotector, reorderer = Unprotector({ID: KEY}), rtp_stream.Reorderer(Counters())
+    given = []
+    for datagram in [*live[:2], *played_back, *live[2:]]:
+        if (plain := unprotector.unprotect(datagram)) is not None:
+            packet = rtp_stream.parse(plain, 0)
+            assert packet is not None
+            given += [taken.sequence for taken, _ in reorderer.push(packet)]
+    assert given == [rtp_stream.MAX_JUMP + number for number in range(1, 50)]
+
+
 def test_a_counter_at_its_end_does_not_end_the_receiver(sender: SrtpSender) -> None:
     packet = sender.protect([rtp(0)])[0]
     unprotector = Unprotector({ID: KEY})
     assert unprotector.unprotect(packet) is not None
-    unprotector._streams[77].highest = (1 << 48) - 1
+    unprotector._streams[77][ID].highest = (1 << 48) - 1
     assert unprotector.unprotect(packet) is None
 
 
