@@ -20,6 +20,9 @@ from pi_firmware.wire.errors import TelemetryError
 
 M = TypeVar("M", bound="Message")
 
+MOST_LETTERS, MOST_ITEMS = 1024, 64
+"""Of a text, of which the rest is cut, and of a list or an object, which is refused beyond it."""
+
 ALARM_NONE, ALARM_LOW, ALARM_CRITICAL = "", "low", "critical"
 
 
@@ -323,19 +326,28 @@ def _value(value: Any, kind: Any, what: str) -> Any:
     if typing.get_origin(kind) is list:
         if not isinstance(value, list):
             raise TelemetryError(f"{what} must be a list, not {str(value)[:60]!r}")
+        _check_count(value, what)
         item = typing.get_args(kind)[0]
         return [_value(v, item, f"{what}[{i}]") for i, v in enumerate(value)]
     if typing.get_origin(kind) is dict:
         if not isinstance(value, dict):
             raise TelemetryError(f"{what} must be an object, not {str(value)[:60]!r}")
+        _check_count(value, what)
         item = typing.get_args(kind)[1]
-        return {str(k): _value(v, item, f"{what}[{k!r:.40}]") for k, v in value.items()}
+        return {k[:MOST_LETTERS]: _value(v, item, f"{what}[{k!r:.40}]") for k, v in value.items()}
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**1000 else math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise TelemetryError(f"{what} must be {kind.__name__}, not {str(value)[:60]!r}")
-    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise TelemetryError(f"{what} holds half a character, which no text can")
+    if isinstance(value, str):
+        value = value[:MOST_LETTERS]
+        if any("\ud800" <= letter <= "\udfff" for letter in value):
+            raise TelemetryError(f"{what} holds half a character, which no text can")
     if isinstance(value, float) and not math.isfinite(value):
         raise TelemetryError(f"{what} must be finite, not {value}")
     return value
+
+
+def _check_count(value: list[Any] | dict[str, Any], what: str) -> None:
+    if len(value) > MOST_ITEMS:
+        raise TelemetryError(f"{what} has {len(value)} items; allowed: {MOST_ITEMS}")

@@ -19,6 +19,8 @@ from pi_firmware.wire import credentials, scouting
 from pi_firmware.wire.errors import TelemetryError
 
 PORT = 7447
+MESSAGE_BYTES = 64 * 1024
+"""A longer message is dropped as it comes; the largest of ours has a few thousand."""
 LOCAL_ENDPOINT = f"tcp/127.0.0.1:{PORT}"
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^\[\]:/#?]+):(\d{1,5})")
 _ATTEMPTS = 5
@@ -194,6 +196,7 @@ def session_config(
         "scouting/gossip/enabled": False,
         # On one host large payloads would silently go through /dev/shm, which may be small.
         "transport/shared_memory/enabled": False,
+        "transport/link/rx/max_message_size": MESSAGE_BYTES,
     }
     settings |= more
     if held is not None:

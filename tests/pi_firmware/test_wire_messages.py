@@ -15,6 +15,7 @@ GATE = messages.Gate(
     time_ns=9, capture_ns=8, sequence=3, passed=False, heartbeat=False, entropy_bits=4.5,
     sharpness=10.0, captured=4, gated=1, heartbeats=0, sent=3, ssrc=77,
 )  # fmt: skip
+HEALTH = messages.Health(time_ns=1, uptime_s=2.0)
 EVENT = messages.Event(time_ns=1, name="started", text="up", values={"ssrc": 77})
 ROS_BATTERY_STATE = {
     "voltage", "temperature", "current", "charge", "capacity", "design_capacity", "percentage",
@@ -71,6 +72,8 @@ def test_fields_that_an_older_writer_did_not_send_get_their_default() -> None:
         (messages.Gate, changed(GATE, passed=1), "'passed' must be bool"),
         (messages.Event, changed(EVENT, values=[1]), "'values' must be an object"),
         (messages.Event, changed(EVENT, values={"a": "b"}), "'values'['a'] must be int"),
+        (messages.Event, changed(EVENT, values=dict.fromkeys(map(str, range(65)), 1)), "65 items"),
+        (messages.Health, changed(HEALTH, late=["a"] * 65), "'late' has 65 items; allowed: 64"),
         (messages.Event, changed(EVENT, values={"a\n" * 99: "b"}), r"'values'['a\na\na"),
     ],
 )
@@ -88,6 +91,14 @@ def test_a_wrong_message_is_refused_by_name(
 def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
     with pytest.raises(TelemetryError):
         messages.decode(messages.Gate, data)
+
+
+def test_a_text_without_end_is_cut() -> None:
+    for name in ("name", "text"):
+        decoded = messages.decode(messages.Event, changed(EVENT, **{name: "x" * 10_000}))
+        assert getattr(decoded, name) == "x" * 1024
+    decoded = messages.decode(messages.Event, changed(EVENT, values={"x" * 10_000: 1}))
+    assert decoded.values == {"x" * 1024: 1}
 
 
 def test_a_number_that_is_not_finite_is_never_sent() -> None:

@@ -140,6 +140,20 @@ def test_hostile_messages_are_refused_and_counted(listener: TelemetryListener) -
     session.close()
 
 
+def test_a_message_of_megabytes_is_dropped_and_its_payload_heard_on(
+    listener: TelemetryListener,
+) -> None:
+    session = open_session(connect=listener.endpoints)
+    publisher = session.zenoh.declare_publisher(keys.key("blimp-1", keys.EVENT))
+    event = messages.Event(time_ns=1, name="large", text="x" * 5_000_000)
+    publisher.put(messages.encode(event))
+    publisher.put(messages.encode(messages.Event(time_ns=2, name="small", text="")))
+    assert listener.wait_for_event("blimp-1", "small", LIMIT_S)
+    state = listener.state("blimp-1")
+    assert state is not None and [event.name for event in state.events] == ["small"]
+    session.close()
+
+
 def test_events_are_handed_on_as_they_come() -> None:
     heard: list[tuple[str, str]] = []
     with TelemetryListener(
