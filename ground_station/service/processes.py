@@ -6,6 +6,7 @@ after a pause that doubles; nobody else waits for it.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import signal
 import subprocess
@@ -25,6 +26,7 @@ _START_S = 60.0  # the first beat of a process that loads a large map on a busy 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _STEADY_S = 30.0  # who has lived this long begins with the shortest pause again
 _TERM_S = 8.0
+_KILL_S = 1.0  # one in the kernel's hands may not end for ever
 
 
 class ServiceError(GroundStationError):
@@ -128,6 +130,14 @@ class Child:
             self._kill()
         self._process = None
 
+    def is_gone(self, until_s: float) -> bool:
+        """Whether it has ended; from an instant of the clock on it is killed."""
+        if self._process is None or self._process.poll() is not None:
+            return True
+        if self._clock() >= until_s:
+            self._process.kill()
+        return False
+
     def _start(self) -> None:
         command = [sys.executable, "-m", self.spec.module, *self.spec.arguments]
         # A parent that is killed takes its children with it, whoever started it.
@@ -151,7 +161,8 @@ class Child:
     def _kill(self) -> None:
         assert self._process is not None
         self._process.send_signal(signal.SIGKILL)
-        self._process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILL_S)
 
 
 class Children:
@@ -161,22 +172,26 @@ class Children:
         self._report = report
         self._lock = threading.Lock()
         self._children = {spec.name: Child(spec) for spec in specs}
+        self._leaving: dict[str, tuple[Child, float]] = {}
+        """What was removed and has not ended yet, with when it is killed."""
 
     def __contains__(self, name: str) -> bool:
         return name in self._children
 
     def add(self, spec: Spec) -> None:
-        """Another process, unless one of its name is there."""
+        """Another process, unless one of its name is there or still ends."""
+        if spec.name in self._leaving:
+            return
         with self._lock:
             self._children.setdefault(spec.name, Child(spec))
 
     def remove(self, name: str) -> None:
-        """Ends a process and forgets it."""
+        """Lets a process end, which nobody waits for, and forgets it."""
         with self._lock:
             child = self._children.pop(name, None)
         if child is not None:
             child.terminate()
-            child.wait(time.monotonic() + _TERM_S)
+            self._leaving[name] = child, time.monotonic() + _TERM_S
 
     def heartbeat(self, name: str, pid: int) -> None:
         """A process was heard."""
@@ -187,6 +202,11 @@ class Children:
 
     def step(self) -> None:
         """Starts what is due; raises `ServiceError` when a needed process cannot start."""
+        self._leaving = {
+            name: (child, until_s)
+            for name, (child, until_s) in self._leaving.items()
+            if not child.is_gone(until_s)
+        }
         for child in list(self._children.values()):
             if child.spec.later and not (child.started or self.living()):
                 continue
@@ -216,6 +236,7 @@ class Children:
     def close(self) -> None:
         """Ends all, the last ones started first."""
         children = list(reversed(self._children.values()))
+        children += [child for child, _ in self._leaving.values()]
         for child in children:
             child.terminate()
         until_s = time.monotonic() + _TERM_S

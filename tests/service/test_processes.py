@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_station.service import bus_messages, settings
+from ground_station.service import bus_messages, processes, settings
 from ground_station.service.bus import Bus, Router
 from ground_station.service.bus_messages import EventMessage, FrameMessage, PayloadMessage
 from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter, path_of
@@ -107,6 +107,49 @@ def test_a_process_that_falls_silent_is_killed_and_started_anew(modules: Path) -
     child.wait(clock() + LIMIT_S)
 
 
+def test_who_ends_slowly_is_not_waited_for(modules: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "_TERM_S", 1.0)
+    spec = Spec("stays", "stand_in_stays")
+    children = Children((spec,), lambda text: None)
+    children.step()
+    pid = children.pids()["stays"]
+    os.kill(pid, signal.SIGSTOP)  # it hears no request to end
+    until(lambda: _state(pid) == "T")
+    children.remove("stays")
+    assert _runs(pid) and "stays" not in children
+    children.add(spec)
+    assert "stays" not in children  # not beside the one that ends
+    until(lambda: not _runs(pid), children.step)
+    until(lambda: "stays" in children, lambda: (children.step(), children.add(spec)))
+    children.close()
+
+
+def test_who_cannot_be_killed_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Undying(subprocess.Popen[bytes]):
+        def __init__(self, *_: object, **__: object) -> None:
+            self.pid, self.returncode = 1, None
+
+        def poll(self) -> int | None:
+            return None
+
+        def wait(self, timeout: float | None = None) -> int:
+            assert timeout is not None
+            raise subprocess.TimeoutExpired("undying", timeout)
+
+        def send_signal(self, sig: int) -> None:
+            pass
+
+        def __del__(self) -> None:
+            pass
+
+    monkeypatch.setattr(subprocess, "Popen", Undying)
+    clock = Time()
+    child = Child(Spec("stays", "stand_in_stays"), clock)
+    child.step()
+    clock.now_s += 61.0
+    assert "was silent for 61 s" in child.step()
+
+
 def test_bad_input_of_a_needed_process_ends_the_service(modules: Path) -> None:
     children = Children((Spec("refuses", "stand_in_refuses"),), lambda text: None)
 
@@ -161,10 +204,14 @@ def test_children_end_with_a_parent_that_is_killed(modules: Path, tmp_path: Path
 
 
 def _runs(pid: int) -> bool:
+    return _state(pid) not in ("", "Z")
+
+
+def _state(pid: int) -> str:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
-        return False
+        return ""
 
 
 def test_notes_cross_the_bus_and_what_is_none_is_dropped(bus_folder: Path) -> None:
