@@ -13,6 +13,8 @@ import pytest
 from browsing import browser, launch  # noqa: F401 - fixtures
 from hypothesis import settings
 
+# As every program sets it: BLAS's own threads would spin against those of the tests beside them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.append(str(Path(__file__).with_name("stream")))  # for `receiving`, which many rooms need
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
