@@ -62,20 +62,32 @@ def align(
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise GeometryError("alignment: a coordinate is not a finite number")
 
-    mean_x, mean_y = w @ x, w @ y  # eq. 34, 35
-    dx, dy = x - mean_x, y - mean_y
-    variance_x = float(w @ np.sum(dx * dx, axis=1))  # eq. 36
-    covariance = (dy * w[:, None]).T @ dx  # eq. 38
-    U, D, Vt = np.linalg.svd(covariance)
-    if not D[1] > RANK_TOLERANCE * D[0]:
+    rotation, translation, scale, determined = similarities(x, y, w)
+    if not determined:
         raise GeometryError("alignment: the points lie on one line or in one place")
-    S = np.ones(3)  # eq. 39, and 43 where the points lie in one plane
-    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
-        S[2] = -1.0
-    rotation = (U * S) @ Vt  # eq. 40
-    scale = float(D @ S) / variance_x if with_scale else 1.0  # eq. 42
-    translation = mean_y - scale * rotation @ mean_x  # eq. 41
-    return Alignment(rotation, translation, scale)
+    if not with_scale:
+        return Alignment(rotation, w @ y - rotation @ (w @ x), 1.0)
+    return Alignment(rotation, translation, float(scale))
+
+
+def similarities(x: Array, y: Array, w: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """`align` with scale for many sets at once: x and y (..., N, 3), finite; weights w (N,), sum 1.
+
+    Rotations (..., 3, 3), translations (..., 3), scales (...), and which sets determine theirs.
+    """
+    mean_x, mean_y = w @ x, w @ y  # eq. 34, 35
+    dx, dy = x - mean_x[..., None, :], y - mean_y[..., None, :]
+    variance_x = np.sum(dx * dx, axis=-1) @ w  # eq. 36
+    covariance = np.swapaxes(dy * w[:, None], -1, -2) @ dx  # eq. 38
+    U, D, Vt = np.linalg.svd(covariance)
+    determined = D[..., 1] > RANK_TOLERANCE * D[..., 0]
+    S = np.ones_like(D)  # eq. 39, and 43 where the points lie in one plane
+    S[..., 2] = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0, -1.0, 1.0)
+    rotation = (U * S[..., None, :]) @ Vt  # eq. 40
+    with np.errstate(divide="ignore", invalid="ignore"):  # points in one place
+        scale = np.sum(D * S, axis=-1) / variance_x  # eq. 42
+        translation = mean_y - scale[..., None] * np.einsum("...ij,...j", rotation, mean_x)  # 41
+    return rotation, translation, scale, determined
 
 
 def _normalized(weights: npt.ArrayLike | None, n: int) -> Array:

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.errors import GeometryError, MapError
-from ground_station.geometry.alignment import Alignment, align
+from ground_station.errors import MapError
+from ground_station.geometry.alignment import Alignment, align, similarities
 
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -50,17 +50,7 @@ def robust_similarity(
     check_spread(target, what)
     n = len(source)
     # The half that must agree has to be more than the triple, which fits itself.
-    rank = min(n - 1, max(n // 2, MIN_POINTS))
-    best, best_score = None, np.inf
-    for triple in _triples(n, seed):
-        try:
-            check_spread(target[triple], what)
-            candidate = align(source[triple], target[triple], True)
-        except (MapError, GeometryError):
-            continue
-        score = float(np.sort(np.linalg.norm(candidate.apply(source) - target, axis=1))[rank])
-        if score < best_score:
-            best, best_score = candidate, score
+    best, best_score = _best_triple(source, target, seed, min(n - 1, max(n // 2, MIN_POINTS)))
     if best is None:
         raise MapError(f"registration: no three of the {n} {what} form a triangle")
     deviation = 1.4826 * (1 + 5 / max(n - MIN_POINTS, 1)) * best_score
@@ -78,6 +68,25 @@ def robust_similarity(
         check_spread(target[inliers], f"{what} that agree with each other")
         result = align(source[inliers], target[inliers], True, 1.0 / variance[inliers])
     return result, inliers
+
+
+def _best_triple(source: F64, target: F64, seed: int, rank: int) -> tuple[Alignment | None, float]:
+    """The similarity by three points after which the error of this `rank` is least, and that."""
+    triples = np.array(_triples(len(source), seed))
+    x, y = source[triples], target[triples]
+    good = np.isfinite(x).all(axis=(1, 2)) & np.isfinite(y).all(axis=(1, 2))
+    x, y = x[good], y[good]
+    extent = np.linalg.svd(y - y.mean(axis=1, keepdims=True), compute_uv=False)
+    wide = (extent[:, 1] >= MIN_WIDTH * extent[:, 0]) & (extent[:, 0] > 0)
+    rotation, translation, scale, determined = similarities(x, y, np.full(3, 1 / 3))
+    best, best_score = None, np.inf
+    for k in np.flatnonzero(wide & determined):
+        candidate = Alignment(rotation[k], translation[k], float(scale[k]))
+        error = candidate.apply(source) - target
+        score = float(np.partition(np.einsum("ij,ij->i", error, error), rank)[rank])
+        if score < best_score:
+            best, best_score = candidate, score
+    return best, float(np.sqrt(best_score))
 
 
 def _triples(n: int, seed: int) -> list[list[int]]:
