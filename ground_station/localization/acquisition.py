@@ -169,11 +169,20 @@ class Acquirer:
         if isinstance(sole, str):
             return _nothing(seen, sole)
         estimator = make()
-        estimator.restart(time_ns, sole.wTc)
+        estimator.restart(time_ns, sole.wTc, self._open(sole))
         alone = estimator.predict(time_ns)
         assert alone is not None
         located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
         return replace(located, relocalized=True, significance=sole.significance)
+
+    def _open(self, found: Relocalization) -> Array:
+        """The covariance (6, 6) of a find: before a wall a turn is hard to tell from a step aside,
+        so that a direction which is open leaves a place open by as much of the depth."""
+        depth_m = poses.transform(
+            poses.inverse(found.wTc), self._landmarks.position_m[found.landmark]
+        )
+        angle = np.deg2rad(self._settings.start.sigma_deg)
+        return np.diag(np.repeat([angle, angle * float(np.median(depth_m[:, 2]))], 3) ** 2)
 
     def _agreed(
         self,
@@ -231,7 +240,8 @@ class Acquirer:
             seen = self.describe(image, taken)
             closer_px = self._settings.association.refine_radius_px
             radius_px = closer_px or self.matcher.radius_px
-            found = self._locate_once(seen, state, state, estimator, radius_px, watch)
+            share = self._settings.tracking.max_chance_share
+            found = self._locate_once(seen, state, state, estimator, radius_px, watch, share)
             found = self._verified(seen, found, watch)
             return self._acquired(time_ns, image, found, watch, searched=False)
 
@@ -288,9 +298,10 @@ class Acquirer:
         estimator: Estimator,
         radius_px: float | None,
         watch: Stopwatch,
+        chance_share: float | None = None,
     ) -> Located:
         settings = self._settings.pose
-        matches = self.matcher.match(seen, around, radius_px, watch)
+        matches = self.matcher.match(seen, around, radius_px, watch, chance_share)
         pixel = seen.features.keypoints_px[matches.feature]
         if len(matches) < settings.min_observations:
             solution = no_solution(len(matches), f"{len(matches)} observations")

@@ -109,11 +109,17 @@ class Matcher:
         self._readout_s = camera.readout_s if settings.pose.rolling_shutter else 0.0
 
     def match(
-        self, seen: Described, expected: Kinematics, radius_px: float | None, watch: Stopwatch
+        self,
+        seen: Described,
+        expected: Kinematics,
+        radius_px: float | None,
+        watch: Stopwatch,
+        chance_share: float | None = None,
     ) -> Matches:
         """Which features are which landmarks near where `expected` projects them.
 
-        Without a radius it follows the expected covariance, up to `self.radius_px`.
+        Without a radius it follows the expected covariance, up to `self.radius_px`. `chance_share`
+        is asked instead of the settings'.
         """
         settings, landmarks = self.settings, self.landmarks
         among = self._index.near(expected.wTc, self._lens, settings.projection)
@@ -152,7 +158,8 @@ class Matcher:
         own = np.arange(len(where))
         pairs = pair(own)
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
-        if (share := settings.association.max_chance_share) < 1.0:
+        share = chance_share or settings.association.max_chance_share
+        if share < 1.0:
             # What is found of landmarks in each other's places is found by chance.
             by_chance = pair(np.roll(own, len(own) // 2)).distance
             best = best[: count_beyond_chance(pairs.distance[best], by_chance, share)]

@@ -226,6 +226,10 @@ class TrackingSettings:
         0.1, "of a keyframe's points in view; a frame that shows fewer is not believed",
         low=0, high=1,
     )  # fmt: skip
+    max_chance_share: float = config.key(
+        1.0, "association's, of a keyframe: its pose is known, and few chance pairs can turn it",
+        low=0.001, high=1,
+    )  # fmt: skip
     keyframe_min_points: int = config.key(20, "a keyframe with fewer is none", low=6, high=1000)
     keyframe_parallax_px: float = config.key(
         100.0, "a keyframe whose points moved by this in the median is replaced", unit="px",
