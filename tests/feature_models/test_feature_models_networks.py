@@ -30,8 +30,10 @@ PORT = networks.superpoint_port_weights()
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where models come to; their scale, which has tests of its own, is not measured each time."""
     folder = tmp_path / "models"
     monkeypatch.setenv("BLIMP_MODELS", str(folder))
+    monkeypatch.setattr(importer.scale, "measured", lambda data, info: 1.25)
     return folder
 
 
@@ -58,6 +60,7 @@ def test_superpoint_is_the_reference(
 ) -> None:
     found = brought(tmp_path, pack(weights))
     assert (found.info.layout, found.info.dimension, found.info.multiple) == ("cells", 256, 8)
+    assert found.info.distance_scale == 1.25
     for name, mine, wanted in zip(
         ("logits", "descriptors"), outputs(found, GREY[None]), reference(weights, GREY), strict=True
     ):

@@ -221,12 +221,13 @@ def test_a_file_ends_at_its_age(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(files_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     made.start()
     name = made.file
-    for k in range(60):
-        now_s[0] += 0.3
-        made.frame("blimp-1", frame(k), log_ns(k))
+    for first in range(0, 60, GOP):
+        for k in range(first, first + GOP):
+            made.frame("blimp-1", frame(k), log_ns(k))
         run = made._run
         assert run is not None
         wait_for(lambda: not run.queue._items)  # noqa: B023
+        now_s[0] += 4.5
     assert made.file != name
     made.close()
     paths = recorded(tmp_path)
