@@ -160,8 +160,12 @@ class Matcher:
         best = np.argsort(pairs.distance, kind="stable")[: settings.pose.max_observations]
         share = chance_share or settings.association.max_chance_share
         if share < 1.0:
-            # What is found of landmarks in each other's places is found by chance.
-            by_chance = pair(np.roll(own, len(own) // 2)).distance
+            # What is found of landmarks in each other's places is found by chance, where these are
+            # half a picture apart.
+            across = np.argsort(where[:, 0])
+            place = np.empty_like(own)
+            place[across] = np.roll(across, len(own) // 2)
+            by_chance = pair(place).distance
             best = best[: count_beyond_chance(pairs.distance[best], by_chance, share)]
         watch.lap("association")
         return Matches(
