@@ -18,6 +18,7 @@ from ground_station.localization.following import Followed, better, catch_up
 from ground_station.localization.kinematics import no_solution
 from ground_station.localization.matching import Matcher, describe
 from ground_station.localization.publishing import covariance_in_map, covariance_in_world
+from ground_station.localization.relocalization import Relocalization
 from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
 from ground_station.localization.tracking import Keyframe
 from ground_station.map.accuracy import Accuracy
@@ -207,3 +208,52 @@ def test_the_maps_own_errors_are_added_by_their_share():
     assert np.array_equal(covariance_in_world(covariance, of_map, wTc, 0.0), covariance)
     more = covariance_in_world(covariance, of_map, wTc, 0.5)
     assert np.allclose(more - covariance, np.diag([0.0025] * 3 + [1.0] * 3))
+
+
+@pytest.mark.parametrize("strip_px", [640, 60])
+def test_pairs_that_chance_makes_are_left_out_and_right_ones_are_not(room, strip_px):
+    """Limits so wide that strangers pair, in a whole picture and where all is in a strip of it."""
+    _, path = room.path(1)
+    whole = room.features(path[0], outliers=0.0, most=180)
+    middle = abs(whole.keypoints_px[:, 0] - np.median(whole.keypoints_px[:, 0])) < strip_px / 2
+    whole = whole.where(middle)
+    rng = np.random.default_rng(4)
+    strange = rng.normal(0, 1, whole.descriptors.shape).astype(np.float32)
+    strange /= np.linalg.norm(strange, axis=1, keepdims=True)
+    order = rng.permutation(len(whole))
+    features = dataclasses.replace(
+        whole,
+        keypoints_px=np.concatenate([whole.keypoints_px, whole.keypoints_px[order] + 3]),
+        scores=np.concatenate([whole.scores, whole.scores]),
+        descriptors=np.concatenate([whole.descriptors, strange]),
+    )
+    described = describe(features, room.camera, Conditions())
+    expected = estimator_at(room, path[0]).predict(0)
+
+    def right_and_wrong(share):
+        settings = load_preset("default")
+        wide = dataclasses.replace(
+            settings.association, max_descriptor_distance=1.6, max_ratio=1.0, max_chance_share=share
+        )
+        matcher = Matcher(
+            room.map, room.camera, dataclasses.replace(settings, association=wide), 1.0
+        )
+        feature = matcher.match(described, expected, None, Stopwatch()).feature
+        return (feature < len(whole)).sum(), (feature >= len(whole)).sum()
+
+    every, cut = right_and_wrong(1.0), right_and_wrong(0.05)
+    assert every[1] > 0.1 * every[0]
+    assert cut[1] <= 0.1 * cut[0] and cut[0] > 0.9 * every[0]
+
+
+def test_a_find_is_as_open_as_its_landmarks_are_far(acquirer, room):
+    _, path = room.path(1)
+    depth_m = poses.transform(poses.inverse(path[0]), room.map.landmarks.position_m)[:, 2]
+    ahead = np.flatnonzero(depth_m > 0.5)
+    ahead = ahead[np.argsort(depth_m[ahead])]
+    near, far = ahead[:21], ahead[-21:]
+    assert depth_m[far[10]] > 1.5 * depth_m[near[10]]
+    for seen in (near, far):
+        sigma = np.sqrt(np.diag(acquirer._open(Relocalization(path[0], seen, seen))))
+        assert sigma[:3] == pytest.approx(np.deg2rad(5.0))
+        assert sigma[3:] == pytest.approx(np.deg2rad(5.0) * depth_m[seen[10]])
