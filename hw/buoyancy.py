@@ -130,7 +130,7 @@ def sampled_margins_g(build: Build, samples: int, seed: int) -> np.ndarray:
         means[item.name] = means.get(item.name, 0.0) + item.mass_g
     for name, spread in _mass_spreads(build).items():
         mass += np.maximum(rng.normal(means[name], spread, samples), 0.0)
-    return lift - mass
+    return np.asarray(lift - mass)
 
 
 def _sampled_lift(build: Build, samples: int, rng: np.random.Generator) -> np.ndarray:
@@ -147,7 +147,7 @@ def _sampled_lift(build: Build, samples: int, rng: np.random.Generator) -> np.nd
         replace(day, **{name: float(values[k]) for name, values in draws.items()}), 1.0
     )
     per_m3 = np.array([one(k) for k in range(samples)]) if draws else np.full(samples, one(0))
-    return volumes * per_m3
+    return np.asarray(volumes * per_m3)
 
 
 def reckon(build: Build, samples: int = 2000, seed: int = 0) -> Margin:

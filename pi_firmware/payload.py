@@ -11,7 +11,7 @@ import time
 from pi_firmware import encoder, link, orders
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
-from pi_firmware.battery.gauges import Gauge
+from pi_firmware.battery.chip import Gauge
 from pi_firmware.capture import Capture, UnrecoverableError
 from pi_firmware.commands import Commands
 from pi_firmware.ground import Ground

@@ -33,7 +33,7 @@ _MAX_RMS_SHARE = 3 / 640
 def tilts_deg(poses: Array) -> Array:
     """Angle (V,) between the board and the picture's plane, of poses (V, 6)."""
     z = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, 2, 2]
-    return np.degrees(np.arccos(np.clip(np.abs(z), 0, 1)))
+    return np.asarray(np.degrees(np.arccos(np.clip(np.abs(z), 0, 1))))
 
 
 def distances_m(poses: Array, middle_m: Array) -> Array:

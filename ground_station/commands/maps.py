@@ -43,4 +43,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command; raises `BlimpError` for what a person can mend."""
-    return _COMMANDS[args.map_command].run(args)
+    return int(_COMMANDS[args.map_command].run(args))

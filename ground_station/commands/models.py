@@ -25,4 +25,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs one of them; returns the exit status."""
     room = training if args.models_command == "train" else models
-    return room.run(args)
+    return int(room.run(args))

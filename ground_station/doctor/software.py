@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from ground_station.doctor import ROOT
 from ground_station.doctor.findings import OK, Finding, ok, problem, warning
@@ -53,6 +54,8 @@ def python() -> Finding:
 
 def packages(root: Path) -> Finding:
     """What the programs need is installed in the version that `requirements.lock` names."""
+    from packaging.utils import canonicalize_name
+
     from ground_station.doctor import locked
 
     try:
@@ -70,7 +73,7 @@ def packages(root: Path) -> Finding:
     )
     if missing:
         return problem("packages", f"missing: {_some(missing)}", _SETUP)
-    names = locked.modules(locked.canonicalize_name(need.name) for need in direct)
+    names = locked.modules(canonicalize_name(need.name) for need in direct)
     if broken := imports(_in_order(set(names))):
         return problem("packages", f"cannot be imported: {_some(broken)}", _SETUP)
     if other:
@@ -186,7 +189,7 @@ def _decode(units: Sequence[bytes]) -> list[tuple[int, int]]:
     return [(p.width, p.height) for packet in packets for p in codec.decode(packet)]
 
 
-def _gst():  # type: ignore[no-untyped-def]  # gi's modules have no types
+def _gst() -> Any:
     import gi
 
     gi.require_version("Gst", "1.0")

@@ -81,7 +81,7 @@ def light(shape: tuple[int, ...], rng: Rng) -> F32:
         b = (np.cos(turn) * (y - cy) - np.sin(turn) * (x - cx)) * rng.uniform(1, 3)
         factor = factor + np.float32(rng.uniform(0.3, 4)) * np.exp(-(a * a + b * b) / wide**2)
     factor *= 1 - np.float32(rng.uniform(0, 0.45)) * (x * x + y * y) / 2
-    return (factor / factor.mean()).astype(np.float32)
+    return np.asarray(factor / factor.mean(), np.float32)
 
 
 def shadow(shape: tuple[int, ...], rng: Rng) -> F32:
@@ -160,7 +160,7 @@ def noisy(code: F32, rng: Rng) -> F32:
     """Shot noise, which grows with the light, and the noise of reading; sometimes scaled up."""
     gain = np.exp(rng.uniform(np.log(0.003), np.log(0.06)))
     deviation = np.float32(gain) * np.sqrt(0.25 + np.clip(code, 0, 1)).astype(np.float32)
-    return code + deviation * _grain(code.shape, 1.0, rng)
+    return np.asarray(code + deviation * _grain(code.shape, 1.0, rng))
 
 
 def _grain(shape: tuple[int, ...], deviation: float, rng: Rng) -> F32:

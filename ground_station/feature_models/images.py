@@ -52,7 +52,7 @@ def _coded(radiance: F32, rng: Rng) -> Bytes:
     level = (radiance - low) / max(high - low, 1e-6)
     bottom, top = rng.uniform(0, 0.06), rng.uniform(0.5, 1)
     code = np.clip(bottom + (top - bottom) * level, 0, 1) ** (1 / 2.2)
-    return (255 * code + 0.5).astype(np.uint8)
+    return np.asarray(255 * code + 0.5, np.uint8)
 
 
 def leaves(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
@@ -104,7 +104,7 @@ def _texture(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
     one = fields[int(rng.integers(len(fields)))]
     zoom = np.exp(rng.normal(0.2, 0.5, 2))
     window = bank.stretched(one, *size, rng, float(zoom[0]), float(zoom[1]))
-    return np.maximum(1 + np.float32(rng.uniform(0.05, 0.5)) * window, 0.05).astype(np.float32)
+    return np.asarray(np.maximum(1 + np.float32(rng.uniform(0.05, 0.5)) * window, 0.05), np.float32)
 
 
 def field(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:

@@ -97,4 +97,4 @@ def _normalized(weights: npt.ArrayLike | None, n: int) -> Array:
     w = np.asarray(weights, dtype=np.float64)
     if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or not np.any(w > 0):
         raise GeometryError(f"alignment: weights must be {n} finite numbers >= 0, not all zero")
-    return w / w.sum()
+    return np.asarray(w / w.sum())

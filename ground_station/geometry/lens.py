@@ -39,4 +39,4 @@ class Lens:
             & (pixels[:, 0] < camera.width_px - 0.5)
             & (pixels[:, 1] < camera.height_px - 0.5)
         )
-        return near
+        return np.asarray(near)

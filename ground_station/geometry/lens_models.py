@@ -231,4 +231,4 @@ _CONVERGED = 1e-12
 
 def _unscaled(pixels: Array, matrix: Array) -> Array:
     """Pixels (N, 2) to bent coordinates (N, 2)."""
-    return (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
+    return np.asarray((pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]])

@@ -32,7 +32,7 @@ def from_quaternion(position_m: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -
 def to_quaternion(wTc: npt.ArrayLike) -> Array:
     """The rotation of poses (…, 4, 4) as unit quaternions x, y, z, w (…, 4), w >= 0."""
     T = np.asarray(wTc)
-    return Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
+    return np.asarray(Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True))
 
 
 def inverse(aTb: npt.ArrayLike) -> Array:
@@ -45,7 +45,7 @@ def inverse(aTb: npt.ArrayLike) -> Array:
 def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> Array:
     """Points (N, 3) in b to coordinates in a, for one pose (4, 4)."""
     T = np.asarray(aTb)
-    return np.asarray(points_b) @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(np.asarray(points_b) @ T[:3, :3].T + T[:3, 3])
 
 
 def exp(xi: npt.ArrayLike) -> Array:

@@ -26,6 +26,7 @@ from ground_station.keys import certificates
 from ground_station.keys.certificates import Pair
 from pi_firmware.wire import credentials, files, keys
 from pi_firmware.wire.credentials import GROUND, PAYLOAD
+from pi_firmware.wire.errors import TelemetryError
 
 SCHEMA = "blimp.authority/1"
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 730
@@ -165,7 +166,7 @@ class Authority:
                 )
                 key = (held.folder / credentials.KEY).read_bytes()
                 certificates.check_key(Pair(certificate, key))
-            except (credentials.TelemetryError, KeysError, OSError) as error:
+            except (TelemetryError, KeysError, OSError) as error:
                 problems.append(f"{name}: {error}")
                 continue
             if name.startswith(PAYLOAD) and not self._trusts_releases(held.folder):
@@ -285,7 +286,7 @@ def _folder(path: Path) -> Path:
 def _member(member: str) -> str:
     try:
         return keys.check_payload_id(member)
-    except credentials.TelemetryError as error:
+    except TelemetryError as error:
         raise KeysError(str(error).replace("payload_id", "name", 1)) from None
 
 

@@ -189,7 +189,7 @@ def building(rng: np.random.Generator, inner: int, total: int) -> Landmarks:
 
 def _described(rng: np.random.Generator, count: int) -> npt.NDArray[np.uint8]:
     """Descriptors (count, 128) as a map's file holds them."""
-    return _BYTES[rng.integers(0, 256, (count, _DIMENSION), np.uint8)]
+    return np.asarray(_BYTES[rng.integers(0, 256, (count, _DIMENSION), np.uint8)])
 
 
 def _info() -> MapInfo:

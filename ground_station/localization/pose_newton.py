@@ -105,7 +105,7 @@ class Reprojection:
     @property
     def count(self) -> int:
         """The number of sights."""
-        return self.points_m.shape[1]
+        return int(self.points_m.shape[1])
 
     def where(self, keep: Flags) -> Reprojection:
         """Of those sights alone."""

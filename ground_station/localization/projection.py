@@ -68,4 +68,6 @@ def in_cone(
     limit = np.cos(np.minimum(half + np.deg2rad(settings.cone_margin_deg), np.pi))
     ratio = settings.max_distance_ratio
     nearest, farthest = landmarks.distance_m[index].T
-    return (cosine >= limit) & (distance * ratio >= nearest) & (distance <= farthest * ratio)
+    return np.asarray(
+        (cosine >= limit) & (distance * ratio >= nearest) & (distance <= farthest * ratio)
+    )

@@ -155,4 +155,4 @@ def _ranges(begins: Indices, ends: Indices) -> Indices:
     """The indices begins[0]..ends[0] − 1, begins[1]..ends[1] − 1, and so on, in one array."""
     lengths = ends - begins
     shift = begins - np.concatenate([[0], np.cumsum(lengths)[:-1]]) if len(begins) else begins
-    return np.arange(int(lengths.sum())) + np.repeat(shift, lengths)
+    return np.asarray(np.arange(int(lengths.sum())) + np.repeat(shift, lengths))

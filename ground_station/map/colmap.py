@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
+import pycolmap as pycolmap  # others have it from here, after zlib
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera

@@ -105,8 +105,8 @@ def quantised(descriptors: F32 | Descriptors) -> dict[str, npt.NDArray[Any]]:
 def _bytes(rows: F32, signed: bool) -> npt.NDArray[Any]:
     top = np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-12)
     if signed:
-        return np.round(rows * 127 / top).astype(np.int8)
-    return np.round(rows * 255 / top).astype(np.uint8)
+        return np.asarray(np.round(rows * 127 / top), np.int8)
+    return np.asarray(np.round(rows * 255 / top), np.uint8)
 
 
 def _unit(rows: F32) -> F32:

@@ -28,7 +28,9 @@ def residuals_px(model: Model) -> F64:
 def _in_camera(model: Model) -> F64:
     T = model.wTc[model.image]
     # cRw (X − t) for each observation
-    return np.einsum("oji,oj->oi", T[:, :3, :3], model.position[model.point] - T[:, :3, 3])
+    return np.asarray(
+        np.einsum("oji,oj->oi", T[:, :3, :3], model.position[model.point] - T[:, :3, 3])
+    )
 
 
 def largest_angles_deg(model: Model) -> F64:

@@ -82,7 +82,7 @@ class Decoder:
         """The pictures still held back at the end."""
         yield from self._drain(None)
 
-    def _drain(self, packet: av.Packet | None) -> Iterator[tuple[int, av.VideoFrame]]:
+    def _drain(self, packet: av.Packet[Any] | None) -> Iterator[tuple[int, av.VideoFrame]]:
         try:
             frames = self._codec.decode(packet)
         except av.error.FFmpegError:  # this access unit is lost; a later one may be whole

@@ -11,7 +11,7 @@ from ground_station.recording.flight import FlightRecording
 from ground_station.recording.folder import ImageFolder
 from ground_station.recording.frames import ALL_FRAMES, FrameRange, FrameSource
 from ground_station.recording.video import AnnexBFile, VideoFile
-from pi_firmware.wire.recording import MAGIC
+from pi_firmware.wire.mcap_records import MAGIC
 
 _ANNEX_B_SUFFIXES = {".h264", ".264", ".avc"}
 

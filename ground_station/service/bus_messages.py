@@ -192,9 +192,10 @@ def _decoder(kind: type[N]) -> msgspec.json.Decoder[N]:
 def decode(kind: type[N], data: bytes) -> N:
     """A message of a kind; raises `MessageError` with one line."""
     try:
-        return _decoder(kind).decode(data)  # type: ignore[arg-type]  # a class is hashable
+        message: N = _decoder(kind).decode(data)  # type: ignore[arg-type]  # a class is hashable
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise MessageError(f"{kind.__name__}: {str(error)[:120]!r}") from None
+    return message
 
 
 def as_document(message: Message) -> dict[str, Any]:

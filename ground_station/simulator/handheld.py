@@ -61,7 +61,7 @@ def _band_noise(
     gain = np.where((f >= band_Hz[0]) & (f <= band_Hz[1]), 1 / np.maximum(f, 1e-3), 0.0)
     spectrum = np.fft.rfft(rng.standard_normal((whole, columns)), axis=0) * gain[:, None]
     noise = np.fft.irfft(spectrum, n=whole, axis=0)
-    return (noise / noise.std(axis=0))[:count]
+    return np.asarray((noise / noise.std(axis=0))[:count])
 
 
 def carry(

@@ -202,7 +202,7 @@ class FrameMaker:
             )
             level += deviation * rng.standard_normal(level.shape, dtype=np.float32)
         codes = np.clip(level / np.float32(_OVERRANGE), 0, 1) * np.float32(16383) + np.float32(0.5)
-        return self._tone[codes.astype(np.uint16)]
+        return np.asarray(self._tone[codes.astype(np.uint16)])
 
 
 class AutoExposure:

@@ -105,7 +105,7 @@ def _seen_orthographic(
     v = ((local[:, 1] + shift_m[1]) / half_m + 1) * (n / 2) - 0.5
     first = _look_up(depth, u, v)
     slope = 2 * half_m / n
-    return (local[:, 2] < first + 0.02 + slope).astype(np.float32)
+    return np.asarray(local[:, 2] < first + 0.02 + slope, np.float32)
 
 
 def _look_up(depth: Floats, u: npt.NDArray[Any], v: npt.NDArray[Any]) -> Floats:
@@ -154,9 +154,8 @@ def _indirect(scene: Scene, points: Floats, normals: Floats, area: Floats, flux:
     level = np.maximum((bounced * area[:, None]).sum(axis=0) / area.sum(), 1e-9)
     # Half diffused, half even: light crosses the hall more directly than it diffuses.
     target = mean_flux / (1 - _ALBEDO)
-    return (0.65 * bounced * (target / level) + 0.35 * target * (near < 0.9)[:, None]).astype(
-        np.float32
-    )
+    even = 0.35 * target * (near < 0.9)[:, None]
+    return np.asarray(0.65 * bounced * (target / level) + even, np.float32)
 
 
 def irradiance(scene: Scene, light: Light) -> list[Floats]:

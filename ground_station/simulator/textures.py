@@ -28,7 +28,7 @@ def power_law_field(size: int, exponent: float, rng: Rng) -> Image:
     spectrum *= (f**-exponent).astype(np.float32)
     spectrum[0, 0] = 0
     result = np.fft.irfft2(spectrum, s=(size, size)).astype(np.float32)
-    return result / result.std()
+    return np.asarray(result / result.std())
 
 
 def dead_leaves(size: int, low_px: float, high_px: float, rng: Rng) -> Image:
@@ -201,7 +201,7 @@ def brick(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: 
             tone = colour * rng.lognormal(0, 0.38) * (1 + 0.08 * rng.standard_normal(3))
             image[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = tone
     shade = _grime(b, rows, columns, rng, 0.18) + 0.12 * b.window(b.fine, rows, columns, rng)
-    return (image * np.clip(shade, 0.05, 2)[..., None]).astype(np.float32)
+    return np.asarray(image * np.clip(shade, 0.05, 2)[..., None], np.float32)
 
 
 def fabric(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
@@ -232,7 +232,7 @@ def sky(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: An
     pale = np.linspace(0, 1, rows, dtype=np.float32)[:, None, None]
     blue = np.array([0.35, 0.50, 0.80], np.float32) * (1 - pale) + 0.85 * pale
     white = np.float32(0.95)
-    return (blue * (1 - cloud[..., None]) + white * cloud[..., None]).astype(np.float32)
+    return np.asarray(blue * (1 - cloud[..., None]) + white * cloud[..., None], np.float32)
 
 
 def frame(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:

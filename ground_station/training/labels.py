@@ -16,7 +16,7 @@ F32 = npt.NDArray[np.float32]
 
 def confidence(scores: F32, low: float, high: float) -> F32:
     """The teacher's scores (N,) as chances that a point is one: a ramp from `low` to `high`."""
-    return np.clip((scores - low) / (high - low), 0, 1).astype(np.float32)
+    return np.asarray(np.clip((scores - low) / (high - low), 0, 1), np.float32)
 
 
 def soft_cells(points_px: F32, chances: F32, shape: tuple[int, int]) -> F32:

@@ -84,7 +84,7 @@ def of_plane(
     )
     shift = np.array([[1, 0, centre_px[0]], [0, 1, centre_px[1]], [0, 0, 1.0]])
     matrix = shift @ to_plane @ to_rays @ rolling
-    return matrix / matrix[2, 2]
+    return np.asarray(matrix / matrix[2, 2])
 
 
 def pair_of_views(

@@ -42,7 +42,7 @@ class Mounting:
     def bRc(self) -> Array:
         """The camera's axes in the body's, (3, 3)."""
         angles = (math.radians(a) for a in (self.roll_deg, self.pitch_deg, self.yaw_deg))
-        return rotation(*angles) @ _AHEAD
+        return np.asarray(rotation(*angles) @ _AHEAD)
 
     @cached_property
     def nRw(self) -> Array:

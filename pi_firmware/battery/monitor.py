@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 from pi_firmware.battery.bus import Counts, GaugeError
 from pi_firmware.battery.charge import ChargeFilter
-from pi_firmware.battery.gauges import Gauge, cell_of
+from pi_firmware.battery.chip import Gauge
+from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages
 from pi_firmware.wire.messages import Battery

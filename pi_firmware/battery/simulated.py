@@ -13,6 +13,7 @@ from typing import Protocol
 
 from pi_firmware.battery.bus import swap
 from pi_firmware.battery.cell import Cell, Polarization
+from pi_firmware.battery.chip import Shunt
 from pi_firmware.battery.chips import ina, max17048
 
 
@@ -211,7 +212,7 @@ class FlyingBus(FakeBus):
         *,
         cell: SimulatedCell,
         discharge_a: float,
-        shunt: ina.Shunt,
+        shunt: Shunt,
         clock: Callable[[], float],
     ) -> None:
         super().__init__(chip, address, faults)
@@ -229,7 +230,7 @@ class FlyingBus(FakeBus):
 
 
 def connect(
-    chip: Ina219Chip | Ina226Chip | Max17048Chip, cell: SimulatedCell, shunt: ina.Shunt
+    chip: Ina219Chip | Ina226Chip | Max17048Chip, cell: SimulatedCell, shunt: Shunt
 ) -> None:
     """Puts a cell's voltage and current before a chip."""
     chip.voltage = cell.voltage

@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
@@ -29,6 +29,7 @@ from mcap.writer import CompressionType, Writer
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.mcap_records import CUT, MAGIC, PARSE_ERRORS, Clamped, Damage, records
 
+M = TypeVar("M", bound=Message)
 VIDEO_TOPIC = "/camera/video"
 CALIBRATION_TOPIC = "/camera/calibration"
 TRUTH_TOPIC = "/truth/pose"
@@ -383,7 +384,7 @@ class RecordingReader:
                 raise RecordingError(f"{self.path}: a message on {topic} is not a JSON object")
             yield record.log_time, value
 
-    def _parse(self, kind: type[Message], record: McapMessage) -> Any:
+    def _parse(self, kind: type[M], record: McapMessage) -> M:
         try:
             return kind.FromString(record.data)
         except DecodeError:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ground_station.bench.maps.folds import is_silent_fold, judge, said
-from ground_station.errors import BlimpError, InputError
+from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.mapping.construction.build import build_map
@@ -23,6 +23,7 @@ from ground_station.progress import Progress
 from ground_station.recording.flight import trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
 from ground_station.recording.open import open_input
+from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import TRUTH_TOPIC
 
 SIMULATED: dict[str, dict[str, Any]] = {

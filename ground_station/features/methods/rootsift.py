@@ -58,7 +58,7 @@ class RootSift:
 def hellinger(sift: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """SIFT histograms (N, 128) to RootSIFT (N, 128), unit L2 norm (section 3 of the paper)."""
     total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-12)
-    return np.sqrt(sift / total).astype(np.float32)
+    return np.asarray(np.sqrt(sift / total), np.float32)
 
 
 METHOD = RootSift

@@ -128,7 +128,7 @@ class Structure:
         node = self.frames.offset[frame] + feature
         pixel, moving = self.frames.pixel_px[node], np.any(self.twist[frame] != 0, axis=1)
         if not moving.any():
-            return pixel
+            return np.asarray(pixel)
         node, frame = node[moving], frame[moving]
         flat = (pixel[moving] - self._pinhole[2:]) / self._pinhole[:2]
         depth = np.where(np.isfinite(depth[moving]) & (depth[moving] > 0), depth[moving], 1e3)
@@ -136,7 +136,7 @@ class Structure:
         camera = self.map.info.camera
         shift = shutter.shift_px(X, self.twist[frame], self.frames.row_s[node], camera)
         pixel[moving] -= np.nan_to_num(shift)
-        return pixel
+        return np.asarray(pixel)
 
     def _off_px(self, frame: I64, feature: I64, key: I64) -> F64:
         """Reprojection errors (N,) of sights in posed frames; inf behind, NaN of no position."""

@@ -241,7 +241,9 @@ class _Problem:
 
     def _in_camera(self, state: _State) -> F64:
         T = state.cTw[self._image]
-        return np.einsum("oij,oj->oi", T[:, :, :3], state.points[self._point]) + T[:, :, 3]
+        return np.asarray(
+            np.einsum("oij,oj->oi", T[:, :, :3], state.points[self._point]) + T[:, :, 3]
+        )
 
     def _cost(self, state: _State, scale_px: float) -> float:
         square = np.sum(self.residuals(state) ** 2, axis=1)

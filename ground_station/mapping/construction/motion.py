@@ -258,7 +258,7 @@ def corners(image: Image) -> F32:
     patch = (_PATCH_PX, _PATCH_PX)
     variance = cv2.blur(grey * grey, patch) - cv2.blur(grey, patch) ** 2
     column, row = np.round(at).astype(np.intp).T
-    return at[variance[row, column] >= _LEAST_CONTRAST**2]
+    return np.asarray(at[variance[row, column] >= _LEAST_CONTRAST**2])
 
 
 def follow(before: Image, after: Image, start: F32, guess: F32) -> tuple[F32, Bool]:

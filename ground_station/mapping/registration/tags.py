@@ -287,5 +287,5 @@ def _centre(corners: F64, camera: Camera) -> F64:
     rays = np.column_stack([camera.undistort(corners), np.ones(4)])
     centre = np.cross(np.cross(rays[0], rays[2]), np.cross(rays[1], rays[3]))
     if not abs(centre[2]) >= 1e-15:  # nor where a corner is beyond what is used of a fisheye
-        return corners.mean(axis=0)[None]
+        return np.asarray(corners.mean(axis=0)[None])
     return camera.distort(centre[None, :2] / centre[2])

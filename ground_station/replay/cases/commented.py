@@ -76,7 +76,7 @@ def _about(item: dataclasses.Field[Any]) -> str:
         told.append("not set by default")
     elif default is not missing:
         told.append(f"default {toml(default)}")
-    return meta["doc"] + (f" ({', '.join(told)})" if told else "")
+    return str(meta["doc"]) + (f" ({', '.join(told)})" if told else "")
 
 
 def _short(value: float) -> str:

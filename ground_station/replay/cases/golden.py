@@ -45,7 +45,7 @@ class Accepted:
     preset: str = key("default", "the localizer's settings")
     payload: str = key("process", "which kind flew")
     stepped: bool = key(False, "whether no clock decided anything")
-    versions: dict = key({}, "of programs")
+    versions: dict[str, str] = key({}, "of programs")
 
     def __post_init__(self) -> None:
         if not self.accepted_by.strip():

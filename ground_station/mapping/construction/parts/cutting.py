@@ -133,7 +133,7 @@ def _halved(weight: csr_array, most: int) -> npt.NDArray[np.bool_]:
     first = min(max(int((share - _AROUND) * n), 1), n - 1)
     last = min(max(int((share + _AROUND) * n), first + 1), n)
     cut = first - 1 + int(np.argmin(cost[first - 1 : last - 1]))
-    return place <= cut
+    return np.asarray(place <= cut)
 
 
 def _beside(pairs: Mapping[Pair, int], home: I64) -> list[Pair]:

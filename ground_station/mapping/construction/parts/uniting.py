@@ -147,4 +147,4 @@ def _in_place(
         good &= (local[:, 2] > 0) & (off <= _IN_PLACE_PX)
     if good.sum() < _HOLDS * len(good):
         return np.empty((0, 2), np.int64)
-    return ends[good]
+    return np.asarray(ends[good])
