@@ -17,7 +17,7 @@ from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.association import associate
 from ground_station.localization.estimate import PoseEstimate
 from ground_station.localization.extraction import extractor_for
-from ground_station.localization.kinematics import Kinematics, Sights
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import solve_graph
@@ -126,7 +126,7 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     direct, graph = solve_direct(*data).wTc, solve_graph(*data).wTc
     assert direct is not None and graph is not None
     middle = 0.5 * (camera.height_px - 1)
-    sights = Sights(
+    observations = LandmarkObservations(
         points,
         pixels,
         camera.readout_s * (camera.distort(flat)[:, 1] - middle) / (2 * middle),
@@ -136,12 +136,12 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     )
     sigma = np.repeat([0.05, 0.1, 0.5, 0.5], 3)
     predicted = Kinematics(0, guess, np.zeros(6), np.diag(sigma**2))
-    assert solve_rolling(predicted, sights, camera, settings).state is not None
+    assert solve_rolling(predicted, observations, camera, settings).state is not None
     ours, theirs, rolling = medians_ms(
         repetitions,
         lambda: solve_direct(*data),
         lambda: solve_graph(*data),
-        lambda: solve_rolling(predicted, sights, camera, settings),
+        lambda: solve_rolling(predicted, observations, camera, settings),
     )
     return {
         "direct_ms": ours,

@@ -1,4 +1,4 @@
-"""From sightings of the board to a camera: choose views, fit the lens, time the rows, fit again."""
+"""From pictures of the board to a camera: choose views, fit the lens, time the rows, fit again."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def calibrate(
     of the `model` misfit and a fisheye fits, a note or the refusal says so.
     """
     verdict.check_seen(gathered, finder)
-    seen = views_of(gathered.sightings, finder.points_m, timed)
+    seen = views_of(gathered.observations, finder.points_m, timed)
     verdict.check_sharp(seen, selection.sharp(seen))
     try:
         result = _calibrated(seen, finder, gathered.size_px, most_views, model)

@@ -205,7 +205,7 @@ class _Hints:
         self._said_s = self._clock()
         from ground_station.calibration.selection import CORNERS, MAX_EDGE_PX, in_corner
 
-        sharp = [s for s in gathered.sightings if s.edge_px <= MAX_EDGE_PX]
+        sharp = [s for s in gathered.observations if s.edge_px <= MAX_EDGE_PX]
         empty = [
             name
             for name in CORNERS

@@ -26,7 +26,7 @@ _STEP_PX = 0.5
 
 
 @dataclass(frozen=True)
-class Sighting:
+class BoardObservation:
     """The board in frame `index` of the `source`-th input.
 
     `ids` (N,) and pixels `px` (N, 2) of its corners, `square_px` the side of a square there,
@@ -67,7 +67,7 @@ class BoardFinder:
         self._pairs = np.concatenate([across, down])
         self._is_across = np.arange(len(self._pairs)) < len(across)
 
-    def find(self, frame: Frame, source: int = 0) -> Sighting | None:
+    def find(self, frame: Frame, source: int = 0) -> BoardObservation | None:
         """The board in a frame; None when too few of its corners are there, or on one line."""
         corners, numbers, _, _ = self._detector.detectBoard(frame.image)
         if numbers is None or len(numbers) < MIN_CORNERS:
@@ -89,7 +89,7 @@ class BoardFinder:
         edge_px = self._edge_px(frame.image, ids, px)
         if edge_px is None:
             return None
-        return Sighting(
+        return BoardObservation(
             source, frame.index, frame.name, frame.time_ns, ids, px, square_px, edge_px, H
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from ground_station.calibration.detection import BoardFinder, Image, Sighting
+from ground_station.calibration.detection import BoardFinder, BoardObservation, Image
 from ground_station.errors import InputError
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameSource
@@ -15,7 +15,7 @@ _PICTURES = 12
 
 @dataclass
 class Gathered:
-    """What was seen: frames looked at, their size, sightings by input and time.
+    """What was seen: frames looked at, their size, observations by input and time.
 
     `without` are a few pictures in which the board was not found, more widely apart the longer it
     lasted.
@@ -23,7 +23,7 @@ class Gathered:
 
     frames: int = 0
     size_px: tuple[int, int] = (0, 0)
-    sightings: list[Sighting] = field(default_factory=list)
+    observations: list[BoardObservation] = field(default_factory=list)
     without: list[Image] = field(default_factory=list)
     interrupted: bool = False
 
@@ -59,7 +59,7 @@ def gather(
                     result.frames += 1
                     seen = finder.find(frame, number)
                     if seen is not None:
-                        result.sightings.append(seen)
+                        result.observations.append(seen)
                     else:
                         missing += 1
                         if missing & (missing - 1) == 0 and len(result.without) < _PICTURES:

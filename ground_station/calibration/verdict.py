@@ -45,7 +45,7 @@ def distances_m(poses: Array, middle_m: Array) -> Array:
 def check_seen(gathered: Gathered, finder: BoardFinder) -> None:
     """Refuses frames without the board, saying what is there instead where that can be told."""
     board: Board = finder.board
-    if gathered.sightings or not gathered.frames:
+    if gathered.observations or not gathered.frames:
         return
     other = other_board(board, gathered.without)
     if other:

@@ -1,4 +1,4 @@
-"""Sightings as views of the lens: how fast the board moved, how well its corners are known."""
+"""Pictures of the board as views of the lens: how fast it moved, how well its corners are known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.calibration.detection import Sighting
+from ground_station.calibration.detection import BoardObservation
 from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
 
@@ -26,14 +26,14 @@ _LEFT_SHARE = 0.02
 
 @dataclass(frozen=True)
 class View:
-    """A sighting with its corners' places on the board `points_m` (N, 3).
+    """An observationing with its corners' places on the board `points_m` (N, 3).
 
     `velocity_px_s` (N, 2) of each corner, None where neighbouring frames do not tell; `speed_px_s`
     is their median, 0 then, `doubt_px_s` how far it may be off. `corner_px` is how far a corner is
     expected to be off, standing still.
     """
 
-    seen: Sighting
+    seen: BoardObservation
     points_m: Array
     velocity_px_s: Array | None
     speed_px_s: float
@@ -70,16 +70,18 @@ def _skew_px(speed_px_s: float, readout_s: float) -> float:
     return speed_px_s * readout_s / math.sqrt(12)
 
 
-def views_of(sightings: list[Sighting], points_m: Array, timed: list[bool]) -> list[View]:
-    """Every sighting, sorted by input and time, as a view.
+def views_of(
+    observations: list[BoardObservation], points_m: Array, timed: list[bool]
+) -> list[View]:
+    """Every observation, sorted by input and time, as a view.
 
     `points_m` (N, 3) are the board's corners by id; `timed` says of each input whether its frames'
     times can be trusted.
     """
     found = []
-    for k, seen in enumerate(sightings):
+    for k, seen in enumerate(observations):
         points = points_m[seen.ids]
-        velocity, doubt = _velocity(sightings, k, points) if timed[seen.source] else (None, 0.0)
+        velocity, doubt = _velocity(observations, k, points) if timed[seen.source] else (None, 0.0)
         speed = 0.0
         if velocity is not None:
             speed = float(np.median(np.linalg.norm(velocity, axis=1)))
@@ -88,35 +90,37 @@ def views_of(sightings: list[Sighting], points_m: Array, timed: list[bool]) -> l
     return found
 
 
-def _velocity(sightings: list[Sighting], k: int, points_m: Array) -> tuple[Array | None, float]:
-    """Of the k-th sighting's corners, pixels a second, and how far that is off.
+def _velocity(
+    observations: list[BoardObservation], k: int, points_m: Array
+) -> tuple[Array | None, float]:
+    """Of the k-th observation's corners, pixels a second, and how far that is off.
 
     By the parabola through three frames, or the quartic through five: what the one differs from the
     other, or the parabola from a chord, is what it may be off. Homographies put every corner into
     frames that lost it.
     """
-    if not (_follows(sightings, k) and _follows(sightings, k + 1)):
+    if not (_follows(observations, k) and _follows(observations, k + 1)):
         return None, 0.0
-    slopes = [_slope(sightings, k, range(k - 1, k + 2), points_m)]
-    if _follows(sightings, k - 1) and _follows(sightings, k + 2):
-        slopes.insert(0, _slope(sightings, k, range(k - 2, k + 3), points_m))
+    slopes = [_slope(observations, k, range(k - 1, k + 2), points_m)]
+    if _follows(observations, k - 1) and _follows(observations, k + 2):
+        slopes.insert(0, _slope(observations, k, range(k - 2, k + 3), points_m))
     else:
-        slopes.append(_slope(sightings, k, range(k, k + 2), points_m))
+        slopes.append(_slope(observations, k, range(k, k + 2), points_m))
     if not np.isfinite(slopes).all():
         return None, 0.0
     return slopes[0], float(np.median(np.linalg.norm(slopes[0] - slopes[1], axis=1)))
 
 
-def _follows(sightings: list[Sighting], k: int) -> bool:
-    """Whether the k-th sighting comes soon after the one before, in the same input."""
-    if not 0 < k < len(sightings) or sightings[k - 1].source != sightings[k].source:
+def _follows(observations: list[BoardObservation], k: int) -> bool:
+    """Whether the k-th observation comes soon after the one before, in the same input."""
+    if not 0 < k < len(observations) or observations[k - 1].source != observations[k].source:
         return False
-    return 0 < sightings[k].time_ns - sightings[k - 1].time_ns <= MAX_GAP_S * 1e9
+    return 0 < observations[k].time_ns - observations[k - 1].time_ns <= MAX_GAP_S * 1e9
 
 
-def _slope(sightings: list[Sighting], k: int, near: range, points_m: Array) -> Array:
-    """The derivative (N, 2) at the k-th sighting of the polynomial through some around it."""
-    nodes_s = np.array([(sightings[j].time_ns - sightings[k].time_ns) / 1e9 for j in near])
+def _slope(observations: list[BoardObservation], k: int, near: range, points_m: Array) -> Array:
+    """The derivative (N, 2) at the k-th observation of the polynomial through some around it."""
+    nodes_s = np.array([(observations[j].time_ns - observations[k].time_ns) / 1e9 for j in near])
     _, slopes = lagrange(nodes_s, np.zeros(1))
-    places = np.array([sightings[j].plane_px(points_m) for j in near])
+    places = np.array([observations[j].plane_px(points_m) for j in near])
     return np.asarray(np.einsum("j,jni->ni", slopes[0], places))

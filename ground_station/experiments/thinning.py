@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.experiments.viewpoints import ExpectedSights, expected_sights
+from ground_station.experiments.viewpoints import ExpectedObservations, expected_observations
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.progress import Progress
@@ -38,17 +38,16 @@ def choose(map_: Map, count: int) -> Indices:
     if count >= total:
         return np.arange(total)
     with Progress("viewpoints, keyframes", len(map_.keyframes)) as progress:
-        sights = expected_sights(map_, progress.step)
-    return np.sort(cover(sights, quality(map_.landmarks, map_.info.camera.fx_px), count))
+        observations = expected_observations(map_, progress.step)
+    return np.sort(cover(observations, quality(map_.landmarks, map_.info.camera.fx_px), count))
 
 
 def quality(landmarks: Landmarks, focal_px: float) -> F64:
-    """How much a sight of each landmark (M,) tells, above 0.
+    """How much an observation of each landmark (M,) tells, above 0.
 
-    More for one that is nearer than most; less for one whose place across the line of sight is not
-    known to a pixel, as seen from the distance it was seen from, and for one that did not always
-    look the same.
-    """
+    More for one that is nearer than most; less for one whose place across the line of sight
+    is not known to a pixel, as seen from the distance it was seen from, and for one that did not
+    always look the same."""
     covariance = landmarks.covariance_m2.astype(np.float64)
     ray = landmarks.view_direction.astype(np.float64)
     along = np.einsum("mi,mij,mj->m", ray, covariance, ray)
@@ -60,7 +59,9 @@ def quality(landmarks: Landmarks, focal_px: float) -> F64:
     return np.asarray(near * steady * _SIGMA_PX**2 / (_SIGMA_PX**2 + square_px))
 
 
-def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUNDS) -> Indices:
+def cover(
+    observations: ExpectedObservations, quality: F64, count: int, rounds: int = _ROUNDS
+) -> Indices:
     """`count` of M landmarks that cover the views, the best first; quality (M,).
 
     Greedily minimises the sum over views of w / (1 + A), as a pose's variance falls with what fixes
@@ -68,25 +69,27 @@ def cover(sights: ExpectedSights, quality: F64, count: int, rounds: int = _ROUND
     landmarks are expected to show there. What one landmark gains only falls while others are
     chosen (its negative is submodular), so the greedy choice is near the best.
     """
-    worth = quality[sights.landmark] * sights.chance
-    filled: F64 = np.zeros(sights.cells)
-    covered: F64 = np.zeros(len(sights.weight))
+    worth = quality[observations.landmark] * observations.chance
+    filled: F64 = np.zeros(observations.cells)
+    covered: F64 = np.zeros(len(observations.weight))
     left = np.ones(len(quality), bool)
     kept: list[Indices] = []
     together = -(-count // rounds)
     missing = count
     while missing:
-        before = filled[sights.cell]
+        before = filled[observations.cell]
         gain = np.sqrt(1 + before + worth) - np.sqrt(1 + before)
-        gain *= (sights.weight / np.square(1 + covered))[sights.view]
-        total = np.bincount(sights.landmark, gain, len(quality))
+        gain *= (observations.weight / np.square(1 + covered))[observations.view]
+        total = np.bincount(observations.landmark, gain, len(quality))
         # What no view sees comes last, by its quality.
         order = np.lexsort((-quality, np.where(left, -total, np.inf)))[: min(together, missing)]
         kept.append(order)
         left[order] = False
         missing -= len(order)
-        new = np.flatnonzero(~left[sights.landmark] & (worth > 0))
-        filled = np.bincount(sights.cell[new], worth[new], sights.cells).astype(np.float64)
+        new = np.flatnonzero(~left[observations.landmark] & (worth > 0))
+        filled = np.bincount(observations.cell[new], worth[new], observations.cells).astype(
+            np.float64
+        )
         in_view = np.sqrt(1 + filled).reshape(len(covered), -1) - 1
         covered = in_view.sum(axis=1)
     return np.concatenate([*kept, np.empty(0, np.intp)]).astype(np.intp)

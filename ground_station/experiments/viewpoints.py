@@ -15,7 +15,7 @@ from scipy import sparse
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.inspection.sightings import PRIOR, View
+from ground_station.inspection.visibility import PRIOR, View
 from ground_station.map.store import Map
 
 F64 = npt.NDArray[np.float64]
@@ -35,12 +35,12 @@ _SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class ExpectedSights:
+class ExpectedObservations:
     """Landmarks that V views are expected to show.
 
-    Of each of E sights: `view` (E,), `cell` (E,), the picture's cell it falls in, counted through
-    all views, `landmark` (E,) and `chance` (E,) that it is found; `weight` (V,) of the views.
-    """
+    Of each of E observations: `view` (E,), `cell` (E,), the picture's cell it falls in, counted
+    through all views, `landmark` (E,) and `chance` (E,) that it is found; `weight` (V,) of the
+    views."""
 
     view: I32
     cell: I32
@@ -54,14 +54,15 @@ class ExpectedSights:
         return len(self.weight) * CELLS[0] * CELLS[1]
 
 
-def expected_sights(map_: Map, step: Callable[[], None] = lambda: None) -> ExpectedSights:
+def expected_observations(
+    map_: Map, step: Callable[[], None] = lambda: None
+) -> ExpectedObservations:
     """Of a map's K keyframes, the first K views, and of views between and beside them.
 
     A landmark's chance is that of the neighbours which saw it among those in whose picture it lies,
-    as in `inspection.sightings`: a keyframe, too, may have seen by luck what is hardly ever found.
-    A keyframe weighs less by those that saw the same, so that a place counts once however long one
-    stayed. `step` is called for each keyframe.
-    """
+    as in `inspection.visibility`: a keyframe, too, may have seen by luck what is hardly ever
+    found. A keyframe weighs less by those that saw the same, so that a place counts once however
+    long one stayed. `step` is called for each keyframe."""
     camera, cells = map_.info.camera, CELLS[0] * CELLS[1]
     shared = _shared(map_)
     weight = _alone(shared).tolist()
@@ -77,7 +78,7 @@ def expected_sights(map_: Map, step: Callable[[], None] = lambda: None) -> Expec
             rows.append((view, cell, near.landmark[index], near.chance[index]))
         step()
     view, cell, landmark, chance = map(np.concatenate, zip(*rows, strict=True))
-    return ExpectedSights(view, cell, landmark, chance, np.array(weight))
+    return ExpectedObservations(view, cell, landmark, chance, np.array(weight))
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,8 @@ def _shared(map_: Map) -> sparse.csr_matrix:
 
 
 def _alone(shared: sparse.csr_matrix) -> F64:
-    """One over how many keyframes each is like (K,), itself counted: by the cosine of their sights.
+    """One over how many keyframes each is like (K,), itself counted: by the cosine of their
+    observations.
 
     One that saw nothing is 1.
     """
@@ -148,13 +150,13 @@ def _beside(wTc: F64, neighbours: F64) -> list[F64]:
 
 def _surrounding(map_: Map, view: View, group: Indices, views: F64) -> _Surrounding:
     kf = map_.keyframes
-    sights = [kf.landmark[kf.offset[n] : kf.offset[n + 1]] for n in group.tolist()]
-    landmark, found = np.unique(np.concatenate(sights), return_counts=True)
+    observations = [kf.landmark[kf.offset[n] : kf.offset[n + 1]] for n in group.tolist()]
+    landmark, found = np.unique(np.concatenate(observations), return_counts=True)
     points = map_.landmarks.position_m[landmark]
     could = np.zeros(len(landmark))
-    for n, mine in zip(group.tolist(), sights, strict=True):
+    for n, mine in zip(group.tolist(), observations, strict=True):
         local = poses.transform(poses.inverse(kf.wTc[n]), points)
-        # A sight at the border may project just outside: it was seen all the same.
+        # An observation at the border may project just outside: it was seen all the same.
         could += view.inside(local) | np.isin(landmark, mine)
     chance = (found / (could + PRIOR)).astype(np.float32)
     return _Surrounding(views, landmark, points, chance, view)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.inspection.sightings import Sightings, View
+from ground_station.inspection.visibility import View, Visibility
 from ground_station.map.store import Map
 
 F64 = npt.NDArray[np.float64]
@@ -55,9 +55,9 @@ class Predictor:
 
     def __init__(self, map_: Map, needs: Needs | None = None) -> None:
         self.needs = needs or Needs()
-        self._sightings = Sightings(map_)
+        self._observations = Visibility(map_)
         self._view = View.of(map_)
-        covariance = map_.landmarks.covariance_m2[self._sightings.rows].astype(np.float64)
+        covariance = map_.landmarks.covariance_m2[self._observations.rows].astype(np.float64)
         values, vectors = np.linalg.eigh(covariance)
         self._root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
         """Of each landmark's covariance (M, 3, 3): it times its transpose."""
@@ -79,11 +79,11 @@ class Predictor:
 
     def _at(self, position_m: F64, wRc: F64) -> F64:
         """Count, position's and rotation's deviation of each rotation (H, 3, 3); (H, 3)."""
-        chance = self._sightings.chance(position_m)
+        chance = self._observations.chance(position_m)
         near = np.flatnonzero(chance > _LEAST_CHANCE)
-        local = (self._sightings.position[near] - position_m) @ wRc  # (H, n, 3)
+        local = (self._observations.position[near] - position_m) @ wRc  # (H, n, 3)
         which, index = np.nonzero(self._view.inside(local))
-        weight = chance[near[index]] * self._sightings.weight
+        weight = chance[near[index]] * self._observations.weight
         count = np.bincount(which, weight, len(wRc))
         rows = self._whitened(local[which, index], wRc[which], self._root[near[index]])
         rows *= np.sqrt(weight)[:, None, None]

@@ -16,7 +16,7 @@ Rows = list[tuple[str, str]]
 
 _STRUCTURE = {
     "track": ("observations of a landmark", ""),
-    "angle_deg": ("largest angle between two of its sights", "°"),
+    "angle_deg": ("largest angle between two of its observations", "°"),
     "landmark_sigma": ("standard deviation of a landmark, its poses taken as known", "length"),
     "error_px": ("reprojection error of an observation", " px"),
     "in_keyframe": ("landmarks that a keyframe saw", ""),

@@ -198,8 +198,10 @@ class Acquirer:
         """
         settings = self._settings.pose
         pixel = seen.features.keypoints_px[found.feature]
-        sights = self.matcher.sights(pixel, found.landmark, settings.sigma_px, expected, seen.taken)
-        solution = believed(estimator.solve(expected, sights, settings), self._settings)
+        observations = self.matcher.observations(
+            pixel, found.landmark, settings.sigma_px, expected, seen.taken
+        )
+        solution = believed(estimator.solve(expected, observations, settings), self._settings)
         if solution.state is None or not solution.innovation < _ALLOWED:
             return None
         located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX, solution.state)
@@ -306,10 +308,10 @@ class Acquirer:
         if len(matches) < settings.min_observations:
             solution = no_solution(len(matches), f"{len(matches)} observations")
         else:
-            sights = self.matcher.sights(
+            seen_at = self.matcher.observations(
                 pixel, matches.landmark, settings.sigma_px, around, seen.taken
             )
-            solution = believed(estimator.solve(expected, sights, settings), self._settings)
+            solution = believed(estimator.solve(expected, seen_at, settings), self._settings)
         watch.lap("pose")
         observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)
         return Located(solution, matches, observations, len(seen))

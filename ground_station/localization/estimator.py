@@ -1,4 +1,4 @@
-"""From one frame's sights to the state: as the thesis does it, or as a filter with covariance."""
+"""From observations to the state: as the thesis does it, or as a filter with covariance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.geometry.camera import Camera
-from ground_station.localization.kinematics import Kinematics, Sights, Solution, no_solution
+from ground_station.localization.kinematics import (
+    Kinematics,
+    LandmarkObservations,
+    Solution,
+    no_solution,
+)
 from ground_station.localization.motion import MotionModel
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import solve_graph
@@ -36,8 +41,10 @@ class Estimator(Protocol):
         """
         ...
 
-    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
-        """The state that explains the sights; changes nothing."""
+    def solve(
+        self, predicted: Kinematics, observations: LandmarkObservations, settings: PoseSettings
+    ) -> Solution:
+        """The state that explains the observations; changes nothing."""
         ...
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
@@ -57,7 +64,7 @@ class Estimator(Protocol):
 
 
 class PoseEstimator:
-    """Each frame's pose from its own sights alone; the last two poses predict the next (thesis)."""
+    """Each frame's pose from that frame alone; the last two poses predict the next (thesis)."""
 
     def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
         self._camera = camera
@@ -72,14 +79,16 @@ class PoseEstimator:
         # Nothing is known of how good the prediction is.
         return None if wTc is None else Kinematics(time_ns, wTc, np.zeros(6), _UNKNOWN)
 
-    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
-        if len(sights):
-            settings = dataclasses.replace(settings, sigma_px=float(sights.sigma_px.mean()))
+    def solve(
+        self, predicted: Kinematics, observations: LandmarkObservations, settings: PoseSettings
+    ) -> Solution:
+        if len(observations):
+            settings = dataclasses.replace(settings, sigma_px=float(observations.sigma_px.mean()))
         found = self._solve(
-            predicted.wTc, sights.points_m, sights.pinhole_px, self._camera, settings
+            predicted.wTc, observations.points_m, observations.pinhole_px, self._camera, settings
         )
         if found.wTc is None or found.covariance is None:
-            return no_solution(len(sights), found.reason, found.iterations)
+            return no_solution(len(observations), found.reason, found.iterations)
         covariance = np.zeros((12, 12))
         covariance[:6, :6] = found.covariance
         state = Kinematics(predicted.time_ns, found.wTc, np.zeros(6), covariance)
@@ -104,7 +113,7 @@ _UNKNOWN = np.full((12, 12), np.nan)
 
 
 class FilterEstimator:
-    """Pose and velocity from prediction and sights together, rows at their own times."""
+    """Pose and velocity from prediction and observations together, rows at their own times."""
 
     def __init__(
         self, camera: Camera, settings: LocalizerSettings, smoothing: bool = False
@@ -126,8 +135,10 @@ class FilterEstimator:
     def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
         return self._smoother.predict(time_ns, wild)
 
-    def solve(self, predicted: Kinematics, sights: Sights, settings: PoseSettings) -> Solution:
-        return solve_rolling(predicted, sights, self._camera, settings)
+    def solve(
+        self, predicted: Kinematics, observations: LandmarkObservations, settings: PoseSettings
+    ) -> Solution:
+        return solve_rolling(predicted, observations, self._camera, settings)
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         state = solution.state

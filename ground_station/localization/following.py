@@ -59,10 +59,10 @@ def follow(
     if found < least:
         solution = no_solution(found, f"{found} points found again")
     else:
-        sights = matcher.sights(
+        observations = matcher.observations(
             tracks.pixel_px, landmark, keyframe.sigma_px[tracks.point], predicted, attempt.taken
         )
-        solution = estimator.solve(predicted, sights, _tracked(settings))
+        solution = estimator.solve(predicted, observations, _tracked(settings))
         solution = believed(solution, settings, int(np.ceil(least)))
     attempt.watch.lap("pose")
     way = np.linalg.norm(tracks.pixel_px - keyframe.pixel_px[tracks.point], axis=1)

@@ -33,7 +33,7 @@ class Kinematics:
 
 
 @dataclass(frozen=True)
-class Sights:
+class LandmarkObservations:
     """N landmarks seen in one frame.
 
     `points_m` (N, 3) in the world; `pinhole_px` (N, 2), undistorted pixels; `row_s` (N,), when each
@@ -55,14 +55,14 @@ class Sights:
 
 @dataclass(frozen=True)
 class Solution:
-    """A pose and twist from a prediction and one frame's sights; `state` is None when it failed.
+    """A pose and twist from a prediction and one frame's observations; `state` is None when it
+    failed.
 
-    `information` (12, 12) and `gradient` (12,) are of the sights alone, robustly weighted, at the
-    solution: minus log-likelihood is ½ δᵀ·information·δ + gradientᵀ·δ for a tangent step δ of pose
-    and twist. `innovation` is the squared Mahalanobis distance of the solution from the prediction
-    by the prediction's covariance (12 degrees of freedom). `residual_px` (N,) and `inlier` (N,)
-    belong to the sights given; `reason` says why there is no state.
-    """
+    `information` (12, 12) and `gradient` (12,) are of the observations alone, robustly weighted, at
+    the solution: minus log-likelihood is ½ δᵀ·information·δ + gradientᵀ·δ for a tangent step δ of
+    pose and twist. `innovation` is the squared Mahalanobis distance of the solution from the
+    prediction by the prediction's covariance (12 degrees of freedom). `residual_px` (N,) and
+    `inlier` (N,) belong to the observations given; `reason` says why there is no state."""
 
     state: Kinematics | None
     information: Array
@@ -75,7 +75,7 @@ class Solution:
 
 
 def no_solution(count: int, reason: str, iterations: int = 0) -> Solution:
-    """A solution that is none, of `count` sights."""
+    """A solution that is none, of `count` observations."""
     return Solution(
         None, np.zeros((12, 12)), np.zeros(12), np.full(count, np.inf), np.zeros(count, bool),
         iterations=iterations, reason=reason,

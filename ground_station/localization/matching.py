@@ -15,7 +15,7 @@ from ground_station.localization.association import Associations, associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
 from ground_station.localization.chance import count_beyond_chance
-from ground_station.localization.kinematics import Kinematics, Sights
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.verification import Witness
@@ -203,14 +203,14 @@ class Matcher:
         witness = Witness(seen.features, self._lens, self._modes)
         return witness.support(wTc, self.landmarks, among).significance
 
-    def sights(
+    def observations(
         self,
         pixel_px: npt.ArrayLike,
         landmark: Indices,
         sigma_px: float | Array,
         expected: Kinematics,
         taken: Conditions,
-    ) -> Sights:
+    ) -> LandmarkObservations:
         """Landmarks (N,) seen at distorted pixels (N, 2), less surely where motion blurs them.
 
         `sigma_px` (N,), or one for all, is without blur.
@@ -225,7 +225,7 @@ class Matcher:
         floor = np.eye(3) * self.settings.pose.landmark_sigma_m**2
         pinhole = self.camera.undistort_to_pinhole(pixel)
         stretch = self.camera.stretch(pinhole)
-        return Sights(
+        return LandmarkObservations(
             points,
             pinhole,
             self.row_s(pixel),

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton on one frame's sights, their landmarks marginalised.
+"""Damped Gauss-Newton on one frame's observations, their landmarks marginalised.
 
 What `solve_direct` and `solve_rolling` share. The objective is that of a graph with a variable for
 each landmark: Huber's loss of each whitened pixel residual, and each landmark's Gaussian prior. A
@@ -67,7 +67,8 @@ class Prior:
 
 @dataclass(frozen=True)
 class Linear:
-    """The sights' cost near a pose and twist, to second order, and their landmarks' best moves.
+    """The observations' cost near a pose and twist, to second order, and their landmarks' best
+    moves.
 
     `information` (D, D), `gradient` (D,) for steps of pose and twist (D = 12) or of the pose alone
     (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
@@ -90,7 +91,7 @@ class Linear:
 class Reprojection:
     """The robust reprojection cost of N landmarks in one frame; arrays with N last.
 
-    `offset_px` (2, N) is from the principal point to the undistorted pixel of each sight.
+    `offset_px` (2, N) is from the principal point to the undistorted pixel of each observation.
     `row_s` (N,) is None for a global shutter: then the pose is all that is asked for.
     """
 
@@ -104,11 +105,11 @@ class Reprojection:
 
     @property
     def count(self) -> int:
-        """The number of sights."""
+        """The number of observations."""
         return int(self.points_m.shape[1])
 
     def where(self, keep: Flags) -> Reprojection:
-        """Of those sights alone."""
+        """Of those observations alone."""
         return replace(
             self,
             points_m=self.points_m[:, keep],
@@ -159,7 +160,7 @@ class Reprojection:
         After the `last` one, landmarks' covariances in the image stay what they were there, so that
         both costs compare; with `move` they are linearised anew where `last` moved the landmarks.
         With `sharp` the information is the cost's second derivative, which is less than that of the
-        reweighted sights beyond Huber's reach and makes for longer steps.
+        reweighted observations beyond Huber's reach and makes for longer steps.
         """
         moved = last.moved_m if move and last is not None else None
         view = self.view(wTc, twist, moved)
@@ -178,7 +179,7 @@ class Reprojection:
         cost += _BEHIND_COST * (self.count - np.count_nonzero(view.front))
         J = view.jacobian()
         gradient = J.reshape(len(J), -1) @ y.reshape(-1)
-        # Times the transposed factor of each sight's information.
+        # Times the transposed factor of each observation's information.
         J[:, 0] *= factor[0]
         J[:, 0] += factor[1] * J[:, 1]
         J[:, 1] *= factor[2]
@@ -245,8 +246,8 @@ def solve2(variance: Array | float, spread: Array, r: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class View:
-    """N landmarks before a camera: `uv` (2, N) on the plane z = 1, the sights' `residual_px` (2, N)
-    and which are in `front` (N,) of it; those behind have numbers that mean nothing."""
+    """N landmarks before a camera: `uv` (2, N) on the plane z = 1, the observations' `residual_px`
+    (2, N) and which are in `front` (N,) of it; those behind have numbers that mean nothing."""
 
     camera: Camera
     wRc: Array
@@ -292,7 +293,7 @@ class View:
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended; `linear` is of the sights alone. `reason` says why there is none."""
+    """Where a descent ended; `linear` is of the observations alone. `reason`: why there is none."""
 
     wTc: Array
     twist: Array
@@ -302,22 +303,21 @@ class Descent:
 
 
 def descend(
-    sights: Reprojection,
+    observations: Reprojection,
     wTc: Array,
     twist: Array,
     prior: Prior | None,
     max_iterations: int,
     rough: bool = False,
 ) -> Descent:
-    """The minimum of the sights' cost and the prior's, from a pose (4, 4) and twist (6,).
+    """The minimum of the observations' cost and the prior's, from a pose (4, 4) and twist (6,).
 
-    Gauss-Newton on reweighted sights, with Levenberg's damping when a step would raise the cost;
-    near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends before
-    that, and its `linear` is of the step before.
-    """
+    Gauss-Newton on reweighted observations, with Levenberg's damping when a step would raise the
+    cost; near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends
+    before that, and its `linear` is of the step before."""
     damping, before = 0.0, math.inf
     sharp, sharpen = False, True
-    linear = sights.linearize(wTc, twist)
+    linear = observations.linearize(wTc, twist)
     information, gradient, cost = _with(prior, linear, wTc, twist)
     for iteration in range(1, max_iterations + 1):
         scale = information.diagonal()
@@ -341,12 +341,13 @@ def descend(
             left = linear.gradient + linear.information @ step
             return Descent(candidate, speed, replace(linear, gradient=left), iteration)
         near = damping == 0 and decrement < _NEAR
-        # Every other one, as the last's information is to be that of the reweighted sights; and no
-        # more once it has led astray, as it can where few sights are within Huber's reach.
+        # Every other one, as the last's information is to be that of the reweighted observations;
+        # and no more once it has led astray, as it can where few observations are within Huber's
+        # reach.
         sharpen &= decrement <= before
         before = decrement
         sharp = near and sharpen and not sharp
-        trial = sights.linearize(candidate, speed, linear, move=near, sharp=sharp)
+        trial = observations.linearize(candidate, speed, linear, move=near, sharp=sharp)
         model = _with(prior, trial, candidate, speed)
         if not near and not model[2] <= cost * (1 + 1e-12):
             damping = max(10 * damping, 1e-4)

@@ -7,47 +7,57 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.localization.kinematics import Kinematics, Sights, Solution, no_solution
+from ground_station.localization.kinematics import (
+    Kinematics,
+    LandmarkObservations,
+    Solution,
+    no_solution,
+)
 from ground_station.localization.pose_newton import Prior, Reprojection, descend, solve2
 from ground_station.localization.settings import PoseSettings
 
 Array = npt.NDArray[np.float64]
 
 _WIDENING = 9.0
-"""Squared: a sight may miss by three standard deviations of its landmark beside `inlier_px`."""
+"""Squared: an observation may miss by three deviations of its landmark beside `inlier_px`."""
 
 _SMALLEST = 1e-9
 """A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
 
 
 def solve_rolling(
-    predicted: Kinematics, sights: Sights, camera: Camera, settings: PoseSettings
+    predicted: Kinematics,
+    observations: LandmarkObservations,
+    camera: Camera,
+    settings: PoseSettings,
 ) -> Solution:
-    """The pose and twist at the frame's time that best explain its sights and the prediction.
+    """The pose and twist at the frame's time that best explain its observations and the prediction.
 
     The maximum a posteriori of the prediction's Gaussian (its pose, twist and 12×12 covariance) and
-    N sights, each seen from wTc·exp(twist·row_s): constant velocity during the readout, as in
+    N observations, each seen from wTc·exp(twist·row_s): constant velocity during the readout, as in
     Hedborg et al. (CVPR 2012). A residual is whitened by its pixel noise and its landmark's
     covariance, and Huber's loss with `settings.huber_k` is that of a graph with a variable for each
-    landmark. With `settings.reject_outliers` it is solved once more from the inliers alone: sights
-    that miss by less than `settings.inlier_px`, widened by their landmarks' covariance. Of
-    `settings`, `max_iterations` and `min_inliers` are used besides.
+    landmark. With `settings.reject_outliers` it is solved once more from the inliers alone:
+    observations that miss by less than `settings.inlier_px`, widened by their landmarks'
+    covariance. Of `settings`, `max_iterations` and `min_inliers` are used besides.
 
-    Never raises: bad or too few sights, a covariance that is none and no convergence are a
+    Never raises: bad or too few observations, a covariance that is none and no convergence are a
     `Solution` without a state, with the reason.
     """
-    count = len(sights)
-    if reason := _refused(predicted, sights):
+    count = len(observations)
+    if reason := _refused(predicted, observations):
         return no_solution(count, reason)
     prior = _prior(predicted)
     if prior is None:
         return no_solution(count, "the prediction's covariance is not positive definite")
     every = Reprojection(
-        points_m=np.ascontiguousarray(sights.points_m.T, np.float64),
-        offset_px=np.ascontiguousarray((sights.pinhole_px - [camera.cx_px, camera.cy_px]).T),
-        covariance_m2=np.ascontiguousarray(sights.covariance_m2.transpose(1, 2, 0), np.float64),
-        variance_px2=np.square(sights.sigma_px, dtype=np.float64),
-        row_s=np.asarray(sights.row_s, np.float64),
+        points_m=np.ascontiguousarray(observations.points_m.T, np.float64),
+        offset_px=np.ascontiguousarray((observations.pinhole_px - [camera.cx_px, camera.cy_px]).T),
+        covariance_m2=np.ascontiguousarray(
+            observations.covariance_m2.transpose(1, 2, 0), np.float64
+        ),
+        variance_px2=np.square(observations.sigma_px, dtype=np.float64),
+        row_s=np.asarray(observations.row_s, np.float64),
         camera=camera,
         huber_k=settings.huber_k,
     )
@@ -65,7 +75,7 @@ def solve_rolling(
             wTc, twist, linear = found.wTc, found.twist, found.linear
             if chosen is every:
                 spread = linear.spread_px2
-            inlier_px = settings.inlier_px * sights.stretch
+            inlier_px = settings.inlier_px * observations.stretch
             residual_px, inlier = _judge(every, wTc, twist, spread, inlier_px)
     covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
     if covariance is None:
@@ -77,16 +87,16 @@ def solve_rolling(
         Kinematics(predicted.time_ns, wTc, twist, covariance),
         linear.information,
         linear.gradient,
-        residual_px / sights.stretch,
+        residual_px / observations.stretch,
         inlier,
         float(apart @ prior.information @ apart),
         iterations,
     )
 
 
-def _refused(predicted: Kinematics, sights: Sights) -> str:
+def _refused(predicted: Kinematics, observations: LandmarkObservations) -> str:
     """Why these cannot be solved at all, or nothing."""
-    count = len(sights)
+    count = len(observations)
     shapes = {
         "points_m": (count, 3),
         "pinhole_px": (count, 2),
@@ -96,12 +106,12 @@ def _refused(predicted: Kinematics, sights: Sights) -> str:
         "stretch": (count,),
     }
     for name, shape in shapes.items():
-        values = getattr(sights, name)
+        values = getattr(observations, name)
         if values.shape != shape:
             return f"{name} has the shape {values.shape}, not {shape}"
         if not np.isfinite(values).all():
             return f"{name} is not finite"
-    if not (sights.sigma_px > 0).all():
+    if not (observations.sigma_px > 0).all():
         return "sigma_px is not positive"
     for name, values in vars(predicted).items():
         if not np.isfinite(values).all():
@@ -135,10 +145,10 @@ def _inverse(information: Array) -> Array | None:
 
 
 def _judge(
-    sights: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: Array
+    observations: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: Array
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Distances (N,) from sights to projected landmarks, pixels, and which are inliers (N,)."""
-    view = sights.view(wTc, twist)
+    """Distances (N,) of observations from projected landmarks, pixels; which are inliers (N,)."""
+    view = observations.view(wTc, twist)
     r = view.residual_px
     share = (solve2(inlier_px**2, _WIDENING * spread_px2, r)[0] * r).sum(axis=0)
     residual_px = np.where(view.front, np.sqrt((r * r).sum(axis=0)), np.inf)

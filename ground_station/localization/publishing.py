@@ -21,9 +21,8 @@ def covariance_in_map(covariance: Array, information: Array, settings: Covarianc
     """The pose's covariance (6, 6) in the map: scaled, and with what frames share added.
 
     A filter takes the errors of two frames for independent; the errors of the landmarks they both
-    see are not. Those move the pose as the sights of one frame alone would: by the inverse of their
-    `information` (12, 12) about the pose, with a share that was calibrated against truth.
-    """
+    see are not. Those move the pose as the observations of one frame alone would: by the inverse of
+    their `information` (12, 12) about the pose, with a share that was calibrated against truth."""
     published = settings.scale**2 * covariance[:6, :6]
     if settings.shared > 0:
         try:

@@ -359,7 +359,7 @@ class CovarianceSettings:
 
     scale: float = config.key(1.0, "standard deviations are multiplied by it", low=0.01, high=100)
     shared: float = config.key(
-        0.0, "share of the deviations by the frame's own sights that all frames have in common",
+        0.0, "share of the deviations by a frame's observations that all frames have in common",
         low=0, high=10,
     )  # fmt: skip
     map: float = config.key(

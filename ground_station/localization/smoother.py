@@ -1,4 +1,5 @@
-"""The live pose graph: the states of the last second, the sights of each, and the process between.
+"""The live pose graph: the states of the last second, the observations of each, and the process
+between.
 
 A fixed-lag smoother on GTSAM's ISAM2 (Kaess et al., IJRR 2012). Its newest state is the causal
 estimate; a state that is one lag old leaves it, and is the smoothed one. The two are never mixed.
@@ -46,11 +47,11 @@ class FixedLagSmoother:
     """Poses and twists of the last `smoother_lag_s`.
 
     Each state is one 12-vector of GTSAM: its step from the solution it came with. Factors are
-    linear at that solution, a frame's sights as a Hessian, the process as a Jacobian, so that ISAM2
-    never calls back into Python. `failures` counts the updates that could not be used and restarted
-    the graph; `failure` says why the last one could not. States that leave the lag are kept until
-    `smoothed` is called; without `keep` they are forgotten, and what is held never grows.
-    """
+    linear at that solution, a frame's observations as a Hessian, the process as a Jacobian, so that
+    ISAM2 never calls back into Python. `failures` counts the updates that could not be used and
+    restarted the graph; `failure` says why the last one could not. States that leave the lag are
+    kept until `smoothed` is called; without `keep` they are forgotten, and what is held never
+    grows."""
 
     def __init__(self, settings: MotionSettings, keep: bool = True) -> None:
         self.settings = settings
@@ -100,10 +101,10 @@ class FixedLagSmoother:
         """Adds a solved frame and returns the newest state with its covariance, causal.
 
         `wild`: it was solved with the wild prediction, so the densities become what it needs.
-        `solution.information` and `.gradient` are of the frame's sights alone, at `solution.state`.
-        When they can't be used, or the graph becomes singular, it restarts from the solution's own
-        state and covariance; when that is not finite either, from the prediction. Raises
-        `ValueError` when there is no state, or its time is not after the newest.
+        `solution.information` and `.gradient` are of the frame's observations alone, at
+        `solution.state`. When they can't be used, or the graph becomes singular, it restarts from
+        the solution's own state and covariance; when that is not finite either, from the
+        prediction. Raises `ValueError` when there is no state, or its time is not after the newest.
         """
         state = solution.state
         if state is None:
@@ -191,7 +192,7 @@ class FixedLagSmoother:
     ) -> Kinematics:
         information = (solution.information + solution.information.T) / 2
         if not (np.isfinite(information).all() and np.isfinite(solution.gradient).all()):
-            raise _Refused("the sights' information is not finite")
+            raise _Refused("the observations' information is not finite")
         step = self._expect(latest, state.time_ns)
         error = process.difference(step.state, state)
         if not (np.isfinite(error).all() and np.isfinite(step.noise).all()):
@@ -208,9 +209,9 @@ class FixedLagSmoother:
             before.key, whiten @ by_latest, key, whiten @ by_state,
             whiten @ (by_latest @ offset - error), _UNIT,
         )  # fmt: skip
-        sights = gtsam.HessianFactor(key, information, -solution.gradient, 0.0)
+        observations = gtsam.HessianFactor(key, information, -solution.gradient, 0.0)
         self._sound = False
-        self._push(state, [process_factor, sights])
+        self._push(state, [process_factor, observations])
         result = self._estimate(self._newest)
         np.linalg.cholesky(result.covariance)  # raises where it is no covariance
         self._sound = True
@@ -270,7 +271,7 @@ class _Adaptation:
 
     After Mehra's covariance matching (IEEE TAC 1972), in the form of the likelihood's score. The
     deviation e of a solution from its prediction has the covariance P − P⁺ when the filter is right
-    (P predicted, P⁺ with the sights), so y = P⁻¹e has S = P⁻¹ − P⁻¹P⁺P⁻¹. Each density's noise Qᵢ
+    (P predicted, P⁺ with the frame), so y = P⁻¹e has S = P⁻¹ − P⁻¹P⁺P⁻¹. Each density's noise Qᵢ
     weighs the directions in which it tells: yᵀQᵢy is expected to be tr(Qᵢ S).
 
     No one value serves: simulated blimps (plans loop, small-circle and mapping, seeds 1 to 10) have

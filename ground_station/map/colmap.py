@@ -65,10 +65,9 @@ def from_arrays(
 
     `feature` is made anew, unless all key points of each image (N, 2), undistorted, are given.
 
-    COLMAP's adjustment has one loss for all sights. So `weight` (K,) of the images becomes a camera
-    for each weight whose pixels are so much smaller: the same rays, with residuals scaled. Without
-    it there is one camera, that of the database.
-    """
+    COLMAP's adjustment has one loss for all observations. So `weight` (K,) of the images becomes a
+    camera for each weight whose pixels are so much smaller: the same rays, with residuals scaled.
+    Without it there is one camera, that of the database."""
     pinhole = pinhole_camera(camera)
     weights = np.ones(len(model.names)) if weight is None else np.asarray(weight, np.float64)
     levels, camera_of = np.unique(weights, return_inverse=True)
@@ -106,10 +105,12 @@ def from_arrays(
         )
     by_point = np.argsort(model.point, kind="stable")
     tracks = np.searchsorted(model.point[by_point], np.arange(len(model.position) + 1)).tolist()
-    sights = np.stack([model.image_id[model.image], place], axis=1)[by_point]
+    observations = np.stack([model.image_id[model.image], place], axis=1)[by_point]
     for m, point_id in enumerate(model.point_id.tolist()):
-        mine = sights[tracks[m] : tracks[m + 1]].tolist()  # all of them as lists would be large
-        track = [pycolmap.TrackElement(*sight) for sight in mine]
+        mine = observations[
+            tracks[m] : tracks[m + 1]
+        ].tolist()  # all of them as lists would be large
+        track = [pycolmap.TrackElement(*observation) for observation in mine]
         point = pycolmap.Point3D(xyz=model.position[m], track=pycolmap.Track(track))
         result.add_point3D_with_id(point_id, point)
     return result
@@ -162,7 +163,7 @@ def copied(model: Reconstruction) -> Reconstruction:
 
 
 def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
-    """Takes images out of a model, with their sights."""
+    """Takes images out of a model, with their observations."""
     for image_id in np.asarray(image_ids).tolist():
         model.deregister_frame(model.images[image_id].frame_id)
 
@@ -170,7 +171,7 @@ def drop_images(model: Reconstruction, image_ids: npt.ArrayLike) -> None:
 def drop_observations(
     model: Reconstruction, image_ids: npt.ArrayLike, features: npt.ArrayLike
 ) -> None:
-    """Takes sights out of a model; a point that keeps only one goes, too."""
+    """Takes observations out of a model; a point that keeps only one goes, too."""
     pairs = zip(np.asarray(image_ids).tolist(), np.asarray(features).tolist(), strict=True)
     for image_id, feature in pairs:
         if model.images[image_id].points2D[feature].has_point3D():
@@ -178,14 +179,14 @@ def drop_observations(
 
 
 def drop_points(model: Reconstruction, point_ids: npt.ArrayLike) -> None:
-    """Takes points out of a model; those that went with their sights are gone already."""
+    """Takes points out of a model; those that went with their observations are gone already."""
     for point_id in np.asarray(point_ids).tolist():
         if model.exists_point3D(point_id):
             model.delete_point3D(point_id)
 
 
 def compact(model: Reconstruction) -> Reconstruction:
-    """A copy that holds the sights of points only, without the key points that none came of.
+    """A copy that holds the observations of points only, without the key points that none came of.
 
     Two thirds of a model's size on disk are key points without a point.
     """
@@ -229,7 +230,7 @@ def write(model: Reconstruction, folder: Path) -> None:
     model.update_point_3d_errors()
     model.write(folder)
     # COLMAP does not look whether the disk took it. By its format a point has 51 bytes, and 8 for
-    # each of its sights, behind the count of points.
+    # each of its observations, behind the count of points.
     points = folder / "points3D.bin"
     wanted = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
     if points.stat().st_size != wanted:

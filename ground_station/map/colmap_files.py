@@ -47,8 +47,8 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _RIG, _SENSOR, _FURTHER = struct.Struct("<II"), struct.Struct("<iI"), struct.Struct("<iIB")
 _FRAME, _DATA, _POSE = struct.Struct("<II7dI"), struct.Struct("<iIQ"), struct.Struct("<7d")
-_IMAGE, _SIGHT = struct.Struct("<I7dI"), np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-_POINT, _TRACK = struct.Struct("<Q3d3BdQ"), np.dtype([("image", "<u4"), ("sight", "<u4")])
+_IMAGE, _OBSERVATION = struct.Struct("<I7dI"), np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+_POINT, _TRACK = struct.Struct("<Q3d3BdQ"), np.dtype([("image", "<u4"), ("observation", "<u4")])
 _LONGEST_NAME = 4096
 _UNIT = 1e-3
 """How far a rotation's quaternion may be from length 1."""
@@ -233,10 +233,10 @@ def _images(file: _File, cameras: dict[int, CameraEntry]) -> dict[int, ImageEntr
         if camera not in cameras:
             raise Fault(f"image {number} is of a camera that is not there")
         name = file.name()
-        sights = file.table(_SIGHT, file.count())
-        if not np.isfinite(sights["xy"]).all():
+        observations = file.table(_OBSERVATION, file.count())
+        if not np.isfinite(observations["xy"]).all():
             raise Fault(f"a pixel of image {number} is not finite")
-        images[number] = ImageEntry(name, camera, tuple(pose), sights["point"])
+        images[number] = ImageEntry(name, camera, tuple(pose), observations["point"])
     file.end()
     return images
 
@@ -276,7 +276,7 @@ def _points(file: _File, images: dict[int, ImageEntry]) -> None:
     for _ in range(file.count()):
         number, x, y, z, *_, length = file.take(_POINT)
         table = file.table(_TRACK, length)
-        tracks.add(number, (x, y, z), table["image"].tolist(), table["sight"].tolist())
+        tracks.add(number, (x, y, z), table["image"].tolist(), table["observation"].tolist())
     file.end()
     tracks.end()
 
@@ -287,27 +287,27 @@ class Tracks:
     def __init__(self, images: dict[int, ImageEntry]) -> None:
         self._images = images
         self._points: set[int] = set()
-        self._sights = 0
+        self._observations = 0
 
     def add(
         self, number: int, position: tuple[float, ...], images: list[int], places: list[int]
     ) -> None:
-        """A point and its sights: images' numbers and the places of key points in them."""
+        """A point and its observations: images' numbers and the places of key points in them."""
         add(self._points, number, "point")
         self._points.add(number)
         if not np.isfinite(position).all():
             raise Fault(f"point {number} is not finite")
-        sights = list(zip(images, places, strict=True))
-        if len(set(sights)) != len(sights):
-            raise Fault(f"point {number} has a sight twice")
-        for image, place in sights:
+        observations = list(zip(images, places, strict=True))
+        if len(set(observations)) != len(observations):
+            raise Fault(f"point {number} has an observation twice")
+        for image, place in observations:
             seen = self._images[image].points if image in self._images else ()
             if not 0 <= place < len(seen) or seen[place] != number:
                 raise Fault(f"point {number} and image {image} contradict each other")
-        self._sights += len(sights)
+        self._observations += len(observations)
 
     def end(self) -> None:
         """After the last point."""
         by_images = sum(int((image.points != NO_POINT).sum()) for image in self._images.values())
-        if self._sights != by_images:
+        if self._observations != by_images:
             raise Fault("images see points that do not know of it")

@@ -34,16 +34,18 @@ def _in_camera(model: Model) -> F64:
 
 
 def largest_angles_deg(model: Model) -> F64:
-    """Each point's largest angle between two of its sights (M,), degrees."""
+    """Each point's largest angle between two of its observations (M,), degrees."""
     rays = model.wTc[model.image, :3, 3] - model.position[model.point]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     order = np.argsort(model.point, kind="stable")
     starts = np.searchsorted(model.point[order], np.arange(len(model.position) + 1))
     angles = np.zeros(len(model.position))
     for m in range(len(angles)):
-        sights = rays[order[starts[m] : starts[m + 1]]]
-        if len(sights) > 1:
-            angles[m] = np.degrees(np.arccos(np.clip((sights @ sights.T).min(), -1.0, 1.0)))
+        observations = rays[order[starts[m] : starts[m + 1]]]
+        if len(observations) > 1:
+            angles[m] = np.degrees(
+                np.arccos(np.clip((observations @ observations.T).min(), -1.0, 1.0))
+            )
     return angles
 
 
@@ -95,12 +97,12 @@ def landmarks_of_blocks(model: Model, blocks: Sequence[tuple[I64, F32]]) -> Land
     n = np.bincount(model.point, minlength=count)
     weight = 1.0 / np.maximum(n, 1)
     mean = np.zeros((count, blocks[0][1].shape[1] if len(blocks) else 0), np.float32)
-    for sights, descriptors in blocks:
-        np.add.at(mean, model.point[sights], descriptors)
+    for observations, descriptors in blocks:
+        np.add.at(mean, model.point[observations], descriptors)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     square = np.zeros(len(model.point), np.float32)
-    for sights, descriptors in blocks:
-        square[sights] = np.sum((descriptors - mean[model.point[sights]]) ** 2, axis=1)
+    for observations, descriptors in blocks:
+        square[observations] = np.sum((descriptors - mean[model.point[observations]]) ** 2, axis=1)
     spread = np.sqrt(np.bincount(model.point, square, count) * weight)
     rays = model.wTc[model.image, :3, 3] - model.position[model.point]
     distance = np.linalg.norm(rays, axis=1)
@@ -127,11 +129,11 @@ def landmarks_of_blocks(model: Model, blocks: Sequence[tuple[I64, F32]]) -> Land
 
 
 def seen_again(lm: Landmarks, landmark: npt.NDArray[np.int64], position: F64) -> Landmarks:
-    """The landmarks after O further sights: of `landmark` (O,), from camera positions (O, 3).
+    """The landmarks after O further observations: of `landmark` (O,), from camera positions (O, 3).
 
-    Cones and distances hold the old sights and the new ones, and the sights are counted; positions,
-    covariances and descriptors stay. The old sights themselves are not needed.
-    """
+    Cones and distances hold the old observations and the new ones, and the observations are
+    counted; positions, covariances and descriptors stay. The old observations themselves are not
+    needed."""
     shown, group = np.unique(landmark, return_inverse=True)
     group, count = group.ravel(), len(shown)
     rays = position - lm.position_m[landmark]

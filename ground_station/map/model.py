@@ -19,7 +19,7 @@ class Model:
 
     `names`, K image names and `image_id` (K,) their ids, in order of id; `wTc` (K, 4, 4);
     `point_id` (M,), `position` (M, 3). Observation o is key point `feature[o]` of image `image[o]`
-    (an index into `names`), a sight of point `point[o]` (an index into `point_id`), at
+    (an index into `names`), an observation of point `point[o]` (an index into `point_id`), at
     `pixel_px[o]` (O, 2), undistorted pixels. `pinhole` is fx, fy, cx, cy in our pixels.
     """
 
@@ -36,7 +36,7 @@ class Model:
 
 
 def model_of(map_: Map) -> Model:
-    """A map's poses, landmarks and sights, its pixels undistorted."""
+    """A map's poses, landmarks and observations, its pixels undistorted."""
     camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
     image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
     return Model(

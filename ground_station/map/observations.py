@@ -1,7 +1,7 @@
 """What a flight saw of a map's landmarks: the file that `blimp map refine` reads.
 
 A safetensors file: names, types and sizes are checked before use and nothing is executed. It says
-which landmarks it means by a hash of them, so that sights of another map are refused.
+which landmarks it means by a hash of them, so that observations of another map are refused.
 """
 
 from __future__ import annotations
@@ -42,13 +42,12 @@ _LATEST_NS = 2**62
 
 @dataclass(frozen=True)
 class FlightObservations:
-    """F frames that were localized in a map, and the sights they were solved from.
+    """F frames that were localized in a map, and the observations they were solved from.
 
     `time_ns` (F,), increasing; `wTc` (F, 4, 4), the localizer's poses in the map's coordinates;
-    the sights of frame f are rows offset[f]:offset[f + 1] of `landmark` (O,), the landmarks' ids,
-    and `pixel_px` (O, 2), distorted pixels of `camera`. `name` is the flight's, `map` the map's;
-    `landmarks_sha256` is that of the map it was localized in.
-    """
+    the observations of frame f are rows offset[f]:offset[f + 1] of `landmark` (O,), the landmarks'
+    ids, and `pixel_px` (O, 2), distorted pixels of `camera`. `name` is the flight's, `map` the
+    map's; `landmarks_sha256` is that of the map it was localized in."""
 
     name: str
     map: str
@@ -164,15 +163,15 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
 
 def _fault(seen: FlightObservations) -> str | None:
     """What does not fit in a file whose arrays have the right types, or None."""
-    frames, sights, offset = len(seen.time_ns), len(seen.landmark), seen.offset
+    frames, observations, offset = len(seen.time_ns), len(seen.landmark), seen.offset
     camera, R = seen.camera, seen.wTc[:, :3, :3]
     if not seen.name.isprintable() or not 0 < len(seen.name) <= _LONGEST_NAME:
         return f"the flight's name in it is not 1 to {_LONGEST_NAME} printable characters"
     if not np.isfinite(seen.wTc).all() or not np.isfinite(seen.pixel_px).all():
         return "it holds a value that is not finite"
-    if len(seen.wTc) != frames or len(offset) != frames + 1 or len(seen.pixel_px) != sights:
+    if len(seen.wTc) != frames or len(offset) != frames + 1 or len(seen.pixel_px) != observations:
         return "its arrays do not fit each other"
-    if offset[0] != 0 or offset[-1] != sights or (offset[1:] < offset[:-1]).any():
+    if offset[0] != 0 or offset[-1] != observations or (offset[1:] < offset[:-1]).any():
         return "its arrays do not fit each other"
     if (seen.time_ns[1:] <= seen.time_ns[:-1]).any():
         return "its frames are not in order of time"

@@ -14,7 +14,7 @@ from ground_station.map.store import Map
 I64 = npt.NDArray[np.int64]
 
 FRAME_TIME = "frame"
-"""`pixels_at` of a map whose sights are where a global shutter would have seen them."""
+"""`pixels_at` of a map whose observations are where a global shutter would have seen them."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,8 @@ class Refined:
 
     The keyframes that were added come after those that were built, in the order of `flights`, each
     a table with its `name` and number of `frames`. `landmarks_sha256` are hashes that the map's
-    landmarks had before some of them were dropped: sights of those are still sights of this map.
-    `last` is the report of the last refinement.
-    """
+    landmarks had before some of them were dropped: observations of those are still observations of
+    this map. `last` is the report of the last refinement."""
 
     runs: int = 0
     pixels_at: str = ""

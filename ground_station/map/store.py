@@ -155,7 +155,7 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     """
     lm, kf, info = map_.landmarks, map_.keyframes, map_.info
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
-    sights: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}
+    observations: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}
     if quantise:
         arrays |= quantised(lm.descriptor)
     else:
@@ -169,7 +169,7 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     form = str(info.format)
     _save(folder / "landmarks.safetensors", arrays, {"format": form})
     names = "\n".join(kf.names)
-    _save(folder / "keyframes.safetensors", sights, {"format": form, "names": names})
+    _save(folder / "keyframes.safetensors", observations, {"format": form, "names": names})
     save_info(folder, info)
 
 

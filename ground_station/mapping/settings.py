@@ -139,7 +139,7 @@ class SfmSettings:
         unit="images", low=50, high=20000,
     )  # fmt: skip
     min_tri_angle_deg: float = config.key(
-        1.5, "a landmark's largest angle between two sights", unit="deg", low=0.0, high=45.0
+        1.5, "a landmark's largest angle between two observations", unit="deg", low=0.0, high=45.0
     )
     min_track: int = config.key(
         3, "images that must have seen a landmark", unit="images", low=2, high=100
@@ -175,9 +175,15 @@ class RefineSettings:
     max_frames: int = config.key(
         400, "of all flights together; more are thinned evenly", unit="frames", low=1, high=5000
     )
-    min_sights: int = config.key(30, "of a frame that is taken", unit="sights", low=6, high=10000)
+    min_observations: int = config.key(
+        30, "of a frame that is taken", unit="observations", low=6, high=10000
+    )
     max_misfit_px: float = config.key(
-        5.0, "median error of a frame's sights in the map as it was", unit="px", low=0.1, high=100.0
+        5.0,
+        "median error of a frame's observations in the map as it was",
+        unit="px",
+        low=0.1,
+        high=100.0,
     )
     max_shift_px: float = config.key(
         10.0, "a frame in which the readout moved one pixel in ten further is too fast", unit="px",
@@ -194,14 +200,14 @@ class RefineSettings:
         low=0.0, high=10.0,
     )  # fmt: skip
     correlation: float = config.key(
-        0.5, "share of a sight's error that all sights of a landmark in one flight have in common",
+        0.5, "share of an observation's error that all of a landmark in one flight have in common",
         low=0.0, high=1.0,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ExtendSettings:
-    """Which frames of a flight `blimp map extend` adds, and what it makes of their sights."""
+    """Which frames of a flight `blimp map extend` adds, and what it makes of their observations."""
 
     lost_interval_s: float = config.key(
         0.4, "of a stretch that is not localized, a frame is tried so often", unit="s",
@@ -223,7 +229,9 @@ class ExtendSettings:
     min_track: int = config.key(
         6, "frames that must have seen a new landmark", unit="frames", low=2, high=100
     )
-    min_sights: int = config.key(30, "of a frame that joins", unit="sights", low=6, high=10000)
+    min_observations: int = config.key(
+        30, "of a frame that joins", unit="observations", low=6, high=10000
+    )
     merge_px: float = config.key(
         1.0, "what is seen so near to a landmark is that landmark", unit="px", low=0.0, high=20.0
     )

@@ -13,8 +13,8 @@ from ground_station.files import write_json
 from ground_station.map.store import Map
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import open_inputs
+from ground_station.mapping.registration.observations import read_pairs
 from ground_station.mapping.registration.register import register_map
-from ground_station.mapping.registration.sights import read_pairs
 from ground_station.mapping.settings import load_settings
 from ground_station.replay import flight_report
 from ground_station.replay.replay import replay, settings_for
@@ -83,7 +83,7 @@ def build(mapping: Path, sample: Path, folder: Path) -> Map:
     inputs = open_inputs([str(mapping)], settings)
     build_map(inputs, inputs.camera, settings, folder, total=inputs.total, built=inputs.built)
     registered, found = register_map(
-        folder, sights=read_pairs(sample / "PAIRS.csv"), source="PAIRS.csv"
+        folder, observations=read_pairs(sample / "PAIRS.csv"), source="PAIRS.csv"
     )
     for note in found.notes:
         print(note)

@@ -98,7 +98,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     quality.add_argument("--bitrate-kbps", type=int, metavar="B", help="bit rate instead of --crf")
     add("--truth", type=Path, metavar="TUM.txt", help="also write the true poses as TUM text")
-    add("--points", type=Path, metavar="PAIRS.csv", help="also write sights of surveyed points")
+    add(
+        "--points",
+        type=Path,
+        metavar="PAIRS.csv",
+        help="also write observations of surveyed points",
+    )
     add("--json", type=Path, metavar="F", help="write what was made and how long it took")
     add(
         "--sample", type=Path, metavar="FOLDER",

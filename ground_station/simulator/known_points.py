@@ -1,4 +1,4 @@
-"""Sights of surveyed points: where a person would click them in a recording's pictures."""
+"""Observations of surveyed points: where a person would click them in a recording's pictures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def frame_name(index: int) -> str:
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointObservation:
     """A known point seen in a frame, distorted pixels."""
 
     point: KnownPoint
@@ -85,7 +85,7 @@ def _visible(
     return ok
 
 
-def choose_sights(
+def choose_observations(
     renderer: SceneRenderer,
     pinhole: Pinhole,
     camera: Camera,
@@ -95,9 +95,10 @@ def choose_sights(
     rng: np.random.Generator,
     *,
     max_points: int = 18,
-    max_sights: int = 5,
-) -> list[Sight]:
-    """Up to `max_points` points spread over the hall, each in 3 to `max_sights` distant frames.
+    max_observations: int = 5,
+) -> list[PointObservation]:
+    """Up to `max_points` points spread over the hall, each in 3 to `max_observations` distant
+    frames.
 
     Raises `SimulatorError` when fewer than 4 points are seen often enough to register a map.
     """
@@ -121,8 +122,8 @@ def choose_sights(
         for i in np.flatnonzero(candidates & _visible(renderer, pinhole, wTc, points)).tolist():
             seen[i].append((frame, pixels[i], wTc[:3, 3]))
     chosen: dict[int, list[tuple[int, Array, Array]]] = {}
-    for i, sights in enumerate(seen):
-        picked = _far_apart(sights, max_sights)
+    for i, observations in enumerate(seen):
+        picked = _far_apart(observations, max_observations)
         if len(picked) >= 3 and _parallax_deg(picked, position[i]) >= _MIN_PARALLAX_DEG:
             chosen[i] = picked
     if len(chosen) < 4:
@@ -134,28 +135,28 @@ def choose_sights(
     for index in _spread(list(chosen), position, max_points):
         for frame, pixel, _ in sorted(chosen[index], key=lambda s: s[0]):
             u, v = pixel + _CLICK_NOISE_PX * rng.standard_normal(2)
-            result.append(Sight(points[index], frame, (float(u), float(v))))
+            result.append(PointObservation(points[index], frame, (float(u), float(v))))
     return result
 
 
 def _far_apart(
-    sights: list[tuple[int, Array, Array]], count: int
+    observations: list[tuple[int, Array, Array]], count: int
 ) -> list[tuple[int, Array, Array]]:
-    """The sights whose cameras stand farthest from each other, greedily."""
-    if len(sights) <= 1:
-        return sights
-    centres = np.array([s[2] for s in sights])
+    """The observations whose cameras stand farthest from each other, greedily."""
+    if len(observations) <= 1:
+        return observations
+    centres = np.array([s[2] for s in observations])
     picked = [int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmax())]
-    while len(picked) < min(count, len(sights)):
+    while len(picked) < min(count, len(observations)):
         gaps = np.linalg.norm(centres[:, None] - centres[picked][None], axis=2).min(axis=1)
         if gaps.max() < 0.2:
             break
         picked.append(int(gaps.argmax()))
-    return [sights[i] for i in picked]
+    return [observations[i] for i in picked]
 
 
-def _parallax_deg(sights: list[tuple[int, Array, Array]], point: Array) -> float:
-    rays = np.array([s[2] - point for s in sights])
+def _parallax_deg(observations: list[tuple[int, Array, Array]], point: Array) -> float:
+    rays = np.array([s[2] - point for s in observations])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
 
@@ -170,10 +171,10 @@ def _spread(candidates: list[int], position: Array, count: int) -> list[int]:
     return sorted(candidates[i] for i in picked)
 
 
-def write_pairs(path: Path, sights: Sequence[Sight]) -> None:
+def write_pairs(path: Path, observations: Sequence[PointObservation]) -> None:
     """Writes PAIRS.csv, beside and renamed."""
     lines = ["point,image,u_px,v_px,x_m,y_m,z_m"]
-    for s in sights:
+    for s in observations:
         x, y, z = s.point.position_m
         u, v = s.pixel
         lines.append(

@@ -1,4 +1,4 @@
-"""The sample that ships with the program: two flights, a floor plan and sights of known points."""
+"""The sample that ships with the program: two flights, a floor plan and known points."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from ground_station.simulator.imaging import (
     covering_pinhole,
     row_offsets_s,
 )
-from ground_station.simulator.known_points import choose_sights, write_pairs
+from ground_station.simulator.known_points import choose_observations, write_pairs
 from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
@@ -125,7 +125,7 @@ class SimulationResult:
     setup_s: float
     frame_s: float
     interrupted: bool
-    sights: int
+    observations: int
     max_speed_m_s: float
     max_turn_deg_s: float
 
@@ -242,13 +242,13 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
         taken, interrupted = _record(settings, flight, maker, progress)
         frame_s = (time.monotonic() - started - setup_s) / max(taken, 1)
         times = flight.times_s[:taken]
-        sights = []
+        observations = []
         if settings.points is not None:
-            sights = choose_sights(
+            observations = choose_observations(
                 renderer, pinhole, camera, flight.motion, times, flight.scene.known_points,
                 flight.clicks,
             )  # fmt: skip
-            write_pairs(settings.points, sights)
+            write_pairs(settings.points, observations)
     if settings.truth is not None:
         wTc = flight.motion.wTc(times)
         write_tum(settings.truth, Trajectory.from_poses(time_ns_of(times), wTc))
@@ -257,7 +257,7 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
         out=str(settings.out), scene=settings.scene, plan=settings.plan, light=settings.light,
         seed=settings.seed, frames=taken, duration_s=round(taken / flight.rate_hz, 6),
         rate_hz=flight.rate_hz, bytes=settings.out.stat().st_size, setup_s=round(setup_s, 3),
-        frame_s=round(frame_s, 4), interrupted=interrupted, sights=len(sights),
+        frame_s=round(frame_s, 4), interrupted=interrupted, observations=len(observations),
         max_speed_m_s=round(float(speed.max(initial=0)), 3),
         max_turn_deg_s=round(math.degrees(float(turn.max(initial=0))), 2),
     )  # fmt: skip

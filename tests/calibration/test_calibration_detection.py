@@ -9,7 +9,7 @@ import pytest
 from board_views import BoardCamera, Image, Pictured, Waypoints, pose_of, scaled
 
 from ground_station.calibration.board import Board
-from ground_station.calibration.detection import BoardFinder, Sighting, other_board
+from ground_station.calibration.detection import BoardFinder, BoardObservation, other_board
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.gather import Gathered, gather
 from ground_station.calibration.verdict import check_seen
@@ -33,11 +33,11 @@ def taken(motion: Waypoints, **how: object) -> Image:
     return BoardCamera(CAMERA, BOARD).take(motion, 0.1, rng=np.random.default_rng(1), **how)
 
 
-def found(image: Image) -> Sighting | None:
+def found(image: Image) -> BoardObservation | None:
     return FINDER.find(Frame(0, "picture", 0, image))
 
 
-def off_px(seen: Sighting, motion: Waypoints, camera: Camera = CAMERA) -> np.ndarray:
+def off_px(seen: BoardObservation, motion: Waypoints, camera: Camera = CAMERA) -> np.ndarray:
     """How far each corner is from where it truly is, the readout left out: the board rests."""
     turned = cv2.Rodrigues(motion.poses[0, :3])[0]
     points = FINDER.points_m[seen.ids] @ turned.T + motion.poses[0, 3:]
@@ -133,7 +133,7 @@ class Interrupted:
 
 def test_ctrl_c_keeps_what_was_seen() -> None:
     seen = gather([Interrupted()], ["live"], FINDER)
-    assert seen.interrupted and seen.frames == len(seen.sightings) == 2
+    assert seen.interrupted and seen.frames == len(seen.observations) == 2
 
 
 def refusal(*images: Image, finder: BoardFinder = FINDER) -> str:

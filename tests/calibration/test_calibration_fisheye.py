@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 from board_views import carried
+from observed import BOARD, gathered, observed
 from scipy.spatial.transform import Rotation
-from sighted import BOARD, gathered, sighted
 
 from ground_station.calibration import lens
 from ground_station.calibration.calibrate import Result, calibrate
@@ -26,7 +26,7 @@ FISHEYE = Camera(
 def views(seed: int, camera: Camera = FISHEYE):
     motion = carried(camera, BOARD, np.random.default_rng(seed), 40)
     times_s = np.arange(40) * (motion.rest_s + motion.move_s) + 0.1
-    return gathered(sighted(camera, motion, times_s, np.random.default_rng(seed)))
+    return gathered(observed(camera, motion, times_s, np.random.default_rng(seed)))
 
 
 def solved(seed: int, model: str, camera: Camera = FISHEYE) -> Result:

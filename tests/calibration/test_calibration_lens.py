@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_views import Waypoints, carried, pose_of
+from observed import BOARD, gathered, observed
 from scipy.spatial.transform import Rotation
-from sighted import BOARD, gathered, sighted
 
 from ground_station.calibration.calibrate import Result, calibrate
 from ground_station.calibration.certainty import at_corners_px
-from ground_station.calibration.detection import BoardFinder, Sighting
+from ground_station.calibration.detection import BoardFinder, BoardObservation
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.selection import CORNERS
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
@@ -23,16 +23,16 @@ STILL = replace(THESIS_CAMERA, readout_s=0.0)
 def many(rng: np.random.Generator, count: int = 40, camera: Camera = STILL, **how: float):
     """Single views of a board that was carried about."""
     motion = carried(camera, BOARD, rng, count, **how)
-    return sighted(camera, motion, np.arange(count) * (motion.rest_s + motion.move_s) + 0.1, rng)
+    return observed(camera, motion, np.arange(count) * (motion.rest_s + motion.move_s) + 0.1, rng)
 
 
-def solved(sightings: list[Sighting], *, timed: bool = False) -> Result:
-    return calibrate(gathered(sightings), FINDER, [timed])
+def solved(observations: list[BoardObservation], *, timed: bool = False) -> Result:
+    return calibrate(gathered(observations), FINDER, [timed])
 
 
-def refused(sightings: list[Sighting]) -> str:
+def refused(observations: list[BoardObservation]) -> str:
     with pytest.raises(CalibrationError) as error:
-        solved(sightings)
+        solved(observations)
     assert "\n" not in str(error.value)
     return str(error.value)
 
@@ -101,7 +101,7 @@ def test_one_distance_is_named_where_it_leaves_the_lens_open() -> None:
         for dx, dy, tilt in ((0, 0, 0), (40, 10, 18), (-30, 20, -18), (10, -30, 16))
     ]
     motion = Waypoints(np.repeat(np.array(middle), 1, axis=0))
-    views = sighted(STILL, motion, np.arange(4) * 0.9 + 0.1, np.random.default_rng(4))
+    views = observed(STILL, motion, np.arange(4) * 0.9 + 0.1, np.random.default_rng(4))
     assert "one distance" in refused(views)
 
 

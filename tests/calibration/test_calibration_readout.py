@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_views import Waypoints, carried
-from sighted import BOARD, gathered, sighted
+from observed import BOARD, gathered, observed
 
 from ground_station.calibration.calibrate import _known_readout_s, calibrate
 from ground_station.calibration.detection import BoardFinder
@@ -25,8 +25,8 @@ def theta_of(camera: Camera) -> np.ndarray:
 
 
 def measured(camera: Camera, times_s: np.ndarray, motion: Waypoints, seed: int):
-    sightings = sighted(camera, motion, times_s, np.random.default_rng(seed))
-    views = views_of(sightings, FINDER.points_m, [True])
+    observations = observed(camera, motion, times_s, np.random.default_rng(seed))
+    views = views_of(observations, FINDER.points_m, [True])
     return readout_of(views, theta_of(camera), camera.height_px)
 
 
@@ -72,13 +72,13 @@ def test_the_lens_of_a_moving_board_is_right_once_the_shutter_is_known() -> None
     """It never rests: every view is skewed, and the skew is taken out."""
     motion = carried(THESIS_CAMERA, BOARD, np.random.default_rng(17), 15, rest_s=0.0, move_s=0.9)
     times = np.arange(0.05, motion.duration_s - 0.05, 1 / 30)
-    sightings = sighted(THESIS_CAMERA, motion, times, np.random.default_rng(18))
-    result = calibrate(gathered(sightings), FINDER, [True])
+    observations = observed(THESIS_CAMERA, motion, times, np.random.default_rng(18))
+    result = calibrate(gathered(observations), FINDER, [True])
     assert result.camera.readout_s == pytest.approx(THESIS_CAMERA.readout_s, rel=0.05)
     assert result.camera.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.003)
     assert result.camera.cy_px == pytest.approx(THESIS_CAMERA.cy_px, abs=1.0)
     with pytest.raises(CalibrationError, match="known to"):  # and no lens without its times
-        calibrate(gathered(sightings), FINDER, [False])
+        calibrate(gathered(observations), FINDER, [False])
 
 
 def test_rows_from_last_to_first_are_said_and_not_written() -> None:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.inspection.sightings import View
+from ground_station.inspection.visibility import View
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
 F64 = npt.NDArray[np.float64]

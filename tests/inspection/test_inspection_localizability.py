@@ -17,7 +17,7 @@ from ground_station.geometry.trajectory import Trajectory
 from ground_station.inspection.comparison import compare, spearman
 from ground_station.inspection.localizability import localizability
 from ground_station.inspection.prediction import Needs, Predictor
-from ground_station.inspection.sightings import Sightings, View
+from ground_station.inspection.visibility import View, Visibility
 from ground_station.localization.settings import load_preset
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
@@ -44,9 +44,9 @@ def test_the_image_ends_where_the_localizer_says():
 
 
 def test_a_landmark_behind_a_wall_is_not_counted(rooms):
-    sightings = Sightings(rooms)
+    visibility = Visibility(rooms)
     for room, x in ((0, 2.0), (1, SIDE_M + 2.0)):
-        chance = sightings.chance([x, 3.0, 1.5])
+        chance = visibility.chance([x, 3.0, 1.5])
         mine, other = np.split(chance, 2)[:: 1 if room == 0 else -1]
         looked_at = mine[mine > 0.5]
         assert len(looked_at) > 100  # nine keyframes saw the middle of this wall from near here
@@ -61,9 +61,9 @@ def test_chances_follow_how_often_a_landmark_was_found():
     shown = np.flatnonzero(View(THESIS_CAMERA).inside(local))
     often, seldom = shown[::2], shown[1::2]
     map_ = made_of(position, wTc, [shown if k < 2 else often for k in range(10)])
-    chance = Sightings(map_).chance([2.0, 3.0, 1.5])
+    chance = Visibility(map_).chance([2.0, 3.0, 1.5])
     assert np.allclose(chance[often], 10 / 11) and np.allclose(chance[seldom], 2 / 11)
-    aside = Sightings(map_).chance([SIDE_M - 0.5, 0.1, 1.5])
+    aside = Visibility(map_).chance([SIDE_M - 0.5, 0.1, 1.5])
     far = np.linalg.norm(position[shown] - [SIDE_M, 5.5, 1.5], axis=1) < 1.0
     assert aside[shown[far]].max() < 0.15  # nobody looked so obliquely, however often
 
@@ -158,7 +158,7 @@ def test_a_map_without_a_world_is_turned_upright(rooms):
 
 
 def test_a_large_map_is_thinned_to_the_same_answer(rooms):
-    whole, few = Sightings(rooms), Sightings(rooms, most_landmarks=200, most_keyframes=9)
+    whole, few = Visibility(rooms), Visibility(rooms, most_landmarks=200, most_keyframes=9)
     assert len(few.rows) == 200 and few.weight == 3
     place = [2.0, 3.0, 1.5]
     assert few.weight * few.chance(place).sum() == pytest.approx(whole.chance(place).sum(), rel=0.2)

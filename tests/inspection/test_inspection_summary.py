@@ -38,7 +38,7 @@ def test_what_is_said_has_percentiles_and_extent():
     assert 0 < document["covered_area"] < 36
 
 
-def test_a_map_without_sights_is_described():
+def test_a_map_without_observations_is_described():
     map_ = two_rooms(5)
     for table in (map_.landmarks, map_.keyframes):
         for name, value in vars(table).items():

@@ -85,7 +85,7 @@ def test_a_frame_is_found_anywhere_in_the_map(wide, room, extractor):
     assert np.linalg.norm((poses.inverse(path[0]) @ estimate.wTc)[:3, 3]) < 0.03
 
 
-def test_the_noise_of_a_sight_grows_to_the_rim_as_its_pixels_do(wide, room):
+def test_the_noise_of_a_observation_grows_to_the_rim_as_its_pixels_do(wide, room):
     matcher = Matcher(wide.map, FISHEYE, load_preset("default"))
     _, path = room.path(1)
     pixels = wide.seen(path[0])
@@ -93,13 +93,13 @@ def test_the_noise_of_a_sight_grows_to_the_rim_as_its_pixels_do(wide, room):
     landmark = landmark[FISHEYE.uses(pixels[landmark])]
     expected = Kinematics(0, path[0], np.zeros(6), np.eye(12))
     pixels = pixels[landmark]
-    sights = matcher.sights(pixels, landmark, 0.5, expected, Conditions())
+    observations = matcher.observations(pixels, landmark, 0.5, expected, Conditions())
     steps = np.random.default_rng(2).normal(0, 0.01, (200, len(pixels), 2))
     kept = FISHEYE.uses(pixels + 0.1) & FISHEYE.uses(pixels - 0.1)
     moved = [FISHEYE.undistort_to_pinhole(p)[kept] for p in pixels + steps]
-    scatter = np.sqrt(np.square(np.array(moved) - sights.pinhole_px[kept]).mean(axis=(0, 2)))
-    assert sights.sigma_px.max() > 3.5 * sights.sigma_px.min()
-    np.testing.assert_allclose(sights.sigma_px[kept] / 0.5, scatter / 0.01, rtol=0.25)
+    scatter = np.sqrt(np.square(np.array(moved) - observations.pinhole_px[kept]).mean(axis=(0, 2)))
+    assert observations.sigma_px.max() > 3.5 * observations.sigma_px.min()
+    np.testing.assert_allclose(observations.sigma_px[kept] / 0.5, scatter / 0.01, rtol=0.25)
 
 
 def test_features_beyond_what_is_used_and_points_followed_there_are_dropped(wide, room):

@@ -145,11 +145,11 @@ def test_landmarks_are_expected_where_their_row_will_see_them(room, extractor):
     camera = dataclasses.replace(room.camera, readout_s=0.02)
     matcher = Matcher(room.map, camera, load_preset("default"))
     _, path = room.path(1)
-    sights = matcher.sights(
+    observations = matcher.observations(
         [[320.0, 0.0], [320.0, 239.5], [320.0, 479.0]], np.arange(3), 2.0,
         estimator_at(room, path[0]).predict(0), Conditions(),
     )  # fmt: skip
-    assert np.allclose(sights.row_s, [-0.01, 0.0, 0.01])
+    assert np.allclose(observations.row_s, [-0.01, 0.0, 0.01])
     off = dataclasses.replace(load_preset("default").pose, rolling_shutter=False)
     still = Matcher(room.map, camera, dataclasses.replace(load_preset("default"), pose=off))
     assert not still.row_s(np.array([[0.0, 0.0], [0.0, 479.0]])).any()

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import L, X
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA as CAMERA
-from ground_station.localization.kinematics import Kinematics, Sights
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_newton import Prior, Reprojection
 from ground_station.localization.pose_rolling import solve_rolling
@@ -37,8 +37,8 @@ def _scene(
     outliers: float = 0.0,
     twist: np.ndarray = TWIST,
     sigma: np.ndarray = SIGMA,
-) -> tuple[Kinematics, Sights, np.ndarray]:
-    """A prediction and sights with exactly the errors they state, and which are wrong.
+) -> tuple[Kinematics, LandmarkObservations, np.ndarray]:
+    """A prediction and observations with exactly the errors they state, and which are wrong.
 
     Landmarks' covariances are four times as long along one random axis as across.
     """
@@ -66,7 +66,7 @@ def _scene(
         5, TRUE @ poses.inverse(poses.exp(error[:6])), twist - error[6:], np.diag(sigma**2)
     )
     sigma, even = np.full(count, noise_px), np.ones(count)
-    return predicted, Sights(points, pixels, row_s, sigma, root @ root, even), wrong
+    return predicted, LandmarkObservations(points, pixels, row_s, sigma, root @ root, even), wrong
 
 
 def _error(state: Kinematics, twist: np.ndarray = TWIST) -> np.ndarray:
@@ -74,21 +74,21 @@ def _error(state: Kinematics, twist: np.ndarray = TWIST) -> np.ndarray:
     return np.concatenate([poses.log(poses.inverse(state.wTc) @ TRUE), twist - state.twist])
 
 
-def _reprojection(sights: Sights, huber_k: float = 1.345) -> Reprojection:
+def _reprojection(observations: LandmarkObservations, huber_k: float = 1.345) -> Reprojection:
     return Reprojection(
-        np.ascontiguousarray(sights.points_m.T),
-        (sights.pinhole_px - [CAMERA.cx_px, CAMERA.cy_px]).T.copy(),
-        np.ascontiguousarray(sights.covariance_m2.transpose(1, 2, 0)),
-        sights.sigma_px**2,
-        sights.row_s,
+        np.ascontiguousarray(observations.points_m.T),
+        (observations.pinhole_px - [CAMERA.cx_px, CAMERA.cy_px]).T.copy(),
+        np.ascontiguousarray(observations.covariance_m2.transpose(1, 2, 0)),
+        observations.sigma_px**2,
+        observations.row_s,
         CAMERA,
         huber_k,
     )
 
 
 def test_pose_and_velocity_are_recovered_among_a_fifth_of_outliers():
-    predicted, sights, wrong = _scene(np.random.default_rng(1), outliers=0.2, noise_px=0.3)
-    solution = solve_rolling(predicted, sights, CAMERA, SETTINGS)
+    predicted, observations, wrong = _scene(np.random.default_rng(1), outliers=0.2, noise_px=0.3)
+    solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
     assert solution.state is not None, solution.reason
     error = _error(solution.state)
     assert np.linalg.norm(error[:3]) < np.deg2rad(0.02) and np.linalg.norm(error[3:6]) < 0.002
@@ -100,11 +100,11 @@ def test_pose_and_velocity_are_recovered_among_a_fifth_of_outliers():
 
 
 def test_without_the_rows_the_pose_is_many_times_worse():
-    predicted, sights, _ = _scene(np.random.default_rng(2), noise_px=0.3)
-    still = dataclasses.replace(sights, row_s=np.zeros(len(sights)))
+    predicted, observations, _ = _scene(np.random.default_rng(2), noise_px=0.3)
+    still = dataclasses.replace(observations, row_s=np.zeros(len(observations)))
     by_rows, at_once = (
         solve_rolling(predicted, s, CAMERA, dataclasses.replace(SETTINGS, inlier_px=20.0)).state
-        for s in (sights, still)
+        for s in (observations, still)
     )
     near, far = (np.linalg.norm(_error(state)[3:6]) for state in (by_rows, at_once))
     assert far > 5 * near
@@ -121,8 +121,8 @@ def test_errors_are_as_large_as_the_covariance_says(landmark_m):
     for seed in range(200):
         rng = np.random.default_rng(100 + seed)
         twist = TWIST * rng.normal(size=6)
-        predicted, sights, _ = _scene(rng, count=80, landmark_m=landmark_m, twist=twist)
-        solution = solve_rolling(predicted, sights, CAMERA, settings)
+        predicted, observations, _ = _scene(rng, count=80, landmark_m=landmark_m, twist=twist)
+        solution = solve_rolling(predicted, observations, CAMERA, settings)
         error = _error(solution.state, twist)
         nees.append(error @ np.linalg.solve(solution.state.covariance, error))
         innovations.append(solution.innovation)
@@ -134,8 +134,8 @@ def test_errors_are_as_large_as_the_covariance_says(landmark_m):
 
 @pytest.mark.parametrize("twist", [TWIST, np.zeros(6)])
 def test_the_jacobian_is_that_of_finite_differences(twist):
-    sights = _scene(np.random.default_rng(3), count=40, twist=twist)[1]
-    cost = _reprojection(sights)
+    observations = _scene(np.random.default_rng(3), count=40, twist=twist)[1]
+    cost = _reprojection(observations)
     J = cost.view(TRUE, twist).jacobian()
     step = 1e-6
     for k in range(12):
@@ -151,8 +151,8 @@ def test_the_jacobian_is_that_of_finite_differences(twist):
 
 def test_gradient_and_landmarks_jacobian_are_those_of_finite_differences():
     rng = np.random.default_rng(4)
-    predicted, sights, _ = _scene(rng, count=60, landmark_m=0.01, outliers=0.3)
-    cost = _reprojection(sights)
+    predicted, observations, _ = _scene(rng, count=60, landmark_m=0.01, outliers=0.3)
+    cost = _reprojection(observations)
     start = cost.linearize(predicted.wTc, predicted.twist)
     for _ in range(3):  # the weights of outliers take a few rounds where landmarks are elongated
         start = cost.linearize(predicted.wTc, predicted.twist, start)
@@ -178,7 +178,7 @@ def test_gradient_and_landmarks_jacobian_are_those_of_finite_differences():
         assert np.allclose(view.rows()[:, axis], numeric, rtol=1e-4, atol=1e-2)
 
 
-def _graph(predicted: Kinematics, sights: Sights, k: float) -> np.ndarray:
+def _graph(predicted: Kinematics, observations: LandmarkObservations, k: float) -> np.ndarray:
     """The same objective with a variable for each landmark, by GTSAM to convergence; no rows."""
     calibration = gtsam.Cal3_S2(CAMERA.fx_px, CAMERA.fy_px, 0.0, CAMERA.cx_px, CAMERA.cy_px)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -186,15 +186,15 @@ def _graph(predicted: Kinematics, sights: Sights, k: float) -> np.ndarray:
     values.insert(X(0), start)
     pose_noise = gtsam.noiseModel.Gaussian.Covariance(predicted.covariance[:6, :6])
     graph.add(gtsam.PriorFactorPose3(X(0), start, pose_noise))
-    for i, point in enumerate(sights.points_m):
+    for i, point in enumerate(observations.points_m):
         noise = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Huber.Create(k),
-            gtsam.noiseModel.Isotropic.Sigma(2, sights.sigma_px[i]),
+            gtsam.noiseModel.Isotropic.Sigma(2, observations.sigma_px[i]),
         )
         values.insert(L(i), point)
-        pixel = sights.pinhole_px[i]
+        pixel = observations.pinhole_px[i]
         graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, X(0), L(i), calibration))
-        model = gtsam.noiseModel.Gaussian.Covariance(sights.covariance_m2[i])
+        model = gtsam.noiseModel.Gaussian.Covariance(observations.covariance_m2[i])
         graph.add(gtsam.PriorFactorPoint3(L(i), point, model))
     params = gtsam.GaussNewtonParams()
     params.setMaxIterations(200)
@@ -208,21 +208,21 @@ def _graph(predicted: Kinematics, sights: Sights, k: float) -> np.ndarray:
 def test_the_optimum_is_the_graphs_with_elongated_landmarks(seed):
     rng = np.random.default_rng(seed)
     still = np.zeros(6)
-    predicted, sights, _ = _scene(
+    predicted, observations, _ = _scene(
         rng, count=400, landmark_m=0.008, outliers=0.2, twist=still, noise_px=2.0
     )
-    sights = dataclasses.replace(sights, row_s=np.zeros(len(sights)))
+    observations = dataclasses.replace(observations, row_s=np.zeros(len(observations)))
     settings = dataclasses.replace(SETTINGS, reject_outliers=False)
-    state = solve_rolling(predicted, sights, CAMERA, settings).state
-    apart = poses.log(poses.inverse(_graph(predicted, sights, settings.huber_k)) @ state.wTc)
+    state = solve_rolling(predicted, observations, CAMERA, settings).state
+    apart = poses.log(poses.inverse(_graph(predicted, observations, settings.huber_k)) @ state.wTc)
     assert np.abs(apart).max() < 1e-5
 
 
 def test_a_global_shutter_leaves_the_velocity_as_predicted():
     rng = np.random.default_rng(5)
-    predicted, sights, _ = _scene(rng, twist=np.zeros(6))
-    sights = dataclasses.replace(sights, row_s=np.zeros(len(sights)))
-    solution = solve_rolling(predicted, sights, CAMERA, SETTINGS)
+    predicted, observations, _ = _scene(rng, twist=np.zeros(6))
+    observations = dataclasses.replace(observations, row_s=np.zeros(len(observations)))
+    solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
     assert np.allclose(solution.state.twist, predicted.twist, atol=1e-12)
     assert np.allclose(solution.state.covariance[6:, 6:], predicted.covariance[6:, 6:])
     assert not solution.information[6:].any() and not solution.gradient[6:].any()
@@ -230,36 +230,38 @@ def test_a_global_shutter_leaves_the_velocity_as_predicted():
 
 def test_with_nothing_predicted_it_is_the_direct_pose():
     rng = np.random.default_rng(6)
-    predicted, sights, _ = _scene(rng, twist=np.zeros(6), outliers=0.2)
-    sights = dataclasses.replace(
-        sights,
-        row_s=np.zeros(len(sights)),
-        covariance_m2=np.tile(1e-4 * np.eye(3), (len(sights), 1, 1)),
+    predicted, observations, _ = _scene(rng, twist=np.zeros(6), outliers=0.2)
+    observations = dataclasses.replace(
+        observations,
+        row_s=np.zeros(len(observations)),
+        covariance_m2=np.tile(1e-4 * np.eye(3), (len(observations), 1, 1)),
     )
     diffuse = np.diag(np.r_[np.full(6, 1e8), np.full(6, 1.0)])
     settings = dataclasses.replace(SETTINGS, sigma_px=1.0, reject_outliers=False)
     unknown = dataclasses.replace(predicted, covariance=diffuse)
-    rolling = solve_rolling(unknown, sights, CAMERA, settings)
-    direct = solve_direct(predicted.wTc, sights.points_m, sights.pinhole_px, CAMERA, settings)
+    rolling = solve_rolling(unknown, observations, CAMERA, settings)
+    direct = solve_direct(
+        predicted.wTc, observations.points_m, observations.pinhole_px, CAMERA, settings
+    )
     assert np.abs(rolling.state.wTc - direct.wTc).max() < 1e-5
     assert np.allclose(rolling.state.covariance[:6, :6], direct.covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_two_sights_do_beside_a_prediction():
+def test_two_observations_do_beside_a_prediction():
     rng = np.random.default_rng(7)
-    predicted, sights, _ = _scene(rng, count=2)
+    predicted, observations, _ = _scene(rng, count=2)
     solution = solve_rolling(
-        predicted, sights, CAMERA, dataclasses.replace(SETTINGS, min_inliers=2)
+        predicted, observations, CAMERA, dataclasses.replace(SETTINGS, min_inliers=2)
     )
     assert solution.state is not None, solution.reason
     before, after = np.diag(predicted.covariance), np.diag(solution.state.covariance)
     assert (after < before * (1 + 1e-9)).all() and after[:2].max() < 0.5 * before[0]
 
 
-def test_the_sights_alone_are_told_for_a_smoother():
+def test_the_observations_alone_are_told_for_a_smoother():
     """Their information and the prior's make up the posterior, and their gradients cancel."""
-    predicted, sights, _ = _scene(np.random.default_rng(8), landmark_m=0.01)
-    solution = solve_rolling(predicted, sights, CAMERA, SETTINGS)
+    predicted, observations, _ = _scene(np.random.default_rng(8), landmark_m=0.01)
+    solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
     state = solution.state
     prior = Prior(
         poses.inverse(predicted.wTc), predicted.twist, np.linalg.inv(predicted.covariance)
@@ -274,18 +276,18 @@ def test_the_sights_alone_are_told_for_a_smoother():
 
 def test_points_behind_reward_no_step():
     """A third of the landmarks is behind: they are no inliers, and the others' pose is found."""
-    predicted, sights, _ = _scene(np.random.default_rng(9), count=90)
-    points = sights.points_m.copy()
+    predicted, observations, _ = _scene(np.random.default_rng(9), count=90)
+    points = observations.points_m.copy()
     away = poses.transform(poses.inverse(TRUE), points[:30])
     points[:30] = poses.transform(TRUE, away * [1, 1, -1])
     solution = solve_rolling(
-        predicted, dataclasses.replace(sights, points_m=points), CAMERA, SETTINGS
+        predicted, dataclasses.replace(observations, points_m=points), CAMERA, SETTINGS
     )
     assert solution.state is not None, solution.reason
     assert not solution.inlier[:30].any() and solution.inlier[30:].all()
     assert np.isinf(solution.residual_px[:30]).all()
     assert np.linalg.norm(_error(solution.state)[3:6]) < 0.01
-    none = dataclasses.replace(sights, points_m=np.tile(points[:1], (90, 1)))
+    none = dataclasses.replace(observations, points_m=np.tile(points[:1], (90, 1)))
     failed = solve_rolling(predicted, none, CAMERA, SETTINGS)
     assert failed.state is None and failed.reason
 
@@ -300,22 +302,24 @@ def test_points_behind_reward_no_step():
         ("sigma_px", 0.0, "sigma_px is not positive"),
     ],
 )
-def test_sights_that_cannot_be_used_are_named(field, value, said):
-    predicted, sights, _ = _scene(np.random.default_rng(10), count=20)
-    values = getattr(sights, field).copy()
+def test_observations_that_cannot_be_used_are_named(field, value, said):
+    predicted, observations, _ = _scene(np.random.default_rng(10), count=20)
+    values = getattr(observations, field).copy()
     values[3] = value
     solution = solve_rolling(
-        predicted, dataclasses.replace(sights, **{field: values}), CAMERA, SETTINGS
+        predicted, dataclasses.replace(observations, **{field: values}), CAMERA, SETTINGS
     )
     assert solution.state is None and solution.reason == said
     assert len(solution.inlier) == len(solution.residual_px) == 20 and not solution.inlier.any()
 
 
 def test_a_prediction_that_cannot_be_used_is_named():
-    predicted, sights, _ = _scene(np.random.default_rng(11), count=20)
-    few = dataclasses.replace(sights, **{name: values[:3] for name, values in vars(sights).items()})
+    predicted, observations, _ = _scene(np.random.default_rng(11), count=20)
+    few = dataclasses.replace(
+        observations, **{name: values[:3] for name, values in vars(observations).items()}
+    )
     none = dataclasses.replace(
-        sights, **{name: values[:0] for name, values in vars(sights).items()}
+        observations, **{name: values[:0] for name, values in vars(observations).items()}
     )
     assert solve_rolling(predicted, few, CAMERA, SETTINGS).reason == "3 inliers"
     assert solve_rolling(predicted, none, CAMERA, SETTINGS).reason == "0 inliers"
@@ -326,19 +330,23 @@ def test_a_prediction_that_cannot_be_used_is_named():
         (np.full((12, 12), np.nan), "the prediction's covariance is not finite"),
     ):
         bad = dataclasses.replace(predicted, covariance=covariance)
-        assert solve_rolling(bad, sights, CAMERA, SETTINGS).reason == said
+        assert solve_rolling(bad, observations, CAMERA, SETTINGS).reason == said
     certain = dataclasses.replace(predicted, covariance=np.zeros((12, 12)))
-    state = solve_rolling(certain, sights, CAMERA, dataclasses.replace(SETTINGS, inlier_px=90.0))
+    state = solve_rolling(
+        certain, observations, CAMERA, dataclasses.replace(SETTINGS, inlier_px=90.0)
+    )
     assert np.allclose(state.state.wTc, predicted.wTc, atol=1e-6)
     stopped = dataclasses.replace(SETTINGS, max_iterations=1)
-    assert "not converged" in solve_rolling(predicted, sights, CAMERA, stopped).reason
+    assert "not converged" in solve_rolling(predicted, observations, CAMERA, stopped).reason
 
 
-def test_no_cycle_where_half_of_few_sights_are_wrong():
+def test_no_cycle_where_half_of_few_observations_are_wrong():
     """Newton's steps on Huber's loss can go round in circles there."""
     sigma = np.repeat([0.1, 0.25, 0.3, 0.8], 3)
     for seed in range(670, 690):  # 678 did
         rng = np.random.default_rng(seed)
-        predicted, sights, _ = _scene(rng, count=30, landmark_m=0.005, outliers=0.5, sigma=sigma)
-        solution = solve_rolling(predicted, sights, CAMERA, SETTINGS)
+        predicted, observations, _ = _scene(
+            rng, count=30, landmark_m=0.005, outliers=0.5, sigma=sigma
+        )
+        solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
         assert "converged" not in solution.reason, seed

@@ -281,7 +281,7 @@ def test_a_solution_that_is_no_number_leaves_the_prediction(what):
         smoother.restart(bad)
 
 
-def test_a_frame_without_sights_says_what_the_prediction_says():
+def test_a_frame_without_observations_says_what_the_prediction_says():
     run, smoother = drawn(9, 40), FixedLagSmoother(STEADY)
     for _ in through(smoother, run):
         pass

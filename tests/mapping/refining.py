@@ -104,7 +104,7 @@ class World:
 
 
 def _localized(flight: FlightObservations, map_: store.Map) -> FlightObservations:
-    """The flight with the poses that its sights have in the map, errors of the map included."""
+    """The flight with the poses that its pixels have in the map, the map's errors included."""
     camera, found = map_.info.camera, []
     place = np.searchsorted(map_.landmarks.id, flight.landmark)
     for k in range(len(flight)):
@@ -125,7 +125,7 @@ def _localized(flight: FlightObservations, map_: store.Map) -> FlightObservation
 def _world(tmp_path_factory) -> World:
     """Eight keyframes of a room, taken close together: what is far is badly known along the view.
 
-    The map is the optimum of its own sights, in the world's coordinates.
+    The map is the optimum of its own observations, in the world's coordinates.
     """
     rng = np.random.default_rng(4)
     count = 260
@@ -169,7 +169,7 @@ def _world(tmp_path_factory) -> World:
     descriptor = np.abs(rng.normal(size=(len(points), 32))).astype(np.float32)
     descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
     info = store.MapInfo("scene", "0" * 64, 32, camera, "room", "world", "m")
-    info.built, info.registration = {"images": 8}, {"method": "sights", "points": 12}
+    info.built, info.registration = {"images": 8}, {"method": "observations", "points": 12}
     map_ = store.Map(
         info,
         landmarks.make_landmarks(model, np.ones((len(image), 32), np.float32)),

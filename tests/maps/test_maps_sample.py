@@ -14,7 +14,7 @@ from ground_station.localization.extraction import extractor_for
 from ground_station.localization.settings import load_preset
 from ground_station.map import store
 from ground_station.map.floorplan import load_floorplan
-from ground_station.mapping.registration.sights import read_pairs
+from ground_station.mapping.registration.observations import read_pairs
 from ground_station.mapping.settings import load_settings
 from ground_station.recording.flight import camera_of, trajectory_of
 from pi_firmware.wire.recording import RecordingReader
@@ -80,12 +80,12 @@ def test_colmaps_own_reader_opens_the_model() -> None:
     np.testing.assert_allclose(ours, map_.landmarks.position_m, atol=1e-9)
 
 
-def test_the_sights_span_the_hall() -> None:
+def test_the_observations_span_the_hall() -> None:
     """Enough points, far apart in all three directions, each seen from two places or more."""
-    sights = read_pairs(SAMPLE / "PAIRS.csv")
-    assert len(sights.points) >= 10
-    assert (np.ptp(sights.world_m, axis=0) > [4, 4, 2]).all()
-    assert (np.bincount(sights.point) >= 2).all()
+    observations = read_pairs(SAMPLE / "PAIRS.csv")
+    assert len(observations.points) >= 10
+    assert (np.ptp(observations.world_m, axis=0) > [4, 4, 2]).all()
+    assert (np.bincount(observations.point) >= 2).all()
 
 
 def test_the_floor_plan_covers_the_flight() -> None:

@@ -126,7 +126,7 @@ def test_a_seed_gives_its_recording_again_and_another_seed_another(
     assert np.abs(a - b).mean() > 5
 
 
-def test_sights_of_known_points_reproject_and_spread(tmp_path: Path) -> None:
+def test_observations_of_known_points_reproject_and_spread(tmp_path: Path) -> None:
     out, pairs, tum = tmp_path / "m.mcap", tmp_path / "PAIRS.csv", tmp_path / "t.txt"
     settings = quick_settings(
         out, plan="mapping", duration_s=100.0, rate_hz=0.5, points=pairs, truth=tum,

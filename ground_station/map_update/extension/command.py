@@ -72,10 +72,11 @@ def shown(report: dict[str, Any]) -> dict[str, Any]:
     age = report["age"]
     table: dict[str, Any] = {
         name: f"{report[name][0]} -> {report[name][1]}"
-        for name in ("keyframes", "landmarks", "modes", "sights", "bytes")
+        for name in ("keyframes", "landmarks", "modes", "observations", "bytes")
     }
     table |= {
-        name: report[name] for name in ("landmarks_seen_again", "sights_as_known", "sights_unlike")
+        name: report[name]
+        for name in ("landmarks_seen_again", "observations_as_known", "observations_unlike")
     }
     table["never_seen"] = (
         f"{age['never_seen']} of {age['expected']} landmarks that were {age['often']} times in view"
@@ -86,6 +87,6 @@ def shown(report: dict[str, Any]) -> dict[str, Any]:
             f"{flight['frames_localized']} of {flight['frames_read']} frames localized, "
             f"{flight['frames']} of {flight['frames_tried']} joined, "
             f"{flight['frames_not_localized']} of them beside localized ones ({left or 'none'} "
-            f"left out), {flight['sights']} sights"
+            f"left out), {flight['observations']} observations"
         )
     return table

@@ -27,7 +27,7 @@ from ground_station.map_update.extension.frames import Frames, Picked, describe,
 from ground_station.map_update.extension.joining import Grown, join
 from ground_station.map_update.extension.localizing import Flight, localize
 from ground_station.map_update.extension.looks import new_looks
-from ground_station.map_update.extension.merging import merge, sight_descriptors
+from ground_station.map_update.extension.merging import merge, observation_descriptors
 from ground_station.map_update.extension.structure import LOOSE_PX, Structure, weak_points
 from ground_station.map_update.extension.tracks import joined, match_frames, pairs_to_match
 from ground_station.mapping.settings import MappingSettings
@@ -162,16 +162,19 @@ def _finish(
     structure.adjust(gate_px)
     model, count = structure.model(gate_px), len(map_.landmarks)
     for _ in range(_FILTERS):
-        few = np.bincount(model.image, minlength=len(model.names)) < settings.extend.min_sights
+        few = (
+            np.bincount(model.image, minlength=len(model.names)) < settings.extend.min_observations
+        )
         model = without_images(model, few)
         new = model.point_id - 1 >= count
         model = without_points(model, weak_points(model, new, settings))
     if not len(model.names):
         raise MapError(
-            f"no frame keeps {settings.extend.min_sights} sights that fit the map: nothing joins it"
+            f"no frame keeps {settings.extend.min_observations} observations that fit the map: "
+            "nothing joins it"
         )
     landmark = np.where(model.point_id - 1 < count, model.point_id - 1, -1)
-    descriptor = sight_descriptors(model, structure.frames)
+    descriptor = observation_descriptors(model, structure.frames)
     old = landmark[model.point] >= 0
     looks = new_looks(map_, landmark[model.point[old]], descriptor[old], settings)
     return Grown(model, landmark, descriptor, looks), merged
@@ -219,7 +222,7 @@ def _flight_report(
         "frames_tried": int((frames.flight == number).sum()),
         "frames": int(mine.sum()),
         "frames_not_localized": int((~known).sum()),
-        "sights": int(mine[grown.model.image].sum()),
+        "observations": int(mine[grown.model.image].sum()),
         "frames_left_out": one.left,
     }
 
@@ -232,7 +235,7 @@ def _report(
     merged: tuple[int, int],
     settings: MappingSettings,
 ) -> dict[str, Any]:
-    """Figures before and after, as pairs, and what became of the sights."""
+    """Figures before and after, as pairs, and what became of the observations."""
     model, looks = grown.model, grown.looks
     count = [len(each.modes) if each.modes is not None else 0 for each in (map_, made)]
     seen = grown.landmark[grown.landmark >= 0]
@@ -241,11 +244,11 @@ def _report(
         "keyframes": [len(map_.keyframes), len(made.keyframes)],
         "landmarks": [len(map_.landmarks), len(made.landmarks)],
         "modes": count,
-        "sights": [len(map_.keyframes.landmark), len(made.keyframes.landmark)],
+        "observations": [len(map_.keyframes.landmark), len(made.keyframes.landmark)],
         "flights": flights,
         "landmarks_seen_again": looks.seen,
-        "sights_as_known": looks.near,
-        "sights_unlike": looks.far,
+        "observations_as_known": looks.near,
+        "observations_unlike": looks.far,
         "landmarks_without_room": looks.full,
         "tracks_that_were_landmarks": merged[0],
         "tracks_merged": merged[1],
@@ -254,9 +257,9 @@ def _report(
 
 
 def _with_flights(past: Refined, map_: store.Map, flights: list[dict[str, Any]]) -> dict[str, Any]:
-    """`refined` of map.toml: its keyframes go by flights, and older sights are of this map, too."""
+    """`refined` of map.toml: keyframes go by flights, and what older ones saw is of this map."""
     rows = [
-        {"name": flight["name"], "frames": flight["frames"], "sights": flight["sights"]}
+        {"name": flight["name"], "frames": flight["frames"], "observations": flight["observations"]}
         for flight in flights
     ]
     hashes = [*past.landmarks_sha256, landmarks_sha256(map_.landmarks)]

@@ -114,10 +114,9 @@ def describe(
 ) -> Frames:
     """The picked frames with their features; reads the inputs once more.
 
-    `straight`: the map's sights are where a global shutter would have seen them, so that these
-    shall be, too. A frame without a pose that shows what the one before did is left out. Raises
-    `MapError` when the map was built with features that are not here.
-    """
+    `straight`: the map's observations are where a global shutter would have seen them, so that
+    these shall be, too. A frame without a pose that shows what the one before did is left out.
+    Raises `MapError` when the map was built with features that are not here."""
     rows: list[tuple[str, int, int, F64, F64, Features, F64, F64]] = []
     total = sum(len(one.time_ns) for one in picked)
     with Progress("features, frames", total) as progress:

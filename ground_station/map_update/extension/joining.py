@@ -24,7 +24,7 @@ I64 = npt.NDArray[np.int64]
 @dataclass(frozen=True)
 class Grown:
     """What joins: `model`, whose image ids are frames plus 1; `landmark` (P,), which of the map's
-    each of its points is, or -1; `descriptor` (O, D) of its sights; and new modes."""
+    each of its points is, or -1; `descriptor` (O, D) of its observations; and new modes."""
 
     model: Model
     landmark: I64
@@ -68,7 +68,7 @@ def _new_landmarks(map_: store.Map, grown: Grown) -> store.Landmarks:
     made = landmarks.make_landmarks(alone, grown.descriptor[mine])
     if not len(made):
         return made
-    # The landmarks of the map, which are fixed, take part in telling how good a sight is.
+    # The landmarks of the map, which are fixed, take part in telling how good an observation is.
     residual = landmarks.residuals_px(model)
     freedom = 2 * len(residual) - 3 * len(alone.point_id) - 6 * len(model.names)
     sigma = float(np.sqrt(np.sum(residual**2) / max(freedom, 1)))

@@ -15,16 +15,15 @@ F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 
 _MOST_SPREAD = 0.6
-"""RMS distance of a mode's sights from their mean, beyond which they are not one look."""
+"""RMS distance of a mode's observations from their mean, beyond which they are not one look."""
 
 
 @dataclass(frozen=True)
 class Looks:
     """New modes: `landmark` (N,) and `descriptor` (N, D).
 
-    `seen` landmarks of the map were seen; `near` of their sights were as the map knows them, `far`
-    were not; `full` landmarks had as many modes as they may.
-    """
+    `seen` landmarks of the map were seen; `near` of their observations were as the map knows them,
+    `far` were not; `full` landmarks had as many modes as they may."""
 
     landmark: I64
     descriptor: F32
@@ -35,9 +34,9 @@ class Looks:
 
 
 def new_looks(map_: Map, landmark: I64, descriptor: F32, settings: MappingSettings) -> Looks:
-    """The modes that sights of landmarks (O,) with descriptors (O, D) give.
+    """The modes that observations of landmarks (O,) with descriptors (O, D) give.
 
-    A sight is far when its descriptor is further from all that the landmark has than
+    An observation is far when its descriptor is further from all that the landmark has than
     `mode_distance` and than `mode_spreads` times the landmark's spread. Far ones, of at least
     `sfm.min_track` frames and alike among themselves, become a mode: their mean. What is near
     changes nothing, so that a landmark goes on to look in its first light as it did.

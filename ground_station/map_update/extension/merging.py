@@ -25,13 +25,13 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 _SHARE = 0.7
-"""Of a point's sights that must be where a landmark projects, for it to be that landmark."""
+"""Of a point's observations that must be where a landmark projects, for it to be that landmark."""
 _ALIKE = 0.5
 """L2 distance of descriptors up to which two points at one place are one."""
 
 
-def sight_descriptors(model: Model, frames: Frames) -> F32:
-    """The descriptor of each of a model's sights (O, D); image ids are frames plus 1."""
+def observation_descriptors(model: Model, frames: Frames) -> F32:
+    """The descriptor of each of a model's observations (O, D); image ids are frames plus 1."""
     dimension = frames.features[0].descriptors.shape[1]
     result = np.empty((len(model.image), dimension), np.float32)
     for k, image_id in enumerate(model.image_id.tolist()):
@@ -53,11 +53,10 @@ def merge(
 ) -> tuple[int, int]:
     """Lets tracks be landmarks of the map, or each other, where they are at one place.
 
-    A track whose sights are within `radius_px` of where a landmark projects, in most of its frames,
-    is that landmark, however unlike it looks: that is what another light does. Of several the most
-    alike is taken. Two tracks, and a track and a landmark seen from elsewhere, also need to look
-    alike. Returns how many tracks became landmarks and how many others.
-    """
+    A track whose observations are within `radius_px` of where a landmark projects, in most of its
+    frames, is that landmark, however unlike it looks: that is what another light does. Of several
+    the most alike is taken. Two tracks, and a track and a landmark seen from elsewhere, also need
+    to look alike. Returns how many tracks became landmarks and how many others."""
     map_ = structure.map
     model = structure.model(gate_px)
     became = _same_place_in_images(structure, model, radius_px, projection)
@@ -68,7 +67,7 @@ def merge(
     if not len(new):
         return len(became), 0
     mean = mean_descriptors(
-        sight_descriptors(model, structure.frames), model.point, len(model.point_id)
+        observation_descriptors(model, structure.frames), model.point, len(model.point_id)
     )[new]
     track, where = model.point_id[new] - 1 - count, model.position[new]
     radius = _radius(model, radius_px)[new]
@@ -103,13 +102,13 @@ def _same_place_in_images(
         landmark = shown.landmark[np.array([i for each in near for i in each], np.int64)]
         pairs.append(np.stack([point, landmark], axis=1))
     found, votes = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
-    sights = np.bincount(model.point, minlength=len(model.point_id))
-    found = found[(votes >= 2) & (votes >= _SHARE * sights[found[:, 0]])]
+    observations = np.bincount(model.point, minlength=len(model.point_id))
+    found = found[(votes >= 2) & (votes >= _SHARE * observations[found[:, 0]])]
     if not len(found):
         return np.empty((0, 2), np.int64)
     points, which = np.unique(found[:, 0], return_inverse=True)
     mean = mean_descriptors(
-        sight_descriptors(model, structure.frames), model.point, len(model.point_id)
+        observation_descriptors(model, structure.frames), model.point, len(model.point_id)
     )
     distance = distance_to_landmarks(map_, mean[found[:, 0]], found[:, 1])
     order = np.lexsort((distance, which.ravel()))

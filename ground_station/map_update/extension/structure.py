@@ -31,7 +31,7 @@ I64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 LOOSE_PX = 4.0
-"""A sight may be so far off before anything was adjusted."""
+"""An observation may be so far off before anything was adjusted."""
 _LEAST_SHARE = 0.3
 """Of a frame's known points that must agree on its pose."""
 _AGAIN = 1.2
@@ -39,14 +39,14 @@ _AGAIN = 1.2
 _BETWEEN = 5
 """Frames that are added between two adjustments."""
 _STEADY = 12
-"""A frame with fewer sights keeps its pose in an adjustment."""
+"""A frame with fewer observations keeps its pose in an adjustment."""
 
 
 class Structure:
     """The state: `wTc` (K, 4, 4) of the frames that are `posed` (K,), `position` (T, 3) of the
     tracks that are known, and `landmark` (T,), which of the map's a track shows, or -1.
 
-    A sight's key is the landmark that it shows, or the number of landmarks plus its track's.
+    An observation's key is the landmark that it shows, or the number of landmarks plus its track's.
     """
 
     def __init__(
@@ -104,10 +104,10 @@ class Structure:
         fits = np.bincount(t.track[rows], off <= LOOSE_PX, t.count)
         self.landmark[2 * fits < seen] = -1
 
-    # Sights and where they are
+    # Observations and where they are
 
-    def _sights(self) -> tuple[I64, I64, I64]:
-        """Frame, feature and key of all sights of tracks and of landmarks without a track."""
+    def _observations(self) -> tuple[I64, I64, I64]:
+        """Frame, feature and key of all observations of tracks and of landmarks without a track."""
         t, count = self.tracks, len(self.map.landmarks)
         key = np.where(self.landmark >= 0, self.landmark, count + np.arange(t.count))[t.track]
         frame, feature, shown = (np.concatenate(rows) for rows in zip(*self._anchors, strict=True))
@@ -124,7 +124,7 @@ class Structure:
         return np.asarray(known[key])
 
     def _pixels(self, frame: I64, feature: I64, depth: F64) -> F64:
-        """Undistorted pixels (N, 2) of sights so far away, at their frame's time."""
+        """Undistorted pixels (N, 2) of observations so far away, at their frame's time."""
         node = self.frames.offset[frame] + feature
         pixel, moving = self.frames.pixel_px[node], np.any(self.twist[frame] != 0, axis=1)
         if not moving.any():
@@ -139,7 +139,7 @@ class Structure:
         return np.asarray(pixel)
 
     def _off_px(self, frame: I64, feature: I64, key: I64) -> F64:
-        """Reprojection errors (N,) of sights in posed frames; inf behind, NaN of no position."""
+        """Reprojection errors (N,) in posed frames; inf behind the camera, NaN of no position."""
         X = shutter.in_cameras(self.wTc[frame], self._where(key))
         pixel = self._pixels(frame, feature, X[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -150,10 +150,9 @@ class Structure:
     def model(self, gate_px: float) -> Model:
         """The posed frames and what they see within `gate_px` of where it should be.
 
-        Image ids are frames plus 1, point ids keys plus 1; a new point has at least two sights and
-        none is seen twice in a frame.
-        """
-        frame, feature, key = self._sights()
+        Image ids are frames plus 1, point ids keys plus 1; a new point has at least two
+        observations and none is seen twice in a frame."""
+        frame, feature, key = self._observations()
         rows = np.flatnonzero(self.posed[frame])
         frame, feature, key = frame[rows], feature[rows], key[rows]
         off = self._off_px(frame, feature, key)
@@ -162,12 +161,12 @@ class Structure:
         twice = key[rows] * len(self.frames) + frame[rows]
         rows = np.sort(rows[np.unique(twice, return_index=True)[1]])
         new = key[rows] >= len(self.map.landmarks)
-        _, which, sights = np.unique(key[rows], return_inverse=True, return_counts=True)
-        rows = rows[~new | (sights[which.ravel()] >= 2)]
+        _, which, observations = np.unique(key[rows], return_inverse=True, return_counts=True)
+        rows = rows[~new | (observations[which.ravel()] >= 2)]
         return self._as_model(frame[rows], feature[rows], key[rows])
 
     def _as_model(self, frame: I64, feature: I64, key: I64, depth: F64 | None = None) -> Model:
-        """Sights as a model; at `depth` (N,) where their points are not known."""
+        """Observations as a model; at `depth` (N,) where their points are not known."""
         posed = np.flatnonzero(self.posed)
         keys, point = np.unique(key, return_inverse=True)
         if depth is None:
@@ -224,7 +223,7 @@ class Structure:
         self.position[model.point_id[~fixed] - 1 - count] = position[~fixed]
 
     def forget_doubtful(self) -> None:
-        """Takes the positions of tracks that most of their posed sights miss."""
+        """Takes the positions of tracks that most of their posed observations miss."""
         t = self.tracks
         known = (self.landmark < 0) & np.isfinite(self.position).all(axis=1)
         rows = np.flatnonzero(self.posed[t.frame] & known[t.track])
@@ -260,7 +259,7 @@ class Structure:
             if known[k] < _AGAIN * before:
                 known[k] = 0
         k = int(known.argmax())
-        return k if known[k] >= self._settings.extend.min_sights else None
+        return k if known[k] >= self._settings.extend.min_observations else None
 
     def _known_of_unposed(self) -> tuple[I64, I64, I64]:
         t = self.tracks
@@ -280,7 +279,7 @@ class Structure:
         found = pose_from_matches(
             points, pixel, self.map.info.camera, self._recovery, self._settings.seed
         )
-        least = max(self._settings.extend.min_sights, _LEAST_SHARE * len(rows))
+        least = max(self._settings.extend.min_observations, _LEAST_SHARE * len(rows))
         if found is None or len(found[1]) < least:
             tried[k] = len(rows)
             return False

@@ -28,7 +28,7 @@ _SHARED = 30
 
 @dataclass(frozen=True)
 class Tracks:
-    """O sights of T tracks: frame[o] shows track[o] as its feature[o]; sorted by track.
+    """O observations of T tracks: frame[o] shows track[o] as its feature[o]; sorted by track.
 
     No track is there twice in a frame.
     """

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ground_station.map import landmarks
 from ground_station.map.model import Model
-from ground_station.mapping.sfm.models import without_sights
+from ground_station.mapping.sfm.models import without_observations
 
 F64 = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -42,15 +42,15 @@ def nearest_to_rays(model: Model) -> F64:
 
 
 def triangulate(model: Model, gate_px: float, min_angle_deg: float) -> tuple[Model, Flags]:
-    """The model with positions from its sights, and which points (M,) are well determined.
+    """The model with positions from its observations, and which points (M,) are well determined.
 
-    Twice, the second time without the sights that miss the first positions by more than `gate_px`;
-    well determined is what two sights agree on with a large enough angle between them.
-    """
+    Twice, the second time without the observations that miss the first positions by more than
+    `gate_px`; well determined is what two observations agree on with a large enough angle between
+    them."""
     first = replace(model, position=nearest_to_rays(model))
-    inner = without_sights(first, ~_agreeing(first, gate_px))
+    inner = without_observations(first, ~_agreeing(first, gate_px))
     result = replace(model, position=nearest_to_rays(inner))
-    agreeing = without_sights(result, ~_agreeing(result, gate_px))
+    agreeing = without_observations(result, ~_agreeing(result, gate_px))
     good = np.bincount(agreeing.point, minlength=len(result.position)) >= 2
     good &= landmarks.largest_angles_deg(agreeing) >= min_angle_deg
     return result, np.asarray(good & np.isfinite(result.position).all(axis=1))

@@ -1,4 +1,4 @@
-"""The map's own sights of what a flight saw once: COLMAP adjusts no point of one sight."""
+"""The map's own observations of what a flight saw once: COLMAP adjusts no point seen once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Witnesses:
-    """One sight of each landmark that a keyframe of the map has."""
+    """One observation of each landmark that a keyframe of the map has."""
 
     def __init__(self, map_: Map) -> None:
         kf, camera = map_.keyframes, map_.info.camera
@@ -27,7 +27,8 @@ class Witnesses:
         self._pixel[landmark] = camera.undistort_to_pinhole(kf.pixel_px[row])
 
     def beside(self, model: Model) -> tuple[Model, Flags]:
-        """The model with keyframes that saw what it has one sight of, and which images are those.
+        """The model with keyframes that saw what it has one observation of, and which images are
+        those.
 
         Point ids are landmarks plus 1. What no keyframe saw either is left out.
         """

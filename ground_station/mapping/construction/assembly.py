@@ -20,16 +20,19 @@ def assemble(
     order = np.lexsort((model.feature, model.image))
     offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
     # Images have id = index + 1 in the database, and their features may lie on disk.
-    sights = np.split(order, offset[1:-1])
+    observations = np.split(order, offset[1:-1])
     index = (model.image_id - 1).tolist()
     described = Lazily(
         len(index),
-        lambda k: (sights[k], images.features[index[k]].descriptors[model.feature[sights[k]]]),
+        lambda k: (
+            observations[k],
+            images.features[index[k]].descriptors[model.feature[observations[k]]],
+        ),
     )
     pixels = np.concatenate(
         [
             images.features[i].keypoints_px[model.feature[mine]]
-            for i, mine in zip(index, sights, strict=True)
+            for i, mine in zip(index, observations, strict=True)
         ]
     )
     keyframes = store.Keyframes(

@@ -26,11 +26,11 @@ I64 = npt.NDArray[np.int64]
 PARAMETERS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 """The order of a lens as a vector."""
 _MOST_STEPS = 30
-_FEWEST_SIGHTS = 12
+_FEWEST_OBSERVATIONS = 12
 """An image with fewer has a pose of its own making."""
 _SETTLED = 1e-3, 3e-5
 """A step that lowers the cost by a smaller share is the last: with the first loss, the second."""
-_MOST_IMAGES, _MOST_SIGHTS = 160, 20_000
+_MOST_IMAGES, _MOST_OBSERVATIONS = 160, 20_000
 """What decides nine numbers well enough: with more, what residuals have in common is what limits
 the lens, not their count."""
 _GROUPS = 10
@@ -56,7 +56,7 @@ class Adjusted:
 
     `sigma_px` is the robust standard deviation of a pixel coordinate. `explained` is the share of
     the residuals' variance that goes with the change of the lens, to second order. `moved_px`: of
-    95 % of the sights the residual moved no further.
+    95 % of the observations the residual moved no further.
     """
 
     camera: Camera
@@ -136,15 +136,19 @@ class _Normal:
 
 
 class _Problem:
-    """One model's sights, and the steps over them."""
+    """One model's observations, and the steps over them."""
 
     def __init__(self, model: Model, prior: Prior) -> None:
         self._image, self._point, self._pixel = model.image, model.point, model.pixel_px
         self._images, self._points = len(model.names), len(model.position)
-        sights = np.arange(len(model.image))
-        ones = np.ones(len(sights))
-        self._by_image = csr_array((ones, (model.image, sights)), (self._images, len(sights)))
-        self._by_point = csr_array((ones, (model.point, sights)), (self._points, len(sights)))
+        observations = np.arange(len(model.image))
+        ones = np.ones(len(observations))
+        self._by_image = csr_array(
+            (ones, (model.image, observations)), (self._images, len(observations))
+        )
+        self._by_point = csr_array(
+            (ones, (model.point, observations)), (self._points, len(observations))
+        )
         self._rows = np.searchsorted(model.image, np.arange(self._images + 1))  # in order, by _once
         self._prior_mean = prior.mean
         self._prior_information = np.linalg.inv(prior.covariance)
@@ -221,8 +225,8 @@ class _Problem:
         total = np.linalg.inv(inverse)
         own = np.einsum("o,oki,okj->oij", weight, pull, pull).reshape(-1, 81) / variance
         for group in self._clusters():
-            sights = np.arange(len(group))
-            member = csr_array((np.ones(len(group)), (group, sights)))
+            observations = np.arange(len(group))
+            member = csr_array((np.ones(len(group)), (group, observations)))
             pulls, held = (member @ score) / variance, (member @ own).reshape(-1, 9, 9)
             without = np.linalg.solve(total - held, pulls[:, :, None])[:, :, 0]
             spread += np.sum(without**2, axis=0) * (1 - 1 / len(pulls))
@@ -232,7 +236,7 @@ class _Problem:
         return np.asarray(inverse * np.outer(inflation, inflation)), explained
 
     def _clusters(self) -> tuple[I64, I64]:
-        """For each sight the stretch of images and the part of the image that it belongs to."""
+        """The stretch of images and the part of the image that each observation belongs to."""
         stretch = self._image * _GROUPS // max(self._images, _GROUPS)
         low, high = self._pixel.min(axis=0), self._pixel.max(axis=0)
         place = (self._pixel - low) / np.maximum(high - low, 1.0) * _CELLS
@@ -315,14 +319,14 @@ class _Problem:
 
 
 def _sums(groups: csr_array, first: F64, second: F64) -> F64:
-    """Of firstᵀ second, (O, 2, A) and (O, 2, B), over each group of sights."""
+    """Of firstᵀ second, (O, 2, A) and (O, 2, B), over each group of observations."""
     blocks = np.einsum("oki,okj->oij", first, second)
     summed = np.asarray(groups @ blocks.reshape(len(blocks), -1))
     return summed.reshape(-1, *blocks.shape[1:])
 
 
 def _once(model: Model) -> Model:
-    """The model with its sights in order of image, each point at most once in each."""
+    """The model with its observations in order of image, each point at most once in each."""
     keys = model.image * len(model.position) + model.point
     first = np.unique(keys, return_index=True)[1]
     rows = {name: getattr(model, name)[first] for name in ("image", "feature", "point", "pixel_px")}
@@ -338,12 +342,12 @@ def _thinned(model: Model) -> Model:
         kept = np.isin(np.arange(K), begins[:, None] + np.arange(length))
         model = without_images(model, ~kept)
         model = without_points(model, np.bincount(model.point, minlength=len(model.position)) < 2)
-    if len(model.image) > _MOST_SIGHTS:
-        every = len(model.image) / _MOST_SIGHTS
+    if len(model.image) > _MOST_OBSERVATIONS:
+        every = len(model.image) / _MOST_OBSERVATIONS
         kept = np.zeros(len(model.position), dtype=bool)
         kept[np.arange(0, len(kept), every).astype(np.int64)] = True
         model = without_points(model, ~kept)
-    few = np.bincount(model.image, minlength=len(model.names)) < _FEWEST_SIGHTS
+    few = np.bincount(model.image, minlength=len(model.names)) < _FEWEST_OBSERVATIONS
     if few.any():
         model = without_images(model, few)
         model = without_points(model, np.bincount(model.point, minlength=len(model.position)) < 2)

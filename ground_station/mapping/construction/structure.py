@@ -29,7 +29,7 @@ from ground_station.mapping.settings import MappingSettings, SfmSettings
 from ground_station.mapping.sfm import adjustment, global_mapping
 from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.incremental import Incremental, Wanted
-from ground_station.mapping.sfm.models import without_points, without_sights
+from ground_station.mapping.sfm.models import without_observations, without_points
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
@@ -344,13 +344,13 @@ class _Reconstruction:
 def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> Model:
     """Takes out observations above `max_error_px`, then points that too few images see.
 
-    A point needs `min_track` images and two sights `min_tri_angle_deg` apart. Returns what is left.
-    """
+    A point needs `min_track` images and two observations `min_tri_angle_deg` apart. Returns what is
+    left."""
     model = colmap.to_arrays(reconstruction)
     error = np.linalg.norm(landmarks.residuals_px(model), axis=1)
     bad = error > sfm.max_error_px
     colmap.drop_observations(reconstruction, model.image_id[model.image[bad]], model.feature[bad])
-    model = without_sights(model, bad)
+    model = without_observations(model, bad)
     # Tracks that were merged may have two key points of one image.
     seen = np.unique(np.stack([model.point, model.image]), axis=1)[0]
     weak = (np.bincount(seen, minlength=len(model.position)) < sfm.min_track) | (

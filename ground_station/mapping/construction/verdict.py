@@ -142,9 +142,8 @@ def _exact(map_: Map) -> str:
     built = map_.info.built
     text = f"exact: {len(map_.landmarks)} landmarks"
     if "reprojection_px" in built:
-        text += (
-            f" fit {built.get('observations', 'their')} sights to {built['reprojection_px']:.2f} px"
-        )
+        count = built.get("observations", "their")
+        text += f" fit {count} observations to {built['reprojection_px']:.2f} px"
     if "noise_px" in built:
         text += f"; a key point's noise is {built['noise_px']:.2f} px"
     return text

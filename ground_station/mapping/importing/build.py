@@ -115,9 +115,9 @@ def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: in
             f"no landmark is seen by {sfm.min_track} images at {sfm.min_tri_angle_deg} degrees "
             f"within {sfm.max_error_px} px of the model's poses"
         )
-    sights = np.bincount(model.image, minlength=len(model.names))
-    if not sights.all():
-        colmap.drop_images(reconstruction, model.image_id[sights == 0])
+    observations = np.bincount(model.image, minlength=len(model.names))
+    if not observations.all():
+        colmap.drop_images(reconstruction, model.image_id[observations == 0])
         model = colmap.to_arrays(reconstruction)
     return model
 

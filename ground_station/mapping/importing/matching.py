@@ -58,9 +58,8 @@ def match(
 ) -> dict[tuple[int, int], TwoView]:
     """Matches of the pairs that fit the images' poses (K, 4, 4), where they are enough.
 
-    A match is kept up to `sfm.max_error_px` off its epipolar lines: a sight further off would not
-    stay in the map. Raises `MapError` when no pair has enough.
-    """
+    A match is kept up to `sfm.max_error_px` off its epipolar lines: an observation further off
+    would not stay in the map. Raises `MapError` when no pair has enough."""
     rules, matrix = rules_of(settings, far=False), camera.matrix
 
     def one(i: int, j: int) -> TwoView | None:

@@ -1,16 +1,16 @@
 """The adjustment of `blimp map refine`: a graph's poses and landmarks together.
 
-Bundle adjustment (Triggs et al. 1999) of the sights of a map's keyframes and of flights' frames.
-What is decided here and not by the solver:
+Bundle adjustment (Triggs et al. 1999) of the observations of a map's keyframes and of flights'
+frames. What is decided here and not by the solver:
 
-- Gauge. Sights fix a model up to a similarity. The adjustment is free, as in the build, and its
+- Gauge. Pixels fix a model up to a similarity. The adjustment is free, as in the build, and its
   result is laid onto the landmarks as they were by the similarity that fits them best: the datum of
   a free network (Baarda 1973). So a registration stays where it was and bends nothing. Priors on
-  the old poses would bend: they hold the old map's errors, from sights that are in the graph.
-- Weights. The sights of a landmark in one flight are not independent: the same light, the same
+  the old poses would bend: they hold the old map's errors, from observations that are in the graph.
+- Weights. What one flight saw of a landmark is not independent: the same light, the same
   side, points followed from the same keyframe. A flight's standard deviation, estimated from its
   residuals, grows by the root of the design effect 1 + (n - 1) · correlation (Kish 1965), where n
-  is the mean number of its sights of a landmark.
+  is the mean number of its observations of a landmark.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _DATUM_ROUNDS = 20
 """Of the datum's reweighting."""
 
 _MOST_LOST = 0.5
-"""A frame that loses a larger share of its sights to the gate was not where it said."""
+"""A frame that loses a larger share of its observations to the gate was not where it said."""
 
 _FLIGHT_GATE = 3.5
-"""Deviations of a pixel coordinate above which a flight's sight goes: no geometry verified it."""
+"""Deviations of a pixel above which a flight's observation goes: no geometry verified it."""
 
 _LEAST_ANGLE_DEG = 0.05
-"""Sights nearer to parallel than this give no depth, and no covariance that could be inverted."""
+"""Rays nearer to parallel than this give no depth, and no covariance that could be inverted."""
 
 
 def adjust(
@@ -53,12 +53,12 @@ def adjust(
 ) -> Graph:
     """The graph at its optimum, in the datum of the map, without what does not fit.
 
-    Solved, gated and solved again with the deviations found: sights above `max_error_px` go,
+    Solved, gated and solved again with the deviations found: observations above `max_error_px` go,
     flights' frames that lose most of theirs, and landmarks that have too few left where they had
     enough. Raises `MapError` when nothing is left.
     """
     camera, sfm = map_.info.camera, settings.sfm
-    weak_before, sights_before = _weak(graph, settings), _sights(graph)
+    weak_before, observations_before = _weak(graph, settings), _observations(graph)
 
     def solve(graph: Graph) -> Graph:
         return graphs.solve(
@@ -71,8 +71,8 @@ def adjust(
 
     graph = solve(_without_hopeless(graph))
     graph = graphs.drop(graph, graph.error_px() > _gate_px(graph, sfm.max_error_px))
-    least = np.maximum((1 - _MOST_LOST) * sights_before, settings.refine.min_sights)
-    graph = graphs.drop_images(graph, (graph.group > 0) & (_sights(graph) < least))
+    least = np.maximum((1 - _MOST_LOST) * observations_before, settings.refine.min_observations)
+    graph = graphs.drop_images(graph, (graph.group > 0) & (_observations(graph) < least))
     graph = _without_hopeless(graph)
     graph = solve(graph)
     weak = _weak(graph, settings)
@@ -82,19 +82,19 @@ def adjust(
 
 
 def _gate_px(graph: Graph, max_error_px: float) -> F64:
-    """The largest error of each sight (O,): the build's or, of a flight, a few deviations."""
+    """The largest error of each observation (O,): the build's or, of a flight, a few deviations."""
     gate = np.minimum(_FLIGHT_GATE * graphs.spread_px(graph), max_error_px)
     gate[0] = max_error_px
-    return np.asarray(gate[graph.group_of_sights()])
+    return np.asarray(gate[graph.group_of_observations()])
 
 
-def _sights(graph: Graph) -> npt.NDArray[np.int64]:
+def _observations(graph: Graph) -> npt.NDArray[np.int64]:
     return np.bincount(graph.model.image, minlength=len(graph.group))
 
 
 def _weighted(graph: Graph, correlation: float) -> Graph:
     """The graph with each group's deviation from its residuals, and from how often it looks."""
-    sigma, group = graphs.spread_px(graph), graph.group_of_sights()
+    sigma, group = graphs.spread_px(graph), graph.group_of_observations()
     for g in range(1, len(sigma)):
         points = graph.model.point[group == g]
         n = len(points) / max(len(np.unique(points)), 1)
@@ -110,11 +110,11 @@ def _weak(graph: Graph, settings: MappingSettings) -> Flags:
 
 
 def _without_hopeless(graph: Graph) -> Graph:
-    """The graph without points that two sights do not fix, and sights from behind."""
+    """The graph without points that two observations do not fix, and observations from behind."""
     graph = graphs.drop(graph, ~np.isfinite(graph.error_px()))
     graph = graphs.drop_points(graph, landmarks.largest_angles_deg(graph.model) < _LEAST_ANGLE_DEG)
     if not len(graph.model.point_id):
-        raise MapError("no landmark of the map keeps two sights that agree")
+        raise MapError("no landmark of the map keeps two observations that agree")
     return graph
 
 

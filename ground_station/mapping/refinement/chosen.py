@@ -17,17 +17,16 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 _SAME_RAY_PX = 0.1
-"""A sight that another camera's lens sees and the map's cannot express is left out."""
+"""An observation that another camera's lens sees and the map's cannot express is left out."""
 
 
 @dataclass(frozen=True)
 class Chosen:
     """F of a flight's frames, as the map's camera would have seen them with a global shutter.
 
-    `time_ns` (F,), `wTc` (F, 4, 4); sight o is of frame `frame[o]` and landmark `landmark[o]`, an
-    index into the map's, at `pixel_px[o]` (O, 2), undistorted pixels of the map's camera. `left`
-    counts frames by why they were left out.
-    """
+    `time_ns` (F,), `wTc` (F, 4, 4); observation o is of frame `frame[o]` and landmark
+    `landmark[o]`, an index into the map's, at `pixel_px[o]` (O, 2), undistorted pixels of the map's
+    camera. `left` counts frames by why they were left out."""
 
     name: str
     time_ns: I64
@@ -41,16 +40,16 @@ class Chosen:
         return len(self.time_ns)
 
     @property
-    def sights_per_landmark(self) -> float:
+    def observations_per_landmark(self) -> float:
         """The mean over the landmarks that were seen at all."""
         seen = np.unique(self.landmark)
         return len(self.landmark) / max(len(seen), 1)
 
 
 @dataclass(frozen=True)
-class _Sights:
-    """A flight's sights against a map: landmarks' indices, where they are in the frame's axes (O,
-    3), undistorted pixels (O, 2), and which of them can be used (O,)."""
+class _Observed:
+    """A flight's observations against a map: landmarks' indices, where they are in the frame's axes
+    (O, 3), undistorted pixels (O, 2), and which of them can be used (O,)."""
 
     landmark: I64
     points_c: F64
@@ -63,24 +62,25 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
 
     At 30 Hz neighbouring frames see the same from the same place, and points followed from one
     keyframe share its errors: a frame is taken when the view has changed enough since the last one
-    taken. Left out are also frames too fast for the readout to be undone, and those whose sights do
-    not fit the map from the pose they came with.
-    """
+    taken. Left out are also frames too fast for the readout to be undone, and those whose
+    observations do not fit the map from the pose they came with."""
     camera = map_.info.camera
     focal, centre = np.array([camera.fx_px, camera.fy_px]), [camera.cx_px, camera.cy_px]
-    sights = _against(seen, map_)
+    observations = _against(seen, map_)
     twist = shutter.twists(seen.time_ns, seen.wTc, settings.twist_reach_s, settings.twist_gap_s)
     if seen.camera.readout_s == 0:
         twist[:] = 0.0
     row_s = shutter.row_times_s(seen.pixel_px[:, 1], seen.camera)
-    left = dict.fromkeys(("view unchanged", "few sights", "no velocity", "too fast", "misfit"), 0)
+    left = dict.fromkeys(
+        ("view unchanged", "few observations", "no velocity", "too fast", "misfit"), 0
+    )
     taken: list[tuple[int, I64, F64]] = []
     for k in range(len(seen)):
         rows = np.arange(seen.offset[k], seen.offset[k + 1])
-        rows = rows[sights.usable[rows]]
-        X = sights.points_c[rows]
-        if len(rows) < settings.min_sights:
-            left["few sights"] += 1
+        rows = rows[observations.usable[rows]]
+        X = observations.points_c[rows]
+        if len(rows) < settings.min_observations:
+            left["few observations"] += 1
             continue
         if taken and not _view_changed(seen, taken[-1][0], k, X, settings):
             left["view unchanged"] += 1
@@ -93,14 +93,14 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
         if not np.percentile(moved, 90) <= settings.max_shift_px:  # nor where it is NaN
             left["too fast"] += 1
             continue
-        pixel = sights.pixel_px[rows] - shift
+        pixel = observations.pixel_px[rows] - shift
         off = np.linalg.norm(pixel - (X[:, :2] / X[:, 2:] * focal + centre), axis=1)
         if np.median(off) > settings.max_misfit_px:
             left["misfit"] += 1
             continue
         # A landmark that is there twice counts where it fits best.
         order = np.argsort(off, kind="stable")
-        landmark, first = np.unique(sights.landmark[rows[order]], return_index=True)
+        landmark, first = np.unique(observations.landmark[rows[order]], return_index=True)
         taken.append((k, landmark, pixel[order[first]]))
     frames = np.array([k for k, _, _ in taken], np.int64)
     return Chosen(
@@ -114,7 +114,7 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
     )
 
 
-def _against(seen: FlightObservations, map_: Map) -> _Sights:
+def _against(seen: FlightObservations, map_: Map) -> _Observed:
     camera, lm = map_.info.camera, map_.landmarks
     order = np.argsort(lm.id)
     place = np.searchsorted(lm.id[order], seen.landmark)
@@ -127,7 +127,7 @@ def _against(seen: FlightObservations, map_: Map) -> _Sights:
         X = shutter.in_cameras(seen.wTc[frame], lm.position_m[landmark])
         usable = np.linalg.norm((again - ray) * focal, axis=1) < _SAME_RAY_PX
     usable &= (lm.id[landmark] == seen.landmark) & np.isfinite(X).all(axis=1) & (X[:, 2] > 0)
-    return _Sights(landmark, X, ray * focal + centre, usable)
+    return _Observed(landmark, X, ray * focal + centre, usable)
 
 
 def _view_changed(

@@ -18,10 +18,10 @@ example:
   blimp map refine maps/atrium out/flight.observations.safetensors
   blimp map register maps/atrium --pairs maps/atrium/PAIRS.csv
 
-Poses and landmarks move together until all sights fit best; the map stays where it is registered,
-and registering it again with the same points takes it nearer still. The old map is kept beside the
-new one, as MAP.before, until you delete it. Without EST the map's own sights are adjusted anew,
-with the rolling shutter taken out."""
+Poses and landmarks move together until all observations fit best; the map stays where it is
+registered, and registering it again with the same points takes it nearer still. The old map is kept
+beside the new one, as MAP.before, until you delete it. Without EST the map's own observations are
+adjusted anew, with the rolling shutter taken out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +79,8 @@ def _shown(report: dict[str, Any]) -> dict[str, Any]:
     for flight in report["flights"]:
         left = ", ".join(f"{n} {why}" for why, n in flight["frames_left_out"].items())
         shown[f"flight {flight['name']}"] = (
-            f"{flight['frames']} frames ({left or 'none'} left out), {flight['sights']} sights, "
+            f"{flight['frames']} frames ({left or 'none'} left out), "
+            f"{flight['observations']} observations, "
             f"median {flight['median_before_px']:.3f} -> {flight['median_px']:.3f} px"
         )
     return shown

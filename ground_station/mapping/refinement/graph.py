@@ -27,7 +27,7 @@ _MAD_TO_SIGMA = 1.4826
 """The median of a normal distribution's absolute values, to its standard deviation."""
 
 _LEAST_SIGMA_PX = 0.05
-"""No group of sights is believed to be better than this."""
+"""No group of observations is believed to be better than this."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Graph:
     """What is adjusted: `model`, whose images are the keyframes and then the flights' frames.
 
     `group` (K,) of each image, 0 for the keyframes that the map was built of and 1, 2, … for the
-    flights; `time_ns` (K,); `sigma_px` (groups,), the standard deviation that a sight counts with.
-    """
+    flights; `time_ns` (K,); `sigma_px` (groups,), the standard deviation that an observation counts
+    with."""
 
     model: Model
     group: I64
@@ -44,20 +44,19 @@ class Graph:
     sigma_px: F64
 
     def error_px(self) -> F64:
-        """Reprojection errors of all sights (O,), undistorted pixels; inf behind the camera."""
+        """Reprojection errors of all observations (O,), pinhole pixels; inf behind the camera."""
         return np.asarray(np.linalg.norm(landmarks.residuals_px(self.model), axis=1))
 
-    def group_of_sights(self) -> I64:
-        """The group of each sight (O,)."""
+    def group_of_observations(self) -> I64:
+        """The group of each observation (O,)."""
         return np.asarray(self.group[self.model.image])
 
 
 def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen]) -> Graph:
     """The graph of a map and flights.
 
-    The map's sights are at `pixel_px` (O, 2), undistorted, and its K keyframes belong to `group`
-    (K,); every flight becomes a group of its own.
-    """
+    The map's observations are at `pixel_px` (O, 2), undistorted, and its K keyframes belong to
+    `group` (K,); every flight becomes a group of its own."""
     camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
     starts = len(kf) + np.concatenate([[0], np.cumsum([len(f) for f in flights])]).astype(np.int64)
     names = list(kf.names)
@@ -65,15 +64,15 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
         names += [f"{flight.name}/{time_ns}" for time_ns in flight.time_ns.tolist()]
     image = [np.repeat(np.arange(len(kf)), np.diff(kf.offset))]
     image += [f.frame + start for f, start in zip(flights, starts, strict=False)]
-    sights = np.concatenate(image)
+    observations = np.concatenate(image)
     model = Model(
         names=names,
         image_id=np.arange(len(names)) + 1,
         wTc=np.concatenate([kf.wTc, *(f.wTc for f in flights)]),
         point_id=lm.id,
         position=np.array(lm.position_m),
-        image=sights,
-        feature=np.zeros(len(sights), np.int64),
+        image=observations,
+        feature=np.zeros(len(observations), np.int64),
         point=np.concatenate([kf.landmark, *(f.landmark for f in flights)]).astype(np.int64),
         pixel_px=np.concatenate([pixel_px, *(f.pixel_px for f in flights)]),
         pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
@@ -87,7 +86,8 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
 
 
 def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
-    """A map's sights without the readout's shift (O, 2), and how many keyframes that concerns.
+    """A map's observations without the readout's shift (O, 2), and how many keyframes that
+    concerns.
 
     A keyframe's velocity is that of its neighbours, where they are within `gap_s`.
     """
@@ -110,17 +110,17 @@ def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
 
 
 def drop(graph: Graph, bad: Flags) -> Graph:
-    """The graph without some sights (O,)."""
-    return replace(graph, model=models.without_sights(graph.model, bad))
+    """The graph without some observations (O,)."""
+    return replace(graph, model=models.without_observations(graph.model, bad))
 
 
 def drop_points(graph: Graph, bad: Flags) -> Graph:
-    """The graph without some points (M,) and their sights."""
+    """The graph without some points (M,) and their observations."""
     return replace(graph, model=models.without_points(graph.model, bad))
 
 
 def drop_images(graph: Graph, bad: Flags) -> Graph:
-    """The graph without some images (K,) and their sights."""
+    """The graph without some images (K,) and their observations."""
     model = models.without_images(graph.model, bad)
     return replace(graph, group=graph.group[~bad], time_ns=graph.time_ns[~bad], model=model)
 
@@ -128,9 +128,9 @@ def drop_images(graph: Graph, bad: Flags) -> Graph:
 def spread_px(graph: Graph) -> F64:
     """A robust standard deviation of a pixel coordinate in each group (groups,).
 
-    By the median absolute deviation; NaN for a group without sights.
+    By the median absolute deviation; NaN for a group without observations.
     """
-    size, group = np.abs(landmarks.residuals_px(graph.model)), graph.group_of_sights()
+    size, group = np.abs(landmarks.residuals_px(graph.model)), graph.group_of_observations()
     found = [size[group == g] for g in range(len(graph.sigma_px))]
     median = [np.median(values) if len(values) else np.nan for values in found]
     return np.maximum(_MAD_TO_SIGMA * np.array(median), _LEAST_SIGMA_PX)

@@ -1,4 +1,4 @@
-"""`refine_map`: flights' sights join a map's graph, and a better map takes the old one's place."""
+"""`refine_map`: what flights saw joins a map's graph, and a better map takes its place."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ground_station.progress import Progress
 F64 = npt.NDArray[np.float64]
 
 _MOST_WORSE = 1.02
-"""A larger deviation of the sights without the readout's shift says that there was none."""
+"""A larger deviation of the observations without the readout's shift says that there was none."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ def refine_map(
 ) -> tuple[store.Map, Refinement]:
     """Refines a map on disk by what flights saw of it, and writes it to `out` or in its place.
 
-    Without flights the map's own sights are adjusted anew. In place, the old map is kept beside it
-    (NAME.before); the new one appears when it is whole. Raises `MapError` when the sights are those
-    of another map, are in it already or do not fit it, and when the map has no sights itself.
-    """
+    Without flights the map's own observations are adjusted anew. In place, the old map is kept
+    beside it (NAME.before); the new one appears when it is whole. Raises `MapError` when the
+    observations are those of another map, are in it already or do not fit it, and when the map has
+    no observations itself."""
     settings, folder = settings or MappingSettings(), Path(folder)
     map_ = store.load(folder)
     past = Refined.of(map_)
@@ -90,7 +90,7 @@ def _refined(
 ) -> tuple[store.Map, Model, dict[str, Any]]:
     """The map adjusted together with the chosen frames, its model, and what is told of it."""
     with Progress("adjustment, rounds", None) as progress:
-        pixel_px, shutter = _keyframe_sights(map_, past, settings, progress.step)
+        pixel_px, shutter = _keyframe_observations(map_, past, settings, progress.step)
         groups = past.groups(len(map_.keyframes))
         start = graphs.build_graph(map_, pixel_px, groups, chosen)
         graph = adjust(start, map_, settings, progress.step)
@@ -99,8 +99,8 @@ def _refined(
     report = {
         "images": len(refined.keyframes),
         "landmarks": len(refined.landmarks),
-        "sights": len(refined.keyframes.landmark),
-        "sights_dropped": len(start.model.point) - len(graph.model.point),
+        "observations": len(refined.keyframes.landmark),
+        "observations_dropped": len(start.model.point) - len(graph.model.point),
         "frames_dropped": len(start.group) - len(graph.group),
         "landmarks_dropped": len(map_.landmarks) - len(refined.landmarks),
         "rolling_shutter": shutter,
@@ -116,7 +116,7 @@ def _refined(
 
 def _check_map(map_: store.Map) -> None:
     if len(map_.keyframes) < 2 or not len(map_.keyframes.landmark):
-        raise MapError(f"{map_.folder}: it holds no keyframes' sights that could be adjusted")
+        raise MapError(f"{map_.folder}: it holds no keyframes' observations that could be adjusted")
     if len(np.unique(map_.landmarks.id)) != len(map_.landmarks):
         raise MapError(f"{map_.folder}: two of its landmarks have the same id")
 
@@ -154,14 +154,14 @@ def _check_added(graph: Graph, past: Refined, chosen: Sequence[Chosen]) -> None:
         if not (graph.group == group).any():
             raise MapError(
                 f"the flight '{flight.name}' does not fit: each of its {len(flight)} frames lost "
-                "most of its sights when all were adjusted together"
+                "most of its observations when all were adjusted together"
             )
 
 
-def _keyframe_sights(
+def _keyframe_observations(
     map_: store.Map, past: Refined, settings: MappingSettings, on_round: Callable[[], None]
 ) -> tuple[F64, dict[str, Any]]:
-    """The map's sights (O, 2), undistorted, at their frame's time unless that fits worse."""
+    """The map's observations (O, 2), undistorted, at their frame's time unless that fits worse."""
     seen_px = map_.info.camera.undistort_to_pinhole(map_.keyframes.pixel_px)
     if past.runs:
         return seen_px, {"keyframes": 0, "undone": past.pixels_at == FRAME_TIME}
@@ -179,8 +179,8 @@ def _keyframe_sights(
             on_round=on_round,
         )
         sigma.append(float(graphs.spread_px(graph)[0]))
-    # Steady motion shears all sights alike, which a sheared model fits as well: then the camera
-    # file is believed. It is not where the sights contradict it.
+    # Steady motion shears all observations alike, which a sheared model fits as well: then the
+    # camera file is believed. It is not where the observations contradict it.
     better = sigma[1] < _MOST_WORSE * sigma[0]
     report = {
         "keyframes": count,
@@ -194,7 +194,7 @@ def _keyframe_sights(
 def _assemble(map_: store.Map, graph: Graph) -> store.Map:
     """The map in memory: old descriptors, everything else from the graph."""
     model, old = graph.model, map_.landmarks
-    sigma_px = graph.sigma_px[graph.group_of_sights()] * _unit_weight(graph)
+    sigma_px = graph.sigma_px[graph.group_of_observations()] * _unit_weight(graph)
     made = landmarks.make_landmarks(model, np.zeros((len(model.point), 0), np.float32))
     kept = np.isin(old.id, model.point_id)
     covariance = landmarks.covariances(model, sigma_px)
@@ -226,18 +226,18 @@ def _unit_weight(graph: Graph) -> float:
     Residual sum of squares over the degrees of freedom, as in `landmarks.sigma_px`.
     """
     model = graph.model
-    r = landmarks.residuals_px(model) / graph.sigma_px[graph.group_of_sights()][:, None]
+    r = landmarks.residuals_px(model) / graph.sigma_px[graph.group_of_observations()][:, None]
     freedom = 2 * len(r) - 3 * len(model.position) - 6 * len(model.names) + 7
     return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
 
 
 def _keyframe_report(map_: store.Map, past: Refined, graph: Graph) -> dict[str, Any]:
-    """How the map's own sights fitted and fit, and how far landmarks and keyframes moved."""
-    built = graph.group_of_sights() == 0
+    """How the map's own observations fitted and fit, and how far landmarks and keyframes moved."""
+    built = graph.group_of_observations() == 0
     kept = np.isin(map_.landmarks.id, graph.model.point_id)
     pixel_px = map_.info.camera.undistort_to_pinhole(map_.keyframes.pixel_px)
     before = graphs.build_graph(map_, pixel_px, past.groups(len(map_.keyframes)), [])
-    built_before = before.group_of_sights() == 0
+    built_before = before.group_of_observations() == 0
     unit = "m" if map_.info.registered else map_.info.units
     moved = np.linalg.norm(graph.model.position - map_.landmarks.position_m[kept], axis=1)
     old = {name: k for k, name in enumerate(map_.keyframes.names)}
@@ -256,13 +256,13 @@ def _keyframe_report(map_: store.Map, past: Refined, graph: Graph) -> dict[str, 
 
 
 def _flight_report(flight: Chosen, start: Graph, graph: Graph, group: int) -> dict[str, Any]:
-    mine, given = graph.group_of_sights() == group, start.group_of_sights() == group
+    mine, given = graph.group_of_observations() == group, start.group_of_observations() == group
     return {
         "name": flight.name,
         "frames": int((graph.group == group).sum()),
-        "sights": int(mine.sum()),
-        "sights_given": int(given.sum()),
-        "sights_a_landmark": round(flight.sights_per_landmark, 2),
+        "observations": int(mine.sum()),
+        "observations_given": int(given.sum()),
+        "observations_a_landmark": round(flight.observations_per_landmark, 2),
         "sigma_px": round(float(graph.sigma_px[group]), 4),
         "median_before_px": _median(start.error_px()[given]),
         "median_px": _median(graph.error_px()[mine]),

@@ -1,6 +1,6 @@
 """The similarity between points known in a model and in the world, weighted by both noises.
 
-A known place has two errors: that of its coordinates in the model, which the sights' geometry
+A known place has two errors: that of its coordinates in the model, which the observations' geometry
 tells, and that of its coordinates in the world, with all that bends the model, which nobody tells.
 Minimising pixels would take the second for none: five centimetres are 25 pixels at one metre and
 two at twelve, and the nearest points would carry all. So the second is estimated from what is left.

@@ -25,7 +25,7 @@ examples:
   blimp map register maps/kitchen --trajectory truth.txt
   blimp map register maps/hall --pairs PAIRS.csv --distances DISTANCES.csv
 
-PAIRS.csv: point,image,u_px,v_px,x_m,y_m,z_m; one line for each sight of a known point, at
+PAIRS.csv: point,image,u_px,v_px,x_m,y_m,z_m; one line for each observation of a known point, at
 least two images a point and three points that are not on one line.
 TAGS.toml: family = "36h11", size_m = 0.16 (side of the black square) and for each tag [[tag]],
 id = 7 and centre_m = [x, y, z]; for an upright tag on a wall also facing_deg, the heading into
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--page", action="store_true", help="pick places in a browser")
     source.add_argument("--picks", metavar="TOML", help="picks that were made on the page")
-    source.add_argument("--pairs", metavar="CSV", help="sights of known points")
+    source.add_argument("--pairs", metavar="CSV", help="observations of known points")
     source.add_argument("--tags", metavar="TOML", help="AprilTags of known place; needs --frames")
     source.add_argument("--trajectory", metavar="TUM", help="true poses at the keyframes' times")
     parser.add_argument("--distances", metavar="CSV", help="known distances: the scale, or more")
@@ -106,21 +106,21 @@ def _distances(args: argparse.Namespace) -> Any:
 
 def _register(args: argparse.Namespace) -> Registration:
     from ground_station.geometry.trajectory import read_tum
+    from ground_station.mapping.registration.observations import read_pairs
     from ground_station.mapping.registration.picks import read_picks
     from ground_station.mapping.registration.register import register_map
-    from ground_station.mapping.registration.sights import read_pairs
 
     given: dict[str, Any] = {"distances": _distances(args)}
     notes: list[str] = []
     if args.pairs:
-        given["sights"] = read_pairs(args.pairs)
+        given["observations"] = read_pairs(args.pairs)
     elif args.trajectory:
         given["trajectory"] = read_tum(args.trajectory)
     elif args.picks:
         given["picks"] = read_picks(args.picks)
     elif args.tags:
         seen = _seen_tags(args)
-        given["sights"], notes = seen.sights, seen.notes
+        given["observations"], notes = seen.observations, seen.notes
     files = (args.pairs, args.trajectory, args.picks, args.tags, args.distances)
     source = ", ".join(Path(file).name for file in files if file)
     _, found = register_map(args.map, source=source, seed=args.seed, **given)

@@ -14,9 +14,13 @@ from ground_station.geometry.alignment import Alignment
 from ground_station.map.store import Map
 from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.adjustment import moved
+from ground_station.mapping.registration.observations import (
+    PointObservations,
+    sigma_px,
+    triangulate_observations,
+)
 from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.rows import numbers, read_rows, word
-from ground_station.mapping.registration.sights import Sights, sigma_px, triangulate_sights
 
 F64 = npt.NDArray[np.float64]
 
@@ -30,7 +34,8 @@ _GATE = 3.0
 
 @dataclass(frozen=True)
 class Distances:
-    """D distances: `names`, `length_m` (D,), `sigma_m` (D,), and the sights of their 2 D ends.
+    """D distances: `names`, `length_m` (D,), `sigma_m` (D,), and the observations of their 2 D
+    ends.
 
     Ends 2 d and 2 d + 1 of `ends` belong to distance d.
     """
@@ -38,7 +43,7 @@ class Distances:
     names: list[str]
     length_m: F64
     sigma_m: F64
-    ends: Sights
+    ends: PointObservations
 
 
 @dataclass(frozen=True)
@@ -52,13 +57,14 @@ class MeasuredScale:
 
 
 def read_distances(path: str | Path) -> Distances:
-    """Reads `distance,end,image,u_px,v_px,length_m[,sigma_m]`, a line for each sight of an end.
+    """Reads `distance,end,image,u_px,v_px,length_m[,sigma_m]`, a line for each observation of an
+    end.
 
     `end` is `a` or `b`. Raises `MapError` naming the line.
     """
     lengths: dict[str, tuple[float, float]] = {}
-    sights: dict[tuple[str, str, str], tuple[float, float]] = {}
-    for where, row in read_rows(path, COLUMNS, "sight"):
+    observations: dict[tuple[str, str, str], tuple[float, float]] = {}
+    for where, row in read_rows(path, COLUMNS, "observation"):
         u, v, length = numbers(row, COLUMNS[3:], where)
         sigma = numbers(row, ["sigma_m"], where)[0] if row.get("sigma_m") else _SIGMA_M
         name, end, image = (word(row, key, where) for key in COLUMNS[:3])
@@ -72,19 +78,19 @@ def read_distances(path: str | Path) -> Distances:
             raise MapError(f"{where}: sigma_m is {sigma:g}; allowed: 1e-06 to below the length")
         if lengths.setdefault(name, (length, sigma)) != (length, sigma):
             raise MapError(f"{where}: the distance '{name}' was {lengths[name][0]:g} m before")
-        if (name, end, image) in sights:
+        if (name, end, image) in observations:
             raise MapError(f"{where}: end {end} of '{name}' was seen in '{image}' before")
-        sights[name, end, image] = u, v
+        observations[name, end, image] = u, v
     if not lengths:
         raise MapError(f"{path}: it holds no distances")
     place = {name: 2 * d for d, name in enumerate(lengths)}
     length_m, sigma_m = np.array(list(lengths.values())).T
-    ends = Sights(
+    ends = PointObservations(
         points=[f"{name} {end}" for name, end in itertools.product(lengths, "ab")],
         world_m=np.zeros((2 * len(lengths), 3)),
-        point=np.array([place[name] + (end == "b") for name, end, _ in sights], np.int64),
-        image=[image for _, _, image in sights],
-        pixel_px=np.array(list(sights.values())),
+        point=np.array([place[name] + (end == "b") for name, end, _ in observations], np.int64),
+        image=[image for _, _, image in observations],
+        pixel_px=np.array(list(observations.values())),
     )
     return Distances(list(lengths), length_m, sigma_m, ends)
 
@@ -97,7 +103,7 @@ def measure_scale(map_: Map, distances: Distances) -> MeasuredScale:
     Birge's ratio (R. T. Birge, Physical Review 40, 1932). Raises `MapError` where none is left.
     """
     kf = map_.keyframes
-    found, notes = triangulate_sights(distances.ends, kf.names, kf.wTc, map_.info.camera)
+    found, notes = triangulate_observations(distances.ends, kf.names, kf.wTc, map_.info.camera)
     place = {point.name: point for point in found}
     sigma = sigma_px(found) if found else 1.0
     used, ratio, deviation = [], [], []

@@ -14,25 +14,26 @@ from ground_station.map import colmap, store
 from ground_station.map.folder import replacing
 from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration.distances import Distances, by_distances, with_distances
+from ground_station.mapping.registration.from_observations import by_observations
 from ground_station.mapping.registration.from_picks import by_picks
-from ground_station.mapping.registration.from_sights import by_sights
 from ground_station.mapping.registration.from_trajectory import by_trajectory
+from ground_station.mapping.registration.observations import PointObservations
 from ground_station.mapping.registration.picks import Picks
 from ground_station.mapping.registration.registration import Registration
-from ground_station.mapping.registration.sights import Sights
 
 
 def register_map(
     folder: str | Path,
     *,
-    sights: Sights | None = None,
+    observations: PointObservations | None = None,
     trajectory: Trajectory | None = None,
     picks: Picks | None = None,
     distances: Distances | None = None,
     source: str = "",
     seed: int = 0,
 ) -> tuple[store.Map, Registration]:
-    """Takes a map on disk to world coordinates by sights of known points, a trajectory or picks.
+    """Takes a map on disk to world coordinates by observations of known points, a trajectory or
+    picks.
 
     Distances are further measurements of the scale, or by themselves the only ones. Poses,
     landmarks, covariances and the COLMAP model are transformed together and take the old map's
@@ -43,7 +44,12 @@ def register_map(
     map_ = store.load(folder)
     reconstruction = colmap.read(folder / "sparse")
     found = find_similarity(
-        map_, sights=sights, trajectory=trajectory, picks=picks, distances=distances, seed=seed
+        map_,
+        observations=observations,
+        trajectory=trajectory,
+        picks=picks,
+        distances=distances,
+        seed=seed,
     )
     fit = found.fit
     moved = transform_map(map_, fit)
@@ -63,15 +69,15 @@ def register_map(
 def find_similarity(
     map_: store.Map,
     *,
-    sights: Sights | None = None,
+    observations: PointObservations | None = None,
     trajectory: Trajectory | None = None,
     picks: Picks | None = None,
     distances: Distances | None = None,
     seed: int = 0,
 ) -> Registration:
     """The similarity of what is given; changes nothing."""
-    if sights is not None:
-        found = by_sights(map_, sights, seed)
+    if observations is not None:
+        found = by_observations(map_, observations, seed)
     elif trajectory is not None:
         found = by_trajectory(map_, trajectory, seed)
     elif picks is not None:
@@ -79,7 +85,7 @@ def find_similarity(
     elif distances is not None:
         return by_distances(map_, distances)
     else:
-        raise MapError("registration: sights, a trajectory, picks or distances are needed")
+        raise MapError("registration: observations, a trajectory, picks or distances are needed")
     return with_distances(found, map_, distances) if distances is not None else found
 
 

@@ -1,4 +1,4 @@
-"""AprilTags of known place as known points: TAGS.toml, and their sights in the map's frames."""
+"""AprilTags of known place as known points: TAGS.toml, and where the map's frames show them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ import numpy.typing as npt
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map
-from ground_station.mapping.registration.sights import Sights, triangulate_sights
+from ground_station.mapping.registration.observations import (
+    PointObservations,
+    triangulate_observations,
+)
 from ground_station.recording.frames import Frame
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
@@ -79,9 +82,9 @@ class Tags:
 
 @dataclass(frozen=True)
 class Found:
-    """Sights of the tags' known points in the map's frames, and lines for a person."""
+    """PointObservations of the tags' known points in the map's frames, and lines for a person."""
 
-    sights: Sights
+    observations: PointObservations
     notes: list[str]
 
 
@@ -175,7 +178,7 @@ def detect(image: U8, family: str) -> list[tuple[int, F64]]:
 
 
 def find_tags(map_: Map, tags: Tags, frames: Iterable[Frame], stems: Iterable[str] = ()) -> Found:
-    """Sights of the tags in those frames that the map was built from, which have its names.
+    """The tags as seen in those frames that the map was built from, which have its names.
 
     `stems` are names of inputs that may stand before the frames', as in a map of several. A tag
     that is seen in one frame only, twice in one frame, or at two places, is left out with a note.
@@ -214,10 +217,10 @@ def find_tags(map_: Map, tags: Tags, frames: Iterable[Frame], stems: Iterable[st
             f"no tag of the family {tags.family} is seen in {looked} images of the map "
             f"(other families: {others})"
         )
-    return _sights(map_, tags, seen, twice, looked)
+    return _observations(map_, tags, seen, twice, looked)
 
 
-def _sights(
+def _observations(
     map_: Map, tags: Tags, seen: dict[int, dict[str, F64]], twice: set[int], looked: int
 ) -> Found:
     camera, kf = map_.info.camera, map_.keyframes
@@ -238,22 +241,24 @@ def _sights(
         notes.append(f"tags that nobody listed are seen: {', '.join(map(str, more[:20]))}")
     good: list[int] = []
     for number in kept:
-        one = _as_sights({number: kept[number]}, tags, camera)
-        found, _ = triangulate_sights(one, kf.names, kf.wTc, camera)
+        one = _as_observations({number: kept[number]}, tags, camera)
+        found, _ = triangulate_observations(one, kf.names, kf.wTc, camera)
         worst = max((point.error_px for point in found), default=math.inf)
         if len(found) < len(one.points) or worst > _CONTRADICTION_PX:
             notes.append(
-                f"tag {number} left out: its sights do not meet (RMS {worst:.0f} px): are there "
-                "two of it?"
+                f"tag {number} left out: its observations do not meet (RMS {worst:.0f} px): are "
+                "there two of it?"
             )
         else:
             good.append(number)
     if not good:
         raise MapError(f"registration: none of the {len(tags.places)} tags can be used: {notes[0]}")
-    return Found(_as_sights({number: kept[number] for number in good}, tags, camera), notes)
+    return Found(_as_observations({number: kept[number] for number in good}, tags, camera), notes)
 
 
-def _as_sights(seen: dict[int, dict[str, F64]], tags: Tags, camera: Camera) -> Sights:
+def _as_observations(
+    seen: dict[int, dict[str, F64]], tags: Tags, camera: Camera
+) -> PointObservations:
     points: list[str] = []
     thing: list[int] = []
     point: list[int] = []
@@ -272,7 +277,7 @@ def _as_sights(seen: dict[int, dict[str, F64]], tags: Tags, camera: Camera) -> S
             point += range(start, start + len(places))
             image += [name] * len(places)
             pixels += list(shown)
-    return Sights(
+    return PointObservations(
         points=points,
         world_m=np.array(world),
         point=np.array(point, np.int64),

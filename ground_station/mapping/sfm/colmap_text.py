@@ -90,11 +90,13 @@ def _images(
         if camera not in cameras:
             raise Fault(f"image {number} is of a camera that is not there")
         line, text = next(lines, (line + 1, ""))
-        sights = text.split()
-        if len(sights) % 3:
+        observations = text.split()
+        if len(observations) % 3:
             raise Fault(f"line {line}: it is cut")
-        _reals([word for k, word in enumerate(sights) if k % 3 < 2], line)
-        points = [NO_POINT if word == "-1" else _whole(word, line, 2**64) for word in sights[2::3]]
+        _reals([word for k, word in enumerate(observations) if k % 3 < 2], line)
+        points = [
+            NO_POINT if word == "-1" else _whole(word, line, 2**64) for word in observations[2::3]
+        ]
         images[number] = ImageEntry(words[9].rstrip(), camera, pose, np.array(points, np.uint64))
     return images
 
@@ -105,8 +107,8 @@ def _points(lines: Iterator[tuple[int, str]], images: dict[int, ImageEntry]) -> 
         if len(words) < 8 or len(words) % 2:
             raise Fault(f"line {line}: it is cut")
         position = _reals(words[1:4], line)
-        sights = [_whole(word, line) for word in words[8:]]
-        tracks.add(_whole(words[0], line, 2**64), position, sights[::2], sights[1::2])
+        observations = [_whole(word, line) for word in words[8:]]
+        tracks.add(_whole(words[0], line, 2**64), position, observations[::2], observations[1::2])
     tracks.end()
 
 

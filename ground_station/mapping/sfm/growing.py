@@ -28,7 +28,7 @@ def adjust_among_fixed(
     """Poses (K, 4, 4) and points (M, 3) of a model at the optimum.
 
     Fixed points (M,) and images (K,) stay, bit for bit, and give the gauge. Every point needs two
-    sights. A Cauchy loss of scale `loss_px`; `threads` 0 takes one a core.
+    observations. A Cauchy loss of scale `loss_px`; `threads` 0 takes one a core.
     """
     reconstruction = colmap.from_arrays(model, camera)
     options = adjustment.adjustment_options(loss_px, threads, max_iterations)

@@ -6,9 +6,8 @@ the whole model was just adjusted. There the model goes to disk, and the next ba
 what it reads there, whether the program ran on or was killed meanwhile. So both ways give one map.
 
 With one seed two runs differ by what COLMAP's threads add up in another order: bundle adjustment
-sums in the order in which threads finish, in the last bits of a number. A sight whose error is that
-near to a limit may fall on the other side of it.
-"""
+sums in the order in which threads finish, in the last bits of a number. An observation whose error
+is that near to a limit may fall on the other side of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of a model: without some of its sights, points or images."""
+"""Parts of a model: without some of its observations, points or images."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ground_station.map.model import Model
 Flags = npt.NDArray[np.bool_]
 
 
-def without_sights(model: Model, bad: Flags) -> Model:
-    """The model without some sights (O,)."""
+def without_observations(model: Model, bad: Flags) -> Model:
+    """The model without some observations (O,)."""
     keep = ~bad
     rows = {name: getattr(model, name)[keep] for name in ("image", "feature", "point", "pixel_px")}
     return replace(model, **rows)
 
 
 def without_points(model: Model, bad: Flags) -> Model:
-    """The model without some points (M,) and their sights."""
-    model, kept = without_sights(model, bad[model.point]), ~bad
+    """The model without some points (M,) and their observations."""
+    model, kept = without_observations(model, bad[model.point]), ~bad
     new = np.cumsum(kept) - 1
     return replace(
         model,
@@ -32,8 +32,8 @@ def without_points(model: Model, bad: Flags) -> Model:
 
 
 def without_images(model: Model, bad: Flags) -> Model:
-    """The model without some images (K,) and their sights."""
-    model, kept = without_sights(model, bad[model.image]), ~bad
+    """The model without some images (K,) and their observations."""
+    model, kept = without_observations(model, bad[model.image]), ~bad
     new = np.cumsum(kept) - 1
     return replace(
         model,

@@ -1,4 +1,4 @@
-"""`ground_station.mapping.registration.sights`: PAIRS.csv."""
+"""`ground_station.mapping.registration.observations`: PAIRS.csv."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import numpy as np
 from pieces import refusing, scratch, stretch
 
 from ground_station.errors import MapError
-from ground_station.mapping.registration.sights import COLUMNS, read_pairs
+from ground_station.mapping.registration.observations import COLUMNS, read_pairs
 
 _FILE = scratch("pairs") / "PAIRS.csv"
 _HEAD = ",".join(COLUMNS).encode() + b"\n"
 
 
 def fuzz(data: bytes) -> None:
-    """Sights that are taken are finite and of points that are there."""
+    """Observations that are taken are finite and of points that are there."""
     _FILE.write_bytes(_HEAD + data[1:] if data[:1] == b"\0" else data)
     with refusing(MapError):
-        sights = read_pairs(_FILE)
-        assert np.isfinite(sights.world_m).all() and np.isfinite(sights.pixel_px).all()
-        assert sights.point.max() < len(sights.points) and len(sights.image) == len(sights.point)
+        observations = read_pairs(_FILE)
+        assert np.isfinite(observations.world_m).all() and np.isfinite(observations.pixel_px).all()
+        assert observations.point.max() < len(observations.points) and len(
+            observations.image
+        ) == len(observations.point)
 
 
 def seeds() -> list[bytes]:

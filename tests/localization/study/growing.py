@@ -30,10 +30,12 @@ def grown(map_: Map, times: int) -> Map:
         offset = kf.offset[1:] + k * len(kf.landmark)
         keyframes.append(replace(kf, wTc=wTc, landmark=seen, offset=offset))
     every = {f.name: np.concatenate([getattr(x, f.name) for x in landmarks]) for f in fields(lm)}
-    sights = {
+    observations = {
         f.name: np.concatenate([getattr(x, f.name) for x in keyframes])
         for f in fields(kf)
         if f.name != "names"
     }
     names = [name for x in keyframes for name in x.names]
-    return replace(map_, landmarks=Landmarks(**every), keyframes=Keyframes(names=names, **sights))
+    return replace(
+        map_, landmarks=Landmarks(**every), keyframes=Keyframes(names=names, **observations)
+    )

@@ -133,7 +133,7 @@ def write_map(corridor: Corridor, folder: Path, seed=1) -> store.Map:
         pinhole=np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px]),
     )
     info = store.MapInfo("corridor", "c" * 64, DIMENSION, CAMERA, folder.name, "world", "m")
-    info.registration = {"method": "sights", "points": 12}
+    info.registration = {"method": "observations", "points": 12}
     map_ = store.Map(
         info,
         landmarks.make_landmarks(model, look),

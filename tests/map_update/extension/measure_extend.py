@@ -94,7 +94,7 @@ def cost(path: Path, wanted: str, folders: list[Path], frames: int) -> list[dict
     extractor = extractor_for(maps[0].info, settings.features)
     localizers = [Localizer(map_, camera, extractor, settings) for map_ in maps]
     spans: list[list[dict[str, float]]] = [[] for _ in maps]
-    sights: list[list[int]] = [[] for _ in maps]
+    observations: list[list[int]] = [[] for _ in maps]
     for k, frame in enumerate(itertools.islice(source, frames)):
         features = extractor.extract(frame.image)
         guess = truth.wTc[truth.nearest(frame.time_ns)].copy()
@@ -104,7 +104,7 @@ def cost(path: Path, wanted: str, folders: list[Path], frames: int) -> list[dict
             localizers[turn].set_initial_pose(guess, frame.time_ns - 33_000_000)
             estimate = localizers[turn].process_features(frame.time_ns, features)
             spans[turn].append(estimate.stage_ms)
-            sights[turn].append(estimate.counts.inliers)
+            observations[turn].append(estimate.counts.inliers)
     return [
         {
             **{
@@ -113,7 +113,7 @@ def cost(path: Path, wanted: str, folders: list[Path], frames: int) -> list[dict
             },
             "inliers": float(np.median(seen)),
         }
-        for mine, seen in zip(spans, sights, strict=True)
+        for mine, seen in zip(spans, observations, strict=True)
     ]
 
 

@@ -27,12 +27,12 @@ def test_nothing_that_was_there_moves_or_changes_its_look(by_sunset):
         assert np.array_equal(getattr(new.landmarks, name)[:count], getattr(old.landmarks, name))
     rows = new.landmarks.descriptor.values[:count]
     assert np.array_equal(rows, old.landmarks.descriptor.values)
-    kf, sights = old.keyframes, len(old.keyframes.landmark)
+    kf, observations = old.keyframes, len(old.keyframes.landmark)
     assert new.keyframes.names[: len(kf)] == kf.names
     for name, end in (("wTc", len(kf)), ("time_ns", len(kf)), ("offset", len(kf) + 1)):
         assert np.array_equal(getattr(new.keyframes, name)[:end], getattr(kf, name))
     for name in ("landmark", "pixel_px"):
-        assert np.array_equal(getattr(new.keyframes, name)[:sights], getattr(kf, name))
+        assert np.array_equal(getattr(new.keyframes, name)[:observations], getattr(kf, name))
     assert new.info.registration == old.info.registration and new.info.frame == "world"
     assert (new.landmarks.observations[:count] >= old.landmarks.observations).all()
     assert new.landmarks.observations.sum() == len(new.keyframes.landmark)
@@ -75,7 +75,7 @@ def test_another_sunset_flight_is_localized_better_and_a_noon_flight_as_before(
     by_sunset, corridor_world
 ):
     old, new, _ = by_sunset
-    sights = {}
+    observations = {}
     for name in ("again", "noon"):
         for when, map_ in (("before", old), ("after", new)):
             flight = _localized(corridor_world, map_, name)
@@ -84,9 +84,9 @@ def test_another_sunset_flight_is_localized_better_and_a_noon_flight_as_before(
             off_m = np.linalg.norm(flight.seen.wTc[:, :3, 3] - truth[at, :3, 3], axis=1)
             assert np.median(off_m) < 0.03
             assert len(flight.seen) >= 0.8 * len(truth)
-            sights[name, when] = np.mean(np.diff(flight.seen.offset))
-    assert sights["again", "after"] > 1.5 * sights["again", "before"]
-    assert sights["noon", "after"] >= 0.97 * sights["noon", "before"]
+            observations[name, when] = np.mean(np.diff(flight.seen.offset))
+    assert observations["again", "after"] > 1.5 * observations["again", "before"]
+    assert observations["noon", "after"] >= 0.97 * observations["noon", "before"]
 
 
 def test_everything_in_the_folder_fits_together(by_sunset):

@@ -80,7 +80,7 @@ def test_points_are_where_their_rays_meet_and_those_without_an_angle_are_not_kno
     assert np.allclose(found.position[:2], points[:2], atol=1e-6)
 
 
-def test_a_sight_that_is_off_a_little_is_left_out_of_its_point():
+def test_a_observation_that_is_off_a_little_is_left_out_of_its_point():
     points = np.array([[0.3, 0.2, 3.0]])
     model = _seen(points, _aside(0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
     off = model.pixel_px.copy()
@@ -113,7 +113,7 @@ def seen_from_the_front():
     return landmarks.make_landmarks(model, np.ones((90, 4), np.float32))
 
 
-def test_cones_and_distances_hold_the_old_sights_and_the_new(seen_from_the_front):
+def test_cones_and_distances_hold_the_old_observations_and_the_new(seen_from_the_front):
     lm = seen_from_the_front
     shown = np.array([4, 4, 9])
     at = np.array([[2.0, 0.3, 1.0], [2.2, 0.3, 0.0], [0.1, 0.0, -6.0]])

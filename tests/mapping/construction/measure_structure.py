@@ -41,7 +41,7 @@ from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.verification import match
-from ground_station.mapping.registration.sights import read_pairs
+from ground_station.mapping.registration.observations import read_pairs
 from ground_station.mapping.settings import MappingSettings, load_settings
 from ground_station.mapping.sfm import global_mapping
 from ground_station.mapping.sfm.database import write_database
@@ -129,7 +129,7 @@ def flight(
 
 
 def points_of(flight: Path) -> Path:
-    """Where the sights of a flight's surveyed points are."""
+    """Where the observations of a flight's surveyed points are."""
     return flight.with_suffix(".points.csv")
 
 

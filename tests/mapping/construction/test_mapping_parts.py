@@ -172,12 +172,12 @@ def _united(scene, runs, pairs):
     return uniting.unite(parts, cores, PLACES[:1] * len(runs), images, pairs)
 
 
-def test_a_landmark_of_two_parts_is_one_with_all_its_sights():
+def test_a_landmark_of_two_parts_is_one_with_all_its_observations():
     scene = _scene()
     model = _united(scene, [range(30), range(20, 60)], {})
-    _, sights = np.unique(np.concatenate(scene[2]), return_counts=True)
+    _, observations = np.unique(np.concatenate(scene[2]), return_counts=True)
     assert len(model.names) == 60
-    assert sorted(np.bincount(model.point)) == sorted(sights[sights > 1])
+    assert sorted(np.bincount(model.point)) == sorted(observations[observations > 1])
 
 
 def test_a_pair_of_images_that_no_part_has_both_of_unites_what_stands_where_it_says():

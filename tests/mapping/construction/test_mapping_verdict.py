@@ -37,7 +37,7 @@ def test_a_whole_map_needs_few_words() -> None:
     assert found.word == "whole" and found.missing == []
     assert found.lines == [
         "WHOLE: all 40 images stand in this map, in one piece",
-        "exact: 50 landmarks fit 200 sights to 0.43 px; a key point's noise is 0.50 px",
+        "exact: 50 landmarks fit 200 observations to 0.43 px; a key point's noise is 0.50 px",
         "scale: unknown until the map is registered; lengths in it are its own",
     ]
 

@@ -98,10 +98,14 @@ def test_everything_in_the_folder_fits_together(world):
     after = np.trace(lm.covariance_m2, axis1=1, axis2=2)
     assert np.median(after) < np.median(before)
     assert loaded.info.refined["flights"][0]["name"] == "flight"
-    assert loaded.info.refined["last"]["sights"] == result.report["sights"] == len(kf.landmark)
+    assert (
+        loaded.info.refined["last"]["observations"]
+        == result.report["observations"]
+        == len(kf.landmark)
+    )
 
 
-def test_sights_that_do_not_fit_are_dropped_and_counted(world):
+def test_observations_that_do_not_fit_are_dropped_and_counted(world):
     flight = world.flight()
     rng = np.random.default_rng(1)
     wrong = rng.random(len(flight.landmark)) < 0.1
@@ -111,7 +115,7 @@ def test_sights_that_do_not_fit_are_dropped_and_counted(world):
         world.folder, [dataclasses.replace(flight, pixel_px=pixel)], SETTINGS
     )
     about = result.report["flights"][0]
-    assert 0.06 < 1 - about["sights"] / about["sights_given"] < 0.16
+    assert 0.06 < 1 - about["observations"] / about["observations_given"] < 0.16
     assert np.median(world.errors_m(refined)) < np.median(world.errors_m(world.map))
 
 
@@ -136,9 +140,9 @@ def test_a_second_flight_joins_the_first_and_the_same_one_is_refused(world):
 
 def test_frames_of_an_earlier_flight_that_go_are_no_longer_counted(world):
     first, _ = refine_map(world.folder, [world.flight()], SETTINGS)
-    sights = np.diff(first.keyframes.offset)[8:]
+    observations = np.diff(first.keyframes.offset)[8:]
     strict = dataclasses.replace(
-        SETTINGS, refine=RefineSettings(min_sights=int(np.median(sights)) + 1)
+        SETTINGS, refine=RefineSettings(min_observations=int(np.median(observations)) + 1)
     )
     second, result = refine_map(world.folder, [], strict)
     table = Refined.of(store.load(world.folder))
@@ -150,7 +154,7 @@ def test_frames_of_an_earlier_flight_that_go_are_no_longer_counted(world):
     assert third_names == (groups == 2).tolist()
 
 
-def test_a_keyframe_and_landmarks_without_sights_are_no_hindrance(world):
+def test_a_keyframe_and_landmarks_without_observations_are_no_hindrance(world):
     kf = world.map.keyframes
     offset = np.append(kf.offset, kf.offset[-1])
     more = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""What a refinement refuses: sights of other maps, files that are cut, foreign or hostile."""
+"""What a refinement refuses: observations of other maps, files that are cut, foreign or hostile."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ground_station.map.observations import landmarks_sha256, load_observations,
 from ground_station.mapping.refinement.refine import refine_map
 
 
-def test_sights_of_another_map_are_refused_by_name(world):
+def test_observations_of_another_map_are_refused_by_name(world):
     flight = dataclasses.replace(world.flight(), landmarks_sha256="1" * 64, map="cellar")
     with pytest.raises(MapError, match=r"'flight' was localized in another map \('cellar'\)"):
         refine_map(world.folder, [flight], SETTINGS)
@@ -27,8 +27,8 @@ def test_sights_of_another_map_are_refused_by_name(world):
     ("change", "words"),
     [
         (lambda f: {"wTc": f.wTc @ poses.exp([0, 0.3, 0, 0, 0, 0])}, "misfit: 22"),
-        (lambda f: {"wTc": _far(f.wTc)}, "few sights: 24"),
-        (lambda f: {"landmark": f.landmark + 100_000}, "few sights: 24"),
+        (lambda f: {"wTc": _far(f.wTc)}, "few observations: 24"),
+        (lambda f: {"landmark": f.landmark + 100_000}, "few observations: 24"),
         (lambda f: {"time_ns": f.time_ns * 100}, "no velocity: 24"),
     ],
 )
@@ -47,7 +47,7 @@ def _far(wTc):
     return moved
 
 
-def test_an_empty_flight_and_a_map_without_sights_are_refused(world):
+def test_an_empty_flight_and_a_map_without_observations_are_refused(world):
     empty = dataclasses.replace(
         world.flight(),
         time_ns=np.empty(0, np.int64),
@@ -64,7 +64,7 @@ def test_an_empty_flight_and_a_map_without_sights_are_refused(world):
         [], empty.time_ns, empty.wTc, empty.offset, np.empty(0, np.int32), empty.pixel_px
     )
     store.save_tables(world.folder, dataclasses.replace(world.map, keyframes=none))
-    with pytest.raises(MapError, match="no keyframes' sights"):
+    with pytest.raises(MapError, match="no keyframes' observations"):
         refine_map(world.folder, [], SETTINGS)
 
 
@@ -184,7 +184,7 @@ def test_the_command_tells_what_it_did(world, tmp_path, capsys):
     shown, report = capsys.readouterr().out, json.loads((tmp_path / "r.json").read_text())
     assert "flight flight" in shown and "room.before" in shown and "registering again" in shown
     flight = report["flights"][0]
-    assert flight["median_px"] < flight["median_before_px"] and report["sights_dropped"] >= 0
+    assert flight["median_px"] < flight["median_before_px"] and report["observations_dropped"] >= 0
     assert cli.main(["map", "info", str(world.folder)]) == 0
     assert f"flight ({flight['frames']} frames)" in capsys.readouterr().out
     for out in (world.folder, tmp_path / "absent" / "new"):

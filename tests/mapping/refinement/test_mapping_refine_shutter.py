@@ -71,7 +71,8 @@ def test_a_maps_own_shutter_is_undone_once_and_not_where_there_was_none(world):
     second, again = refine_map(world.folder, [], SETTINGS)
     assert again.report["rolling_shutter"] == {"keyframes": 0, "undone": True}
     assert np.abs(second.keyframes.pixel_px - first.keyframes.pixel_px).max() < 1e-3
-    # Sights that a global shutter took are not spoilt by a readout that the camera file claims.
+    # Observations that a global shutter took are not spoilt by a readout that the camera file
+    # claims.
     rows = [_seen(world.points, T, camera, rng, 0.1) for T in wTc]
     keyframes = dataclasses.replace(
         keyframes,

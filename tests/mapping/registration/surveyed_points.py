@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.map.store import Map
-from ground_station.mapping.registration.from_sights import by_sights
-from ground_station.mapping.registration.sights import Sights
+from ground_station.mapping.registration.from_observations import by_observations
+from ground_station.mapping.registration.observations import PointObservations
 
 NOISE_M = 0.05
 
@@ -24,18 +24,20 @@ class Drawn:
     points: list[int]
 
 
-def six_points(map_: Map, truth_m: np.ndarray, sights: Sights, draws: int) -> Drawn:
+def six_points(
+    map_: Map, truth_m: np.ndarray, observations: PointObservations, draws: int
+) -> Drawn:
     """Registers a map by six points far apart, `draws` times with other noise of `NOISE_M`.
 
     `truth_m` (K, 3): the keyframes' true places. Only the points' places are noisy, each coordinate
-    on its own; the sights are those given.
+    on its own; the observations are those given.
     """
-    six = only(sights, far_apart(sights.world_m, 6))
+    six = only(observations, far_apart(observations.world_m, 6))
     rng = np.random.default_rng(0)
     drawn = Drawn([], [], [])
     for _ in range(draws):
         told = six.world_m + NOISE_M * rng.normal(size=six.world_m.shape)
-        found = by_sights(map_, dataclasses.replace(six, world_m=told), 0)
+        found = by_observations(map_, dataclasses.replace(six, world_m=told), 0)
         off = np.linalg.norm(found.fit.apply(map_.keyframes.wTc[:, :3, 3]) - truth_m, axis=1)
         drawn.median_m.append(float(np.median(off)))
         drawn.covered.append(float(np.mean(off <= found.uncertainty.radius_m(truth_m))))
@@ -43,16 +45,16 @@ def six_points(map_: Map, truth_m: np.ndarray, sights: Sights, draws: int) -> Dr
     return drawn
 
 
-def only(sights: Sights, chosen: list[int]) -> Sights:
-    """The sights of some of the points."""
-    kept = np.flatnonzero(np.isin(sights.point, chosen))
+def only(observations: PointObservations, chosen: list[int]) -> PointObservations:
+    """The observations of some of the points."""
+    kept = np.flatnonzero(np.isin(observations.point, chosen))
     place = {p: k for k, p in enumerate(chosen)}
-    return Sights(
-        [sights.points[p] for p in chosen],
-        sights.world_m[chosen],
-        np.array([place[p] for p in sights.point[kept].tolist()]),
-        [sights.image[k] for k in kept],
-        sights.pixel_px[kept],
+    return PointObservations(
+        [observations.points[p] for p in chosen],
+        observations.world_m[chosen],
+        np.array([place[p] for p in observations.point[kept].tolist()]),
+        [observations.image[k] for k in kept],
+        observations.pixel_px[kept],
     )
 
 

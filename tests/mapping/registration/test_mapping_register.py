@@ -13,14 +13,14 @@ from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map import colmap, landmarks, store
 from ground_station.map.model import Model
-from ground_station.mapping.registration import register, sights
+from ground_station.mapping.registration import observations, register
 
 pycolmap = colmap.pycolmap
 
 
 def make_pairs(scene, chosen, rng, noise_px=0.3):
     """PAIRS.csv lines of points (P, 3) that are seen by at least two images."""
-    lines = [",".join(sights.COLUMNS)]
+    lines = [",".join(observations.COLUMNS)]
     for p, point in enumerate(chosen):
         for k, T in enumerate(scene.wTc):
             local = poses.transform(poses.inverse(T), point[None])
@@ -46,19 +46,23 @@ def target(built, tmp_path):
     return folder
 
 
-def _pairs(tmp_path: Path, lines: list[str]) -> sights.Sights:
+def _pairs(tmp_path: Path, lines: list[str]) -> observations.PointObservations:
     path = tmp_path / "PAIRS.csv"
     path.write_text("\n".join(lines) + "\n")
-    return sights.read_pairs(path)
+    return observations.read_pairs(path)
 
 
 def _camera_errors(map_: store.Map, scene) -> np.ndarray:
     return np.linalg.norm(map_.keyframes.wTc[:, :3, 3] - scene.wTc[:, :3, 3], axis=1)
 
 
-def test_sights_of_known_points_put_the_map_into_the_world(built, target, tmp_path, world_points):
+def test_observations_of_known_points_put_the_map_into_the_world(
+    built, target, tmp_path, world_points
+):
     lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
-    moved, found = register.register_map(target, sights=_pairs(tmp_path, lines), source="P.csv")
+    moved, found = register.register_map(
+        target, observations=_pairs(tmp_path, lines), source="P.csv"
+    )
     assert _camera_errors(moved, built.scene).max() < 0.03
     turned = moved.keyframes.wTc[:, :3, :3] @ np.swapaxes(built.scene.wTc[:, :3, :3], 1, 2)
     assert np.degrees(poses.rotation_angle(turned)).max() < 0.3
@@ -71,7 +75,7 @@ def test_sights_of_known_points_put_the_map_into_the_world(built, target, tmp_pa
 
 def test_everything_in_the_folder_is_in_world_coordinates(built, target, tmp_path, world_points):
     lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
-    register.register_map(target, sights=_pairs(tmp_path, lines), source="P.csv")
+    register.register_map(target, observations=_pairs(tmp_path, lines), source="P.csv")
     loaded = store.load(target)
     model = pycolmap.Reconstruction(target / "sparse")
     lm, kf = loaded.landmarks, loaded.keyframes
@@ -93,8 +97,8 @@ def test_everything_in_the_folder_is_in_world_coordinates(built, target, tmp_pat
 
 def test_registering_again_changes_nothing_but_the_report(built, target, tmp_path, world_points):
     lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
-    first, _ = register.register_map(target, sights=_pairs(tmp_path, lines))
-    second, found = register.register_map(target, sights=_pairs(tmp_path, lines))
+    first, _ = register.register_map(target, observations=_pairs(tmp_path, lines))
+    second, found = register.register_map(target, observations=_pairs(tmp_path, lines))
     assert found.report["scale"] == pytest.approx(1, abs=1e-6)
     assert np.allclose(first.keyframes.wTc, second.keyframes.wTc, atol=1e-5)
     assert np.array_equal(
@@ -112,7 +116,7 @@ def test_wrong_points_are_found_and_named(built, target, tmp_path, world_points)
         else line
         for line in lines
     ]
-    moved, found = register.register_map(target, sights=_pairs(tmp_path, lines))
+    moved, found = register.register_map(target, observations=_pairs(tmp_path, lines))
     assert _camera_errors(moved, built.scene).max() < 0.04
     assert found.report["points"] == 10
     assert all(any(f"'{name}' left out" in note for note in found.notes) for name in ("p3", "p7"))
@@ -159,7 +163,7 @@ def test_too_few_points_or_points_on_a_line_are_refused_and_the_map_stays(
 ):
     lines = make_pairs(built.scene, np.array(points), np.random.default_rng(1))
     with pytest.raises(MapError, match=words) as caught:
-        register.register_map(target, sights=_pairs(tmp_path, lines))
+        register.register_map(target, observations=_pairs(tmp_path, lines))
     assert "\n" not in str(caught.value)
     assert not store.load(target).info.registered
     assert [p.name for p in tmp_path.iterdir() if p.suffix == ".part"] == []
@@ -170,7 +174,7 @@ def test_points_in_images_that_the_map_lacks_are_left_out_with_a_note(
 ):
     lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
     lines = [line.replace("frame-", "other-") if line.startswith("p0,") else line for line in lines]
-    _, found = register.register_map(target, sights=_pairs(tmp_path, lines))
+    _, found = register.register_map(target, observations=_pairs(tmp_path, lines))
     assert found.report["points"] == 11
     assert any("'p0' left out: 0 of its" in note for note in found.notes)
 
@@ -178,7 +182,10 @@ def test_points_in_images_that_the_map_lacks_are_left_out_with_a_note(
 def test_an_image_is_known_without_its_suffix_and_folder(built, target, tmp_path, world_points):
     lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
     lines = [line.replace(",frame-", ",clicks/frame-") for line in lines]
-    assert register.register_map(target, sights=_pairs(tmp_path, lines))[1].report["points"] == 12
+    assert (
+        register.register_map(target, observations=_pairs(tmp_path, lines))[1].report["points"]
+        == 12
+    )
 
 
 @pytest.mark.parametrize(
@@ -186,14 +193,14 @@ def test_an_image_is_known_without_its_suffix_and_folder(built, target, tmp_path
     [
         ("", "'point' is missing"),
         ("point,image,u_px,v_px,x_m,y_m\n", "'z_m' is missing"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\n", "no sights"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4\n", "sight 1: numbers are needed"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,x\n", "sight 1: numbers are needed"),
-        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,nan\n", "sight 1: z_m is nan"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\n", "no observations"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4\n", "observation 1: numbers are needed"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,x\n", "observation 1: numbers are needed"),
+        ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,nan\n", "observation 1: z_m is nan"),
         ("point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,5\na,c,1,2,3,4,6\n", "'a' was at"),
         (
             "point,image,u_px,v_px,x_m,y_m,z_m\na,b,1,2,3,4,1e9\n",
-            "sight 1: z_m is 1e\\+09; allowed",
+            "observation 1: z_m is 1e\\+09; allowed",
         ),
         ("point,image,u_px,v_px,x_m,y_m,z_m\n,b,1,2,3,4,5\n", "column 'point' is empty"),
         ("z_m,image,u_px,v_px,x_m,y_m,point\n1,b,1,2,3,4\n", "column 'point' is empty"),
@@ -205,12 +212,12 @@ def test_a_pairs_file_that_is_wrong_is_refused_by_line(tmp_path, text, words):
     path = tmp_path / "PAIRS.csv"
     path.write_text(text)
     with pytest.raises(MapError, match=words) as caught:
-        sights.read_pairs(path)
+        observations.read_pairs(path)
     assert "\n" not in str(caught.value)
 
 
 def test_triangulation_scatters_as_its_covariance_says(built):
-    """Also the covariance of landmarks, which is the same matrix over the same kind of sights."""
+    """Also the covariance of landmarks, which is the same matrix over the same kind of pixels."""
     scene, rng = built.scene, np.random.default_rng(5)
     camera = scene.camera
     # The middle of the image only: the noise is added in distorted pixels, where the lens of the
@@ -221,9 +228,9 @@ def test_triangulation_scatters_as_its_covariance_says(built):
     found = []
     for _ in range(400):
         rays = camera.undistort(exact + rng.normal(size=exact.shape))
-        found.append(sights.triangulate(T, rays, camera))
+        found.append(observations.triangulate(T, rays, camera))
     scatter = np.cov(np.array(found).T)
-    _, J = sights.reproject(point, T, camera.undistort(exact), camera)
+    _, J = observations.reproject(point, T, camera.undistort(exact), camera)
     predicted = np.linalg.inv(np.einsum("ski,skj->ij", J, J))
     ratio = np.linalg.eigvals(np.linalg.solve(predicted, scatter)).real
     assert (ratio > 0.6).all() and (ratio < 1.6).all()

@@ -18,7 +18,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.map import store
 from ground_station.mapping.registration import command, tags
-from ground_station.mapping.registration.from_sights import by_sights
+from ground_station.mapping.registration.from_observations import by_observations
 from ground_station.mapping.registration.tags import FAMILIES, find_tags, read_tags
 from ground_station.recording.frames import Frame
 
@@ -136,8 +136,11 @@ def off_m(fit, flight) -> np.ndarray:
 def test_tags_put_the_map_into_the_world(flight, listed):
     seen = find_tags(flight.map, listed, flight.frames)
     assert not seen.notes
-    assert len(seen.sights.points) == 3 * 4 + 1 and len(set(seen.sights.group.tolist())) == 4
-    found = by_sights(flight.map, seen.sights, 0)
+    assert (
+        len(seen.observations.points) == 3 * 4 + 1
+        and len(set(seen.observations.group.tolist())) == 4
+    )
+    found = by_observations(flight.map, seen.observations, 0)
     assert off_m(found.fit, flight).max() < 0.02, found.report
     assert found.report["points"] == 13 and found.report["reprojection_rms_px"] < 0.5
     assert found.uncertainty.freedom == 3 * 4 - 7  # tags, not corners
@@ -149,7 +152,7 @@ def test_a_tag_that_was_hung_elsewhere_is_found_and_named(flight, listed):
     places = dict(listed.places)
     places[7] = places[7] + [0, 0, 1.0]
     seen = find_tags(flight.map, dataclasses.replace(listed, places=places), flight.frames)
-    found = by_sights(flight.map, seen.sights, 0)
+    found = by_observations(flight.map, seen.observations, 0)
     assert off_m(found.fit, flight).max() < 0.03
     assert found.report["points"] == 9
     assert {note.split(",")[0] for note in found.notes} == {"point 'tag 7"}
@@ -159,7 +162,9 @@ def test_tags_that_are_printed_turned_are_known_by_turn(flight, listed):
     """A quarter turn to the right: the list's top left is the print's bottom left."""
     places = {k: np.roll(p, 1, axis=0) if len(p) == 4 else p for k, p in listed.places.items()}
     turned = dataclasses.replace(listed, places=places, turn=1)
-    found = by_sights(flight.map, find_tags(flight.map, turned, flight.frames).sights, 0)
+    found = by_observations(
+        flight.map, find_tags(flight.map, turned, flight.frames).observations, 0
+    )
     assert off_m(found.fit, flight).max() < 0.02
 
 
@@ -189,7 +194,7 @@ def test_what_is_not_seen_seen_once_or_not_listed_is_noted(flight, listed):
     assert "tag 3 left out: it is seen in one image; two are needed" in notes
     assert "tag 55 left out: it is not seen in 6 images" in notes
     assert "tags that nobody listed are seen: 20" in notes
-    assert len(seen.sights.points) == 8
+    assert len(seen.observations.points) == 8
 
 
 def cover(image: np.ndarray, flight, k: int, corners: np.ndarray) -> None:
@@ -211,7 +216,7 @@ def test_two_tags_with_one_number_are_left_out(flight, listed):
         if k < 3:
             draw(frame.image, flight.rays, flight.wTc[k], listed.places[7], 11)
     seen = find_tags(flight.map, listed, apart)
-    assert any("tag 11 left out: its sights do not meet" in note for note in seen.notes)
+    assert any("tag 11 left out: its observations do not meet" in note for note in seen.notes)
 
 
 def test_the_wrong_family_frames_or_size_are_refused(flight, listed):
@@ -234,7 +239,8 @@ def test_images_of_a_map_of_several_inputs_have_the_inputs_name(flight, listed):
         info=flight.map.info, keyframes=Keyframes(names, flight.map.keyframes.wTc)
     )
     assert (
-        find_tags(map_, listed, flight.frames[:3], ["walk"]).sights.image[0] == "walk/frame-000000"
+        find_tags(map_, listed, flight.frames[:3], ["walk"]).observations.image[0]
+        == "walk/frame-000000"
     )
 
 
@@ -251,7 +257,7 @@ def test_a_folder_of_frames_is_looked_through(flight, tmp_path, monkeypatch, cap
     monkeypatch.setattr(store, "load", lambda _: map_)
     args = argparse.Namespace(map="m", tags=tmp_path / "TAGS.toml", frames=[str(folder)])
     seen = command._seen_tags(args)
-    assert set(seen.sights.image) == set(names[:4]) and not seen.notes
+    assert set(seen.observations.image) == set(names[:4]) and not seen.notes
 
 
 @pytest.mark.parametrize(

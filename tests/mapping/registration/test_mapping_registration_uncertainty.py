@@ -81,22 +81,22 @@ def test_near_and_far_points_weigh_by_both_noises():
     rng = np.random.default_rng(5)
     sigma = np.array([0.0005, 0.01, 0.01, 0.01, 0.02, 0.02])
     covariance = np.eye(3) * (sigma**2)[:, None, None]
-    by_sights, by_both, scatter = [], [], []
+    by_observations, by_both, scatter = [], [], []
     for _ in range(60):
         told = SIX + NOISE_M * rng.normal(size=SIX.shape)
         points = known(TRUTH, SIX, told, covariance=covariance)
         points.model[:] += sigma[:, None] * rng.normal(size=SIX.shape)
         weights = 1 / covariance[:, 0, 0]
         pixels_only = align(points.model, told, True, weights)
-        by_sights.append(off(pixels_only, PLACES)[0])
+        by_observations.append(off(pixels_only, PLACES)[0])
         found = adjust(pixels_only, points)
         by_both.append(off(found.fit, PLACES)[0])
         scatter.append(found.scatter_m)
-    assert np.median(by_both) < 0.85 * np.median(by_sights)
+    assert np.median(by_both) < 0.85 * np.median(by_observations)
     assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(NOISE_M, rel=0.15)
 
 
-def test_places_without_noise_weigh_by_their_sights_alone():
+def test_places_without_noise_weigh_by_their_observations_alone():
     rng = np.random.default_rng(6)
     sigma = np.array([0.002, 0.002, 0.002, 0.3, 0.3, 0.3])
     covariance = np.eye(3) * (sigma**2)[:, None, None]

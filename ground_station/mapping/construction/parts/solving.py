@@ -46,10 +46,10 @@ class Given:
 class Solved:
     """A part's largest model, in coordinates of its own.
 
-    `index` (K,) of its images in the build and their `wTc` (K, 4, 4); `position` (M, 3); sight o is
-    key point `feature[o]` of image `image[o]`, a place in `index`, and of point `point[o]`.
-    `pinhole` is fx, fy, cx, cy; `notes` are texts, what structure from motion has to say.
-    """
+    `index` (K,) of its images in the build and their `wTc` (K, 4, 4); `position` (M, 3);
+    observation o is key point `feature[o]` of image `image[o]`, a place in `index`, and of point
+    `point[o]`. `pinhole` is fx, fy, cx, cy; `notes` are texts, what structure from motion has to
+    say."""
 
     index: I64
     wTc: F64

@@ -1,4 +1,4 @@
-"""One model of joined parts: each image once, and each landmark with all its sights."""
+"""One model of joined parts: each image once, and each landmark with all its observations."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def unite(
     image = np.concatenate([part.index[part.image] for part in parts])
     feature = np.concatenate([part.feature for part in parts])
     point = np.concatenate([part.point + first for part, first in zip(parts, offset, strict=False)])
-    # Key points by number: the first sight of each decides where it belongs.
+    # Key points by number: the first observation of each decides where it belongs.
     starts = np.cumsum([0, *(len(pixels) for pixels in images.pinhole_px)])
     key = starts[image] + feature
     seen, first, place = np.unique(key, return_index=True, return_inverse=True)
@@ -73,7 +73,8 @@ def unite(
     _, landmark = connected_components(graph, directed=False)
     sums = np.stack([np.bincount(landmark, position[:, k]) for k in range(3)], axis=1)
     united = sums / np.bincount(landmark)[:, None]
-    # Of each key point one sight: the first. A landmark may have lost its others to another one.
+    # Of each key point one observation: the first. A landmark may have lost its others to another
+    # one.
     track = landmark[point[first]]
     first = first[np.bincount(track)[track] > 1]
     used, track = np.unique(landmark[point[first]], return_inverse=True)
@@ -104,11 +105,11 @@ def _poses(
     best: dict[int, tuple[bool, int]] = {}
     wTc: dict[int, F64] = {}
     for part, core, by in zip(parts, cores, at, strict=True):
-        sights = np.bincount(part.image, minlength=len(part.index)).tolist()
+        observations = np.bincount(part.image, minlength=len(part.index)).tolist()
         own = np.isin(part.index, core).tolist()
         moved = by.apply_poses(part.wTc)
         for n, k in enumerate(part.index.tolist()):
-            rank = own[n], sights[n]
+            rank = own[n], observations[n]
             if k not in best or rank > best[k]:
                 best[k], wTc[k] = rank, moved[n]
     index = np.array(sorted(wTc), dtype=np.int64)

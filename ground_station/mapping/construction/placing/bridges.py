@@ -1,9 +1,8 @@
 """Where a model hangs together by few landmarks, so that one part's scale says little of another's.
 
 Of two sets of images, scale is carried across by landmarks that both triangulate, each by two
-sights, or by two images of one set that stand each among the other's landmarks. Where there are too
-few, a bundle adjustment moves one set against the other for next to nothing.
-"""
+observations, or by two images of one set that stand each among the other's landmarks. Where there
+are too few, a bundle adjustment moves one set against the other for next to nothing."""
 
 from __future__ import annotations
 
@@ -33,9 +32,9 @@ def separated(model: Placed) -> list[set[int]]:
     seen = [model.landmark[k][model.landmark[k] >= 0] for k in index.tolist()]
     rows = np.repeat(np.arange(len(index)), [len(each) for each in seen])
     shape = len(index), len(model.position)
-    sights = csr_array((np.ones(len(rows)), (rows, np.concatenate(seen))), shape=shape)
-    sights.data[:] = 1.0
-    shared = csr_array(np.triu((sights @ sights.T).toarray(), 1))
+    observations = csr_array((np.ones(len(rows)), (rows, np.concatenate(seen))), shape=shape)
+    observations.data[:] = 1.0
+    shared = csr_array(np.triu((observations @ observations.T).toarray(), 1))
     # The tree of least weight has the largest counts when these are subtracted from a larger one.
     weight = csr_array(shared)
     weight.data = shared.data.max(initial=0.0) + 1.0 - shared.data
@@ -47,7 +46,7 @@ def separated(model: Placed) -> list[set[int]]:
         part = _components(edges[kept], len(index))
         sides = part == part[i], part == part[j]
         few = min(int(np.count_nonzero(side)) for side in sides) < _PART
-        kept[n] = few or _carries(sights[sides[0]], sights[sides[1]])
+        kept[n] = few or _carries(observations[sides[0]], observations[sides[1]])
     part = _components(edges[kept], len(index))
     sets = [{*index[part == number].tolist()} for number in np.unique(part).tolist()]
     return sorted(sets, key=lambda each: -len(each))

@@ -1,4 +1,4 @@
-"""Sightings without pictures: corners projected at their rows' times, with noise."""
+"""BoardObservations without pictures: corners projected at their rows' times, with noise."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy.typing as npt
 from board_views import Waypoints, project_rolling
 
 from ground_station.calibration.board import Board
-from ground_station.calibration.detection import Sighting
+from ground_station.calibration.detection import BoardObservation
 from ground_station.calibration.gather import Gathered
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
 BOARD = Board()
 
 
-def sighted(
+def observed(
     camera: Camera, motion: Waypoints, times_s: npt.ArrayLike, rng: np.random.Generator, *,
     noise_px: float = 0.08, board: Board = BOARD,
-) -> list[Sighting]:  # fmt: skip
+) -> list[BoardObservation]:  # fmt: skip
     """The board at those times, as a finder would give it; frames with too little left out."""
     points_m = board.points_m()
     found = []
@@ -30,10 +30,10 @@ def sighted(
         px = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
         H, _ = cv2.findHomography(points_m[ids, :2], px)
         time_ns = 10**18 + round(time_s * 1e9)
-        found.append(Sighting(0, index, f"frame-{index}", time_ns, ids, px, 30.0, 1.5, H))
+        found.append(BoardObservation(0, index, f"frame-{index}", time_ns, ids, px, 30.0, 1.5, H))
     return found
 
 
-def gathered(sightings: list[Sighting], camera: Camera = THESIS_CAMERA) -> Gathered:
-    """These sightings as what was seen."""
-    return Gathered(len(sightings), (camera.width_px, camera.height_px), sightings)
+def gathered(observations: list[BoardObservation], camera: Camera = THESIS_CAMERA) -> Gathered:
+    """These observations as what was seen."""
+    return Gathered(len(observations), (camera.width_px, camera.height_px), observations)

@@ -27,7 +27,7 @@ LOG_DISTANCE = np.log(1.5)
 FARTHEST = 2.5
 """A keyframe further aside than so many of these tells nothing."""
 PRIOR = 1.0
-"""A keyframe's worth of not having found it: one sight from right here is a chance of 1/2."""
+"""A keyframe's worth of not having found it: one observation from right here is a chance of 1/2."""
 
 MOST_LANDMARKS, MOST_KEYFRAMES = 20_000, 400
 """Of larger maps one in so many is looked at, which then stands for them."""
@@ -55,7 +55,7 @@ class View:
         return keep.reshape(shape)
 
 
-class Sightings:
+class Visibility:
     """Every landmark with the keyframes whose pictures it lies in, and whether they saw it.
 
     `rows` (M,) are the map's landmarks that are looked at, each of which stands for `weight`.
@@ -80,10 +80,10 @@ class Sightings:
         seen: list[Mask] = []
         for k in range(0, len(kf), max(1, -(-len(kf) // most_keyframes))):
             here = np.zeros(len(self.rows), bool)
-            sights = at[kf.landmark[kf.offset[k] : kf.offset[k + 1]]]
-            here[sights[sights >= 0]] = True
+            observations = at[kf.landmark[kf.offset[k] : kf.offset[k + 1]]]
+            here[observations[observations >= 0]] = True
             local = poses.transform(poses.inverse(kf.wTc[k]), self.position)
-            # A sight at the border may project just outside: it was seen all the same.
+            # An observation at the border may project just outside: it was seen all the same.
             shown = np.flatnonzero(view.inside(local) | here)
             landmark.append(shown)
             ray.append(kf.wTc[k, :3, 3] - self.position[shown])

@@ -1,4 +1,4 @@
-"""Sights of known points (PAIRS.csv) and their triangulation with a model's own poses."""
+"""Observations of known points (PAIRS.csv), and their triangulation with a model's own poses."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ COLUMNS = ("point", "image", "u_px", "v_px", "x_m", "y_m", "z_m")
 _SAME_POINT_M = 1e-6
 _HUBER_PX = 2.0
 _LEAST_PX = 0.1
-"""No sight is better than a tenth of a pixel, however well a few of them happen to meet."""
+"""No observation is better than a tenth of a pixel, however well a few of them happen to meet."""
 
 
 @dataclass(frozen=True)
-class Sights:
-    """S sights of P known points.
+class PointObservations:
+    """S observations of P known points.
 
     `points`, P names; `world_m` (P, 3); `point` (S,), an index into the points; `image`, S image
     names; `pixel_px` (S, 2), distorted pixels. Points that were measured as one thing, such as a
@@ -52,8 +52,8 @@ class Triangulated:
     """A known point found again in the model's coordinates.
 
     `name`; `world_m` (3,); `position` (3,) and `covariance` (3, 3) for 1 px of noise, model units;
-    `wTc` (S, 4, 4), the poses of its sights; `ray` (S, 2), on the plane z = 1; `error_px`, the RMS
-    of its sights' reprojection.
+    `wTc` (S, 4, 4), the poses that saw it; `ray` (S, 2), on the plane z = 1; `error_px`, the RMS of
+    its reprojection.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Triangulated:
     error_px: float
 
 
-def read_pairs(path: str | Path) -> Sights:
+def read_pairs(path: str | Path) -> PointObservations:
     """Reads `point,image,u_px,v_px,x_m,y_m,z_m` lines; raises `MapError` naming the line.
 
     So it does for a point that is seen twice in one image, and for two points at one place: of two
@@ -77,7 +77,7 @@ def read_pairs(path: str | Path) -> Sights:
     image: list[str] = []
     pixels: list[list[float]] = []
     seen: set[tuple[str, str]] = set()
-    for where, row in read_rows(path, COLUMNS, "sight"):
+    for where, row in read_rows(path, COLUMNS, "observation"):
         u, v, *xyz = numbers(row, COLUMNS[2:], where)
         name, picture = word(row, "point", where), word(row, "image", where)
         if name not in index:
@@ -92,7 +92,7 @@ def read_pairs(path: str | Path) -> Sights:
         image.append(picture)
         pixels.append([u, v])
     if not point:
-        raise MapError(f"{path}: it holds no sights")
+        raise MapError(f"{path}: it holds no observations")
     places: dict[tuple[float, ...], str] = {}
     for name, k in index.items():
         place = tuple(round(x / _SAME_POINT_M) for x in world[k])
@@ -101,7 +101,7 @@ def read_pairs(path: str | Path) -> Sights:
                 f"{path}: the points '{places[place]}' and '{name}' are at the same place"
             )
         places[place] = name
-    return Sights(
+    return PointObservations(
         points=list(index),
         world_m=np.array(world),
         point=np.array(point, dtype=np.int64),
@@ -110,8 +110,8 @@ def read_pairs(path: str | Path) -> Sights:
     )
 
 
-def triangulate_sights(
-    sights: Sights, names: list[str], wTc: F64, camera: Camera
+def triangulate_observations(
+    observations: PointObservations, names: list[str], wTc: F64, camera: Camera
 ) -> tuple[list[Triangulated], list[str]]:
     """The points that at least two images of a model see, and a note for each that had to go.
 
@@ -121,17 +121,19 @@ def triangulate_sights(
     lookup = lookup_images(names)
     found: list[Triangulated] = []
     notes: list[str] = []
-    rays = camera.undistort(sights.pixel_px)
-    for p, name in enumerate(sights.points):
-        mine = np.flatnonzero(sights.point == p)
+    rays = camera.undistort(observations.pixel_px)
+    for p, name in enumerate(observations.points):
+        mine = np.flatnonzero(observations.point == p)
         within = mine[np.isfinite(rays[mine]).all(axis=1)]
         if len(within) < len(mine):
             notes.append(
-                f"point '{name}': {len(mine) - len(within)} of its {len(mine)} sights are too near "
-                "to the rim of a fisheye's picture to be used: click it nearer to the middle"
+                f"point '{name}': {len(mine) - len(within)} of its {len(mine)} observations are "
+                "too near the rim of a fisheye's picture to be used: click it nearer to the middle"
             )
         mine = within
-        known = [(s, lookup[key]) for s in mine if (key := known_image(sights.image[s], lookup))]
+        known = [
+            (s, lookup[key]) for s in mine if (key := known_image(observations.image[s], lookup))
+        ]
         if len({k for _, k in known}) < 2:
             notes.append(
                 f"point '{name}' left out: {len(known)} of its {len(mine)} images are in the map"
@@ -140,14 +142,16 @@ def triangulate_sights(
         T, ray = wTc[[k for _, k in known]], rays[[s for s, _ in known]]
         position = triangulate(T, ray, camera)
         if position is None:
-            notes.append(f"point '{name}' left out: its sights do not meet in front of the cameras")
+            notes.append(
+                f"point '{name}' left out: its observations do not meet in front of the cameras"
+            )
             continue
         residual, J = reproject(position, T, ray, camera)
         information = np.einsum("ski,skj->ij", J, J)
         found.append(
             Triangulated(
                 name=name,
-                world_m=sights.world_m[p],
+                world_m=observations.world_m[p],
                 position=position,
                 covariance=np.linalg.pinv(information),
                 wTc=T,
@@ -204,7 +208,7 @@ def reproject(X: F64, wTc: F64, rays: F64, camera: Camera) -> tuple[F64, F64]:
 
 
 def sigma_px(points: Sequence[Triangulated]) -> float:
-    """The standard deviation of a sight's coordinate, pixels: what the triangulation leaves."""
+    """The deviation of an observation's coordinate, pixels: what the triangulation leaves."""
     squares = sum(len(point.ray) * point.error_px**2 for point in points)
     freedom = sum(2 * len(point.ray) - 3 for point in points)
     return max(float(np.sqrt(squares / max(freedom, 1))), _LEAST_PX)

@@ -1,4 +1,4 @@
-"""The similarity from sights of known points in the map's images."""
+"""The similarity from observations of known points in the map's images."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map
 from ground_station.mapping.registration.adjustment import KnownPoints, adjust, adjust_agreeing
+from ground_station.mapping.registration.observations import (
+    PointObservations,
+    Triangulated,
+    reproject,
+    sigma_px,
+    triangulate_observations,
+)
 from ground_station.mapping.registration.registration import (
     Registration,
     listed,
     rms,
     similarity_report,
-)
-from ground_station.mapping.registration.sights import (
-    Sights,
-    Triangulated,
-    reproject,
-    sigma_px,
-    triangulate_sights,
 )
 from ground_station.mapping.registration.similarity import (
     MIN_POINTS,
@@ -36,22 +36,21 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 
-def by_sights(map_: Map, sights: Sights, seed: int) -> Registration:
-    """The similarity from sights of known points, triangulated with the map's own poses.
+def by_observations(map_: Map, observations: PointObservations, seed: int) -> Registration:
+    """The similarity from observations of known points, triangulated with the map's own poses.
 
     The points that agree are found first (`robust_similarity`); those are adjusted, weighted by the
-    sights' geometry and by what the places scatter (`adjust`). Each thing that was measured, a
-    point or a tag, is also held out once.
-    """
+    observations' geometry and by what the places scatter (`adjust`). Each thing that was measured,
+    a point or a tag, is also held out once."""
     camera, kf = map_.info.camera, map_.keyframes
-    found, notes = triangulate_sights(sights, kf.names, kf.wTc, camera)
-    what = f"of {len(sights.points)} points could be triangulated"
+    found, notes = triangulate_observations(observations, kf.names, kf.wTc, camera)
+    what = f"of {len(observations.points)} points could be triangulated"
     if len(found) < MIN_POINTS:
         raise MapError(
             f"registration: {len(found)} {what}; at least {MIN_POINTS} are needed"
             + (f" ({notes[0]})" if notes else "")
         )
-    points = _known(found, sights, sigma_px(found))
+    points = _known(found, observations, sigma_px(found))
     plain, agree = robust_similarity(points.model, points.world, _noise(points), seed, "points")
     adjusted, agree = adjust_agreeing(plain, points, agree)
     far = _errors(adjusted.fit, points)
@@ -62,13 +61,13 @@ def by_sights(map_: Map, sights: Sights, seed: int) -> Registration:
     fit = adjusted.fit
     held, scales = _held_out(used)
     report: dict[str, Any] = {
-        "method": "sights",
+        "method": "observations",
         "points": len(used),
-        "points_given": len(sights.points),
-        "sights": sum(len(point.ray) for point in names),
+        "points_given": len(observations.points),
+        "observations": sum(len(point.ray) for point in names),
         **listed([point.name for point in names], _errors(fit, used), held),
         "reprojection_rms_px": _reprojection_px(fit, names, camera),
-        "sight_sigma_px": sigma_px(names),
+        "observation_sigma_px": sigma_px(names),
         "point_sigma_m": adjusted.scatter_m,
         **similarity_report(fit, scales),
     }
@@ -80,8 +79,10 @@ def by_sights(map_: Map, sights: Sights, seed: int) -> Registration:
     return Registration(fit, report, adjusted.uncertainty, notes)
 
 
-def _known(found: Sequence[Triangulated], sights: Sights, sigma: float) -> KnownPoints:
-    group = dict(zip(sights.points, sights.group.tolist(), strict=True))
+def _known(
+    found: Sequence[Triangulated], observations: PointObservations, sigma: float
+) -> KnownPoints:
+    group = dict(zip(observations.points, observations.group.tolist(), strict=True))
     return KnownPoints(
         model=np.array([point.position for point in found]),
         covariance=sigma**2 * np.array([point.covariance for point in found]),
@@ -120,7 +121,7 @@ def _errors(fit: Alignment, points: KnownPoints) -> F64:
 
 
 def _reprojection_px(fit: Alignment, points: Sequence[Triangulated], camera: Camera) -> float:
-    """How far the world's points lie from their sights, RMS, undistorted pixels."""
+    """How far the world's points lie from their observations, RMS, undistorted pixels."""
     off = []
     for point in points:
         X = fit.rotation.T @ (point.world_m - fit.translation) / fit.scale
