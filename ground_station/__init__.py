@@ -2,7 +2,7 @@
 
 import os
 
-__version__ = "0.1.0"
+from pi_firmware import __version__ as __version__
 
 # OpenCV reads it when it is imported: no picture here has more pixels, and a small file of zeros
 # could else ask for a gigabyte.

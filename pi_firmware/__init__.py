@@ -1,3 +1,3 @@
 """What runs on the payload: camera, gate, encoder, stream, battery and telemetry."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

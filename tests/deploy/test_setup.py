@@ -7,6 +7,9 @@ import subprocess
 import tomllib
 from pathlib import Path
 
+import ground_station
+import pi_firmware
+
 ROOT = Path(__file__).parents[2]
 LOCK = (ROOT / "requirements.lock").read_text()
 
@@ -27,6 +30,12 @@ def test_every_direct_dependency_is_locked() -> None:
     for requirement in wanted:
         name = re.split(r"[<>=!\[ ;]", requirement)[0].lower()
         assert name in locked, f"{requirement} is not in requirements.lock: run `make lock`"
+
+
+def test_one_version_counts_and_its_changes_are_told() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    told = re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert project["version"] == pi_firmware.__version__ == ground_station.__version__ == told[0]
 
 
 def test_setup_refuses_an_old_python_in_one_line(tmp_path: Path) -> None:
