@@ -51,7 +51,8 @@ uninstall-service:  ## Take the service away; configuration and recordings stay
 	@sh deploy/ground_station/service.sh uninstall
 
 test: setup  ## Run the tests of every room
-	@failed=0; \
+	@sh tests/tools.sh
+	@failed=0; export PATH="$(CURDIR)/out/sshd/usr/sbin:$$PATH"; \
 	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
 	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 2 --dist loadfile tests || failed=1; \
 	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
