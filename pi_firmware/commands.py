@@ -18,6 +18,9 @@ from pi_firmware.wire.messages import Answer, Command
 _WAITING = 8
 _JOIN_LIMIT_S = 2.0
 
+FORCED = "forced"
+"""Among the values of what was done although it is refused otherwise."""
+
 Values = Mapping[str, float]
 
 
@@ -82,7 +85,8 @@ class Commands:
                 continue
             done = self.carry_out(name, command)
             answer(done)
-            self._announce(f"{name}: {'done' if done.done else done.reason}")
+            forced = ", forced" if FORCED in done.values else ""
+            self._announce(f"{name}: {'done' if done.done else done.reason}{forced}")
 
     def _checked(self, name: str) -> Action:
         if name not in self._actions:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from pi_firmware.capture import Capture
-from pi_firmware.commands import Action, Refusal, Values
+from pi_firmware.commands import FORCED, Action, Refusal, Values
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import CameraSettings, EncoderSettings, Settings
 from pi_firmware.wire.config import range_of
@@ -19,8 +19,12 @@ def table(
     capture: Capture,
     recorder: Recorder,
     end: Callable[[list[str]], object],
+    armed: Callable[[], bool],
 ) -> dict[str, Action]:
-    """The commands by name; `end` ends the flight and then runs the words it is given."""
+    """The commands by name; `end` ends the flight and then runs the words it is given.
+
+    Those that interrupt the video are refused while the autopilot is `armed`, unless `force` is 1.
+    """
 
     def set_bitrate(kbps: float) -> Values:
         return {"kbps": capture.set_bitrate(round(kbps))}
@@ -55,6 +59,17 @@ def table(
 
         return run
 
+    def disarmed(
+        run: Callable[..., Values | None], numbers: Mapping[str, tuple[float, float]] = {}
+    ) -> Action:
+        def guarded(force: float = 0, **given: float) -> Values:
+            if armed() and not force:
+                raise Refusal("the autopilot is armed: disarm it, or say force=1")
+            values = run(**given) or {}
+            return {**values, FORCED: 1} if force else values
+
+        return Action(guarded, {**numbers, "force": (0, 1)})
+
     slowest, _ = range_of(EncoderSettings, "min_bitrate_kbps")
     _, fastest = range_of(EncoderSettings, "bitrate_kbps")
     exposures = {name: range_of(CameraSettings, name) for name in ("exposure_s", "gain")}
@@ -63,9 +78,9 @@ def table(
     return {
         "idr": Action(capture.force_idr),
         "bitrate": Action(set_bitrate, {"kbps": (slowest, fastest)}, frozenset({"kbps"})),
-        "exposure": Action(expose, exposures),
+        "exposure": disarmed(expose, exposures),
         "record-start": Action(record),
         "record-stop": Action(end_recording),
-        "shutdown": Action(off),
-        "reboot": Action(anew),
+        "shutdown": disarmed(off),
+        "reboot": disarmed(anew),
     }

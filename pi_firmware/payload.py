@@ -88,7 +88,9 @@ class Payload:
             on_low=self._capture.limit_bitrate,
         )
         self._commands = Commands(
-            orders.table(settings, self._capture, self._recorder, self._end),
+            orders.table(
+                settings, self._capture, self._recorder, self._end, lambda: self._autopilot.armed
+            ),
             lambda text: self._reporter.announce(messages.EVENT_COMMAND, text),
         )
 
@@ -106,7 +108,9 @@ class Payload:
             self._capture.start()
             if self.settings.recording.at_start:
                 threading.Thread(target=self._record_at_start, name="record", daemon=True).start()
-            self._supervision.start(self._capture, self._ground, self._recorder, self._telemetry)
+            self._supervision.start(
+                self._capture, self._ground, self._recorder, self._telemetry, self._autopilot
+            )
             self._battery.start(on_critical=self._on_critical)
             self._autopilot.start()
             self._telemetry.on_pose(self._on_pose)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+from pi_firmware.autopilot import Autopilot
 from pi_firmware.capture import Capture
 from pi_firmware.ground import Ground
 from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi, memory
@@ -25,8 +26,8 @@ _FEED_S = 1.0
 _CLOCK_S = 10.0
 _MEMORY_S = 60.0
 _SILENCE_S = 5.0  # before that a ground station may only be slow
-TELEMETRY_UP, TELEMETRY_DOWN = "telemetry up", "telemetry down"
-"""What systemd's status line says; whoever tries out a new release looks for it."""
+TELEMETRY_UP, TELEMETRY_DOWN, ARMED = "telemetry up", "telemetry down", "autopilot armed"
+"""What systemd's status line says; whoever brings or tries out a new release looks for it."""
 _GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
 
 
@@ -91,14 +92,20 @@ class Supervision:
         return self._may_reboot(ending=True)
 
     def start(
-        self, capture: Capture, ground: Ground, recorder: Recorder, telemetry: Telemetry
+        self,
+        capture: Capture,
+        ground: Ground,
+        recorder: Recorder,
+        telemetry: Telemetry,
+        autopilot: Autopilot,
     ) -> None:
         """Starts the threads that publish health, ask for the ground's time and tidy up."""
 
         def publish() -> None:
             self.wifi.step()
             telemetry.health(self.health(capture, ground, recorder))
-            self._tell_systemd(TELEMETRY_DOWN if ground.seen is None else TELEMETRY_UP)
+            heard = TELEMETRY_DOWN if ground.seen is None else TELEMETRY_UP
+            self._tell_systemd(f"{heard}; {ARMED}" if autopilot.armed else heard)
 
         def ask() -> None:
             trip = telemetry.ask_time()

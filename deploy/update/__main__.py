@@ -51,6 +51,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--allow-older", action="store_true", help="may replace the newer version that runs now"
     )
+    parser.add_argument(
+        "--force", action="store_true", help="also while its autopilot is armed: video stops"
+    )
     return parser
 
 
@@ -94,7 +97,7 @@ def _update(given: argparse.Namespace) -> int:
     size = bundles.size_to_send(made, held)
     version = made.listed.release.version
     with Progress(f"sending {version}", size) as progress:
-        answer = card.give(made, held, progress.advance)
+        answer = card.give(made, held, progress.advance, force=given.force)
     if not answer.get("id"):
         _say(f"{version} is in force already")
         return 0

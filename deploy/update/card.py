@@ -96,7 +96,12 @@ class Card:
         return self._answer(done.returncode, done.stdout, done.stderr)
 
     def give(
-        self, bundle: Bundle, held: Mapping[str, str], wrote: Callable[[int], None]
+        self,
+        bundle: Bundle,
+        held: Mapping[str, str],
+        wrote: Callable[[int], None],
+        *,
+        force: bool = False,
     ) -> dict[str, Any]:
         """Sends a bundle and gives the card's `version` and `id` of the trial ('': in force).
 
@@ -104,7 +109,7 @@ class Card:
         then the card is as it was, or tries the release out, which `status` tells.
         """
         process = subprocess.Popen(
-            self._command("receive"),
+            self._command("receive", *(["--force"] if force else [])),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -168,8 +173,8 @@ class Card:
             f"{f' ({fault})' if fault else ''}; the card decides by itself, ask again"
         )
 
-    def _command(self, action: str) -> list[str]:
-        return [*self._words, "--", self.host, f"{_PROGRAM} {shlex.quote(action)}"]
+    def _command(self, *words: str) -> list[str]:
+        return [*self._words, "--", self.host, f"{_PROGRAM} {shlex.join(words)}"]
 
     def _answer(self, status: int, out: bytes, err: bytes) -> dict[str, Any]:
         lines = [line for line in err.decode(errors="replace").splitlines() if line.strip()]

@@ -16,7 +16,8 @@ examples:
   blimp command blimp-1 record-start --certificates ~/keys/ground/main --connect tls/10.0.0.1:7447
 
 record-start, record-stop, idr, shutdown and reboot take no numbers; bitrate takes kbps, exposure
-takes exposure_s and gain (0: automatic). The payload refuses what is out of its range.
+takes exposure_s and gain (0: automatic). The payload refuses what is out of its range, and while
+its autopilot is armed exposure, shutdown and reboot, unless force=1 is given.
 
 Payloads connect to the ground station. Where none runs, the command listens in its place; where
 one does, give its endpoint, or one that the payload listens on, to --connect.

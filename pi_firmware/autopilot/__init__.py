@@ -15,7 +15,12 @@ _SERIAL = ("baud", "system", "component")
 
 
 class Autopilot(Protocol):
-    """Anything that takes poses; no method waits for a device."""
+    """Anything that takes poses; no method waits for a device.
+
+    `armed`: it said so last, though it may be silent since.
+    """
+
+    armed: bool
 
     def start(self) -> None:
         """Begins to talk to it."""
@@ -32,6 +37,8 @@ class Autopilot(Protocol):
 
 class NoAutopilot:
     """`off:`: poses go nowhere."""
+
+    armed = False
 
     def start(self) -> None:
         """Nothing to begin."""

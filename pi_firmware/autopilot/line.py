@@ -45,6 +45,7 @@ class SerialAutopilot:
         component: int,
         publish: Callable[[State], None],
     ) -> None:
+        self.armed = False
         self.poses = PoseGate(settings)
         self._settings = settings
         self._path, self._baud = path, baud
@@ -187,8 +188,9 @@ class SerialAutopilot:
         if kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
             self._heard_s = time.monotonic()
             self._heartbeats += 1
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             self._values |= {
-                "armed": bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+                "armed": self.armed,
                 "mode": int(message.custom_mode),
                 "system_status": int(message.system_status),
             }

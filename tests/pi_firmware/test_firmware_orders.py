@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 from flying import ALL_FRAMES, Flying, numbers
+from vehicle import Vehicle
 
 from ground_station.stream import commands
-from ground_station.stream.telemetry import TelemetryListener
+from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import settings
 from pi_firmware.payload import Payload
 from pi_firmware.recording import Recorder
@@ -129,6 +131,35 @@ def test_the_board_ends_by_command_after_all_else(
     (path,) = seen.glob("*.mcap")  # whole already when the command ran
     reader = RecordingReader(path)
     assert len(list(reader.video())) >= 30 and not reader.cut
+
+
+def test_an_armed_vehicle_keeps_its_video_unless_forced(flying: Flying, tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "tty")
+
+    def says(state: PayloadState, *, armed: bool) -> bool:
+        vehicle.live(armed)
+        return state.autopilot is not None and state.autopilot.armed is armed
+
+    flown(
+        flying,
+        f"autopilot.uri=serial:{vehicle.link}",
+        "autopilot.period_s=0.1",
+        "supervision.period_s=0.2",
+        'battery.shutdown_command=["true"]',
+        'supervision.reboot_command=["true"]',
+    )
+    flying.state(partial(says, armed=True))
+    for name, given in (("shutdown", {}), ("reboot", {"force": 0}), ("exposure", {"gain": 2})):
+        refused = ask(flying, name, **given)
+        assert not refused.done and "armed: disarm it, or say force=1" in refused.reason
+    assert ask(flying, "exposure", gain=2, force=1).values["forced"] == 1
+    flying.state(lambda s: any(e.text == "exposure: done, forced" for e in s.events))
+    # What an update looks for.
+    flying.state(lambda s: any("autopilot armed" in line for line in flying.said()))
+    flying.state(partial(says, armed=False))
+    assert "forced" not in ask(flying, "exposure", gain=1).values
+    flying.end()
+    vehicle.unplug()
 
 
 def test_a_board_that_knows_no_way_to_end_refuses(flying: Flying) -> None:

@@ -78,6 +78,7 @@ def test_the_program_tells_its_release_and_why_an_update_did_not_stay(
             lines += flying.said()
     # What tries out a release on the card reads this very line.
     assert supervision.TELEMETRY_UP == service.TELEMETRY_UP
+    assert supervision.ARMED == service.ARMED
     told_systemd = [line for line in lines if line.startswith("STATUS=")]
     assert told_systemd in ([f"{before} down", f"{before} up"], [f"{before} up"])
     assert lines.index("READY=1") < lines.index(told_systemd[0])

@@ -24,12 +24,13 @@ def main() -> int:
         choices=("receive", "watch", "status", "holds"),
         help="take a bundle from standard input; watch a trial; tell what runs; tell the files",
     )
+    parser.add_argument("--force", action="store_true", help="receive while the autopilot is armed")
     given = parser.parse_args()
     os.umask(0o022)  # the firmware's user reads what root writes
     at, service = Places(given.root), Service()
     try:
         if given.action == "receive":
-            answer = receive.receive(at, sys.stdin.buffer, service)
+            answer = receive.receive(at, sys.stdin.buffer, service, force=given.force)
         elif given.action == "watch":
             watch.watch(at, service, lambda line: print(line, flush=True))
             return 0

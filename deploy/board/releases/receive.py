@@ -29,19 +29,23 @@ _FILE_SYSTEM_BYTES = 4096  # what a file takes beside its content, at most
 _SPARE_BYTES = 4 << 20
 
 
-def receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
+def receive(
+    at: Places, stream: BinaryIO, service: Service, *, force: bool = False
+) -> dict[str, Any]:
     """Takes a bundle and switches to it, on trial; gives its `version` and the trial's `id`.
 
-    Raises `DeployError` with one line, and the card is as it was.
+    While the autopilot is armed only with `force`: the firmware is started anew. Raises
+    `DeployError` with one line, and the card is as it was.
     """
     with shelf.lock(at):
         try:
-            return _receive(at, stream, service)
+            return _receive(at, stream, service, force)
         except OSError as error:
             raise DeployError(f"{error.filename or at.releases}: {error.strerror}") from None
 
 
-def _receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
+def _receive(at: Places, stream: BinaryIO, service: Service, force: bool) -> dict[str, Any]:
+    _check_disarmed(service, force)
     if (trial := shelf.settle(at, service)) is not None:
         raise DeployError(f"{trial['release']} is still on trial; wait until that is decided")
     shelf.prune(at)
@@ -65,6 +69,7 @@ def _receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
         _compile(part, at.folder(name))
         if at.folder(name).is_dir():  # not the one in force
             shelf.discard(at.folder(name))
+        _check_disarmed(service, force)  # sending takes minutes
         part.rename(at.folder(name))
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
@@ -73,6 +78,11 @@ def _receive(at: Places, stream: BinaryIO, service: Service) -> dict[str, Any]:
     trial_id = shelf.begin(at, name, telemetry=service.seen().telemetry)
     service.watch()
     return {"version": name, "id": trial_id}
+
+
+def _check_disarmed(service: Service, force: bool) -> None:
+    if not force and service.seen().armed:
+        raise DeployError("the autopilot is armed: disarm it, or say --force")
 
 
 def _named(members: Iterator[Member], name: str) -> Member:

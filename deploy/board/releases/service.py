@@ -10,6 +10,8 @@ UNIT = "blimp-payload.service"
 WATCH = "blimp-release-watch.service"
 TELEMETRY_UP = "telemetry up"
 """What the firmware's status line says while a ground station reports its video."""
+ARMED = "autopilot armed"
+"""What it says while the autopilot is."""
 _COMMAND_S = 20.0
 _NAMES = (
     "ActiveState,SubState,NRestarts,StatusText,Result,ExecMainStatus,ActiveEnterTimestampMonotonic"
@@ -24,6 +26,7 @@ class Seen(NamedTuple):
     restarts: int = 0
     telemetry: bool = False
     said: str = "unknown"
+    armed: bool = False
 
 
 class Service:
@@ -75,4 +78,5 @@ def judge(shown: str, now_s: float) -> Seen:
         int(restarts) if restarts.isdigit() else 0,
         TELEMETRY_UP in found.get("StatusText", ""),
         said,
+        active and ARMED in found.get("StatusText", ""),
     )

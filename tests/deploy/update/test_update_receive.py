@@ -1,6 +1,7 @@
 """A card takes a good bundle whole; any other one, a full card or a power cut leaves it sound."""
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -67,6 +68,18 @@ def test_a_wrong_signature_is_refused(card: Card, tmp_path: Path) -> None:
     refused(card, tar_of(long), "allowed: 8192")
 
 
+def test_an_armed_vehicle_takes_an_update_only_when_forced(card: Card) -> None:
+    disarmed = card.service.now
+    card.service.now = disarmed._replace(armed=True)
+    refused(card, card.bundle(contents(NEW)), "armed: disarm it, or say --force")
+    looks = iter((disarmed, card.service.now))
+    card.service.seen = lambda: next(looks)  # type: ignore[method-assign]  # armed while it came
+    refused(card, card.bundle(contents(NEW)), "armed")
+    del card.service.seen
+    stream = io.BytesIO(card.bundle(contents(NEW)))
+    assert receive.receive(card.at, stream, card.service, force=True)["version"] == NEW  # type: ignore[arg-type]
+
+
 def test_a_signature_for_something_else_is_refused(card: Card, tmp_path: Path) -> None:
     good = bundles.make(contents(NEW), card.key)
     path = tmp_path / "manifest.json"
@@ -113,7 +126,6 @@ def test_files_other_than_the_list_are_refused(
     card: Card, change: Callable[[dict[str, bytes]], dict[str, bytes]], said: str
 ) -> None:
     """The list is signed; what follows it is not."""
-    import io
     import tarfile
 
     good = bundles.make(contents(NEW), card.key)

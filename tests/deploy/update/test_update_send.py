@@ -38,9 +38,9 @@ esac
 PROGRAM = """#!/bin/sh
 printf '%s\\n' "$*" >>"$CARD/asked"
 [ ! -e "$CARD/unreachable" ] || { echo 'ssh: connect to host x: No route to host' >&2; exit 255; }
-for word in ${SSH_ORIGINAL_COMMAND:-$*}; do action=$word; done
+words=${SSH_ORIGINAL_COMMAND:-$*}; words=${words##*deploy.board.releases }; action=${words%% *}
 [ "$action" != receive ] || [ ! -e "$CARD/cut" ] || { head -c 5000 >/dev/null; exit 255; }
-exec "$PYTHON" -m deploy.board.releases --root "$CARD" "$action"
+exec "$PYTHON" -m deploy.board.releases --root "$CARD" $words
 """
 
 
@@ -281,8 +281,9 @@ def test_over_a_real_sshd(
     assert (stand.card.at.folder(NEW) / "site/big").read_bytes() == big["site/big"]
     # A refusal comes back as the card's own words, though the rest of the bundle is not read.
     stranger = bundles.make(contents("0.9.0", big), other_keys / "releases/1")
-    with pytest.raises(DeployError, match="blimp-1 refuses: the bundle's signature is of no"):
-        card.give(stranger, {}, sizes.append)
+    for force in (False, True):
+        with pytest.raises(DeployError, match="blimp-1 refuses: the bundle's signature is of no"):
+            card.give(stranger, {}, sizes.append, force=force)
     # Another host key than the payload's own is refused.
     other = Path(shutil.copytree(other_keys, tmp_path / "other"))
     own = stand.keys / "ground/main/ssh_ed25519"

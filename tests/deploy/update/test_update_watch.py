@@ -67,6 +67,10 @@ def test_the_decision(
             Seen(True, 60.0, 2, True, "active"),
         ),
         (
+            "ActiveState=active\nStatusText=version 1; telemetry up; autopilot armed\n",
+            Seen(True, telemetry=True, said="active", armed=True),
+        ),
+        (
             "ActiveState=activating\nNRestarts=1\nResult=exit-code\nExecMainStatus=2\n"
             "StatusText=version 1; telemetry down\n",
             Seen(False, 0.0, 1, False, "activating, exit-code, status 2"),
