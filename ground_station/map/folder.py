@@ -68,13 +68,12 @@ def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         yield part
-        for path in part.rglob("*"):
-            files.sync(path)
-        files.sync(part)
+        files.sync_all(part)
         if folder.exists():
             for entry in folder.iterdir():
                 if entry.name not in (*_OURS, PICTURE) and not (part / entry.name).exists():
                     _keep(entry, part / entry.name)
+            files.sync(part)
             if keep is None:
                 shutil.rmtree(old, ignore_errors=True)
             _swap(part, folder, old)
@@ -114,10 +113,11 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def _keep(source: Path, target: Path) -> None:
-    if source.is_dir():
-        shutil.copytree(source, target, symlinks=True)
-        return
     try:
         os.link(source, target, follow_symlinks=False)
-    except OSError:  # a file system without hard links
-        shutil.copy2(source, target, follow_symlinks=False)
+    except OSError:  # a folder, or a file system without hard links
+        if source.is_dir() and not source.is_symlink():
+            shutil.copytree(source, target, symlinks=True)
+        else:
+            shutil.copy2(source, target, follow_symlinks=False)
+        files.sync_all(target)

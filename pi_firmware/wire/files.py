@@ -42,10 +42,17 @@ def write(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 
 def replace(part: Path, path: Path) -> None:
-    """Gives a file that is written its name, or a folder whose files are; raises `OSError`."""
-    sync(part)
+    """Gives a file that is written its name, or a folder with all in it; raises `OSError`."""
+    sync_all(part)
     part.replace(path)
     sync(path.parent)
+
+
+def sync_all(path: Path) -> None:
+    """Brings a file, or a folder with all files and folders in it, to the disk."""
+    for entry in (*path.rglob("*"), path):
+        if not entry.is_symlink() and (entry.is_file() or entry.is_dir()):
+            sync(entry)
 
 
 def sync(path: Path) -> None:

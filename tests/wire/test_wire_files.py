@@ -39,6 +39,15 @@ def test_a_file_is_synced_then_renamed_then_its_folder_is_synced(tmp_path, calls
     assert [p.name for p in tmp_path.iterdir()] == ["state.json"]
 
 
+def test_all_of_a_folder_is_synced_before_it_is_renamed(tmp_path, calls):
+    (tmp_path / "new/in").mkdir(parents=True)
+    (tmp_path / "new/in/points.bin").write_bytes(b"1")
+    (tmp_path / "new/gone").symlink_to("nowhere")
+    files.replace(tmp_path / "new", tmp_path / "model")
+    synced = calls[: calls.index(("rename", "model"))]
+    assert {name for _, name in synced} == {"points.bin", "in", "new"}
+
+
 def test_what_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     path = tmp_path / "map.toml"
     path.write_text("old")

@@ -9,6 +9,7 @@ from pathlib import Path
 from ground_station.errors import MapError
 from ground_station.files import write_json
 from ground_station.map import colmap, colmap_files
+from pi_firmware.wire import files
 
 _KEPT = 2
 """The newest and the one before: after a power cut the newest may hold nothing."""
@@ -37,7 +38,7 @@ class Snapshots:
         colmap.write(model, part)
         write_json(part / _STATE, state)
         shutil.rmtree(target, ignore_errors=True)
-        part.rename(target)
+        files.replace(part, target)
 
     def load(self, name: str) -> tuple[colmap.Reconstruction, State] | None:
         """The model of that name and its state; None where there is none that is whole."""

@@ -21,6 +21,7 @@ from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.structure import reconstruct
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
+from pi_firmware.wire import files
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -119,10 +120,8 @@ def _solved(
 
 
 def _write(path: Path, solved: Solved) -> None:
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with files.replacing(path) as part, part.open("wb") as file:
         np.savez(file, **{name: getattr(solved, name) for name in _ARRAYS})
-    part.replace(path)
 
 
 def _read(path: Path) -> Solved | None:
