@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from deploy.board.disk import read_bounded
+
 if TYPE_CHECKING:
     from typing import Any
 
@@ -84,8 +86,7 @@ def is_name(name: str) -> bool:
 def read(path: Path) -> dict[str, Any] | None:
     """A JSON object from a file; None for anything else, absent or damaged."""
     try:
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
+        data = read_bounded(path, _MOST_BYTES) or b""  # /run/blimp is the firmware's folder
         document = json.loads(data) if len(data) <= _MOST_BYTES else None
     except (OSError, ValueError, RecursionError):
         return None

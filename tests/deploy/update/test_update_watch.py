@@ -1,6 +1,7 @@
 """A new release stays when frames come and keep coming; otherwise the card goes back, with why."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -277,3 +278,14 @@ def test_status_tells_what_runs_and_what_became_of_the_last_one(card: Card) -> N
     status = watch.status(card.at)
     assert status["in_force"]["version"] == status["in_force"]["name"] == NEW
     assert status["last"]["outcome"] == HEALTHY and json.dumps(status)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link"])
+def test_what_the_firmware_lays_into_its_folder_holds_up_no_root(card: Card, kind: str) -> None:
+    if kind == "pipe":
+        os.mkfifo(card.at.running)
+    else:
+        secret = card.root / "secret.json"
+        secret.write_text('{"release": "of root"}')
+        card.at.running.symlink_to(secret)
+    assert watch.status(card.at)["running"] is None
