@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from pathlib import Path
 
 from deploy.board.releases import choose, places
 from deploy.board.releases.places import Places
@@ -18,15 +19,24 @@ ENVIRONMENT = "BLIMP_RELEASE"
 
 
 def choice(at: Places, state: choose.State) -> choose.Choice:
-    """The release to start now; counts the start of one under trial."""
-    if state.on_trial and state.trial is not None and 0 <= state.starts < choose.STARTS:
-        counted = {"id": state.trial["id"], "starts": state.starts + 1}
-        try:
-            places.write(at.starts, counted)
-        except OSError as error:
-            print(f"start: {at.starts}: {error.strerror}", file=sys.stderr)
+    """The release to start now; counts the start of an update, which its first frame forgets."""
+    if state.on_trial and state.trial is not None:
+        if 0 <= state.starts < choose.STARTS and not _count(
+            at.starts, state.trial["id"], state.starts
+        ):
             state.starts = -1
+    elif state.current != places.FACTORY:
+        _count(at.frameless, state.current, state.frameless)
     return choose.choose(state, lambda name: choose.size_fault(at, name))
+
+
+def _count(path: Path, of: str, before: int) -> bool:
+    try:
+        places.write(path, {"id": of, "starts": before + 1})
+    except OSError as error:
+        print(f"start: {path}: {error.strerror}", file=sys.stderr)
+        return False
+    return True
 
 
 def environment(at: Places, chosen: choose.Choice, given: dict[str, str]) -> dict[str, str]:

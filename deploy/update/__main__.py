@@ -101,7 +101,7 @@ def _update(given: argparse.Namespace) -> int:
     if not answer.get("id"):
         _say(f"{version} is in force already")
         return 0
-    _say(f"{version} is on the card and on trial: frames must come within {limit_s:g} s")
+    _say(f"{version} is on the card and on trial, which ends within {limit_s:g} s")
     last = card.follow(str(answer["id"]), limit_s, _say)
     if is_healthy(last):
         _say(f"{version} is in force")

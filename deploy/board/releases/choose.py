@@ -12,10 +12,13 @@ from deploy.board.releases.places import FACTORY, Places
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
     from typing import Any
 
 STARTS = 3
 """A release under trial is started so often at most before it has shown that it works."""
+FRAMELESS = 5
+"""After so many starts in a row without a frame an update leaves its place to the one before."""
 
 OF_IMAGE, UPDATE, FELL_BACK = "factory", "update", "fell back"
 HEALTHY = "healthy"
@@ -40,7 +43,7 @@ class State:
 
     `current` and `previous` are names ('' the image's release), `trial` and `last` the documents of
     those files, or None; `starts` counts those of the release under trial before this one, and is
-    negative when they cannot be counted.
+    negative when they cannot be counted; `frameless` those since the last frame of an update.
     """
 
     def __init__(
@@ -50,9 +53,10 @@ class State:
         trial: dict[str, Any] | None = None,
         last: dict[str, Any] | None = None,
         starts: int = 0,
+        frameless: int = 0,
     ) -> None:
         self.current, self.previous = current, previous
-        self.trial, self.last, self.starts = trial, last, starts
+        self.trial, self.last, self.starts, self.frameless = trial, last, starts, frameless
 
     @property
     def on_trial(self) -> bool:
@@ -75,6 +79,9 @@ def choose(state: State, fault: Callable[[str], str]) -> Choice:
         elif state.starts >= STARTS:
             reason = f"{state.current}: started {STARTS} times without getting healthy"
             del order[0]
+    elif state.frameless >= FRAMELESS and state.current != FACTORY:
+        reason = f"{state.current}: no frame in {FRAMELESS} starts"
+        del order[: state.frameless // FRAMELESS]  # and not for ever the one before
     for name in order:
         if name == FACTORY:
             break
@@ -102,7 +109,8 @@ def read_state(at: Places) -> State:
         at.linked("previous"),
         trial,
         read_last(at),
-        starts_of(at, trial["id"]) if trial else 0,
+        starts_of(at.starts, trial["id"]) if trial else 0,
+        starts_of(at.frameless, at.linked("current")),
     )
 
 
@@ -125,10 +133,10 @@ def read_last(at: Places) -> dict[str, Any] | None:
     return last if last and last["outcome"] in (HEALTHY, FELL_BACK) else None
 
 
-def starts_of(at: Places, trial: str) -> int:
-    """How often a trial's release was started so far."""
-    found = places.read(at.starts)
-    if found is None or found.get("id") != trial:
+def starts_of(path: Path, of: str) -> int:
+    """How many starts of a trial or release a file counts."""
+    found = places.read(path)
+    if found is None or found.get("id") != of:
         return 0
     starts = found.get("starts")
     return starts if isinstance(starts, int) and 0 <= starts < 1000 else STARTS

@@ -34,6 +34,7 @@ class Places:
         self.trial = self.releases / "trial.json"
         self.last = self.releases / "last.json"
         self.starts = root / "data/state/starts.json"
+        self.frameless = root / "data/state/frameless.json"
         self.running = root / "run/blimp/release.json"
         self.boot_id = root / "proc/sys/kernel/random/boot_id"
         self.uptime = root / "proc/uptime"

@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,12 +13,14 @@ from card_stand import CHECKOUT, NEW, NOW, OLD, Card, contents
 
 from deploy.board import start
 from deploy.board.releases import choose
-from deploy.board.releases.choose import STARTS, Choice, State
+from deploy.board.releases.choose import FRAMELESS, STARTS, Choice, State
 
+UNIT = CHECKOUT / "deploy/board/root/usr/lib/systemd/system/blimp-payload.service"
 TRIAL = {"id": "t", "release": NEW, "previous": OLD, "boot_id": "b", "started_s": 1.0}
 OF_IMAGE = TRIAL | {"previous": ""}
 BACK = {"id": "t", "release": NEW, "previous": OLD, "outcome": "fell back", "reason": "why"}
 GOOD = BACK | {"outcome": "healthy", "reason": ""}
+DARK = f"{NEW}: no frame in {FRAMELESS} starts"
 NEVER = f"{NEW}: started {STARTS} times without getting healthy"
 
 
@@ -39,6 +43,12 @@ NEVER = f"{NEW}: started {STARTS} times without getting healthy"
         ),
         # A trial of another release than the one in force is over, or has not begun.
         (State(OLD, trial=TRIAL, starts=STARTS), (), Choice(OLD, "update")),
+        # Later on: so many starts without a frame, then the one before, then the image's.
+        (State(NEW, OLD, frameless=FRAMELESS - 1), (), Choice(NEW, "update")),
+        (State(NEW, OLD, frameless=FRAMELESS), (), Choice(OLD, "fell back", DARK)),
+        (State(NEW, OLD, frameless=2 * FRAMELESS), (), Choice("", "fell back", DARK)),
+        (State("", OLD, frameless=FRAMELESS), (), Choice("", "factory")),
+        (State(NEW, trial=TRIAL, frameless=FRAMELESS), (), Choice(NEW, "update")),
         # Damaged ones are passed over; the first reason is told.
         (State(NEW, OLD), (NEW,), Choice(OLD, "fell back", f"{NEW}: broken")),
         (State(NEW, OLD), (NEW, OLD), Choice("", "fell back", f"{NEW}: broken")),
@@ -108,6 +118,21 @@ def test_starts_of_a_trial_are_counted_across_power_cuts(card: Card) -> None:
     card.take(card.bundle(contents(NEW)))
     assert [card.choice().name for _ in range(STARTS + 2)] == [NEW] * STARTS + ["", ""]
     assert card.choice() == Choice("", "fell back", NEVER)
+
+
+def test_an_update_without_frames_leaves_its_place_until_frames_come(card: Card) -> None:
+    card.take(card.bundle(contents(NEW)))
+    card.at.trial.unlink()
+    names = [card.choice().name for _ in range(FRAMELESS + 2)]
+    assert names == [NEW] * FRAMELESS + ["", ""]
+    assert card.choice() == Choice("", "fell back", DARK)
+    after = re.search(r"ExecStartPost=-/usr/bin/rm -f (/\S+)", UNIT.read_text())
+    assert after is not None  # systemd does it once READY=1 came
+    Path(f"{card.root}{after[1]}").unlink()
+    assert card.choice() == Choice(NEW, "update")
+    card.at.frameless.unlink()
+    card.at.frameless.parent.rmdir()
+    assert card.choice() == Choice(NEW, "update")  # what cannot be counted holds up no flight
 
 
 def test_another_trial_of_the_same_release_counts_from_zero(card: Card) -> None:

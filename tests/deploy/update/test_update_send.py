@@ -113,7 +113,7 @@ def test_a_checkout_comes_into_force(stand: Stand) -> None:
     lines = done.stderr.splitlines()
     assert lines[0] == f"update: blimp-1 (zero2w) runs {OLDEST}"
     assert lines[1].startswith("sending 0.") and " MB in " in lines[1]
-    assert lines[2].endswith("is on the card and on trial: frames must come within 120 s")
+    assert lines[2].endswith("is on the card and on trial, which ends within 180 s")
     assert lines[3].endswith("is in force") and len(lines) == 4 and done.stdout == ""
     version = lines[3].split()[1]
     assert stand.card.choice() == Choice(version, "update")
