@@ -11,13 +11,21 @@ Zenoh reads no revocation list. A revoked name leaves the access lists of all ot
 each machine once its new folder is there and its program was started anew; a rotation of the
 authority ends what the old one signed, whatever the lists say. The key of the releases goes along
 with it, step by step.
+
+`authority.json` is written last, and whatever was cut short before may be done again: a member's
+folder gets its name when it is whole.
 """
 
 from __future__ import annotations
 
 import datetime
+import fcntl
 import json
+import os
 import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +42,7 @@ STEPS = ("settled", "both trusted", "new certificates")
 SRTP, SSH, SIGNERS = "srtp.key", "ssh_ed25519", "allowed_signers"
 RELEASES = "blimp-release"
 """Name and OpenSSH namespace of what the release keys sign."""
+_LOCK_S = 10.0
 
 
 class Authority:
@@ -67,8 +76,11 @@ class Authority:
 
     @classmethod
     def create(cls, folder: Path) -> Authority:
-        """A new authority; raises `KeysError` when the folder holds anything."""
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        """A new authority; raises `KeysError` when the folder holds more than one cut short."""
+        begun = {"authorities", "releases", f"authority.json{files.PART}"}  # it signed nothing
+        if folder.exists() and (
+            not folder.is_dir() or {path.name for path in folder.iterdir()} - begun
+        ):
             raise KeysError(f"{folder}: exists already, and keys are never overwritten")
         _folder(folder)
         self = cls.__new__(cls)
@@ -78,31 +90,48 @@ class Authority:
         return self
 
     def add(self, role: str, member: str, days: int = CERTIFICATE_DAYS) -> Path:
-        """A new machine's folder; raises `KeysError` when the name is taken or was revoked."""
+        """A new machine's folder, or the one that was whole when this was cut short.
+
+        Raises `KeysError` when the name is taken or was revoked.
+        """
         name = f"{role}.{_member(member)}"
         if name in self.members:
             state = "was revoked" if self.members[name]["revoked"] else "exists already"
             raise KeysError(f"{role} '{member}' {state}; take another name")
-        folder = _folder(self.of(name))
-        self._sign(name, days)
-        private, public = certificates.make_ssh_key()
-        write_private(folder / SSH, private)
-        write_private(folder / f"{SSH}.pub", public)
-        if role == PAYLOAD:
-            write_private(folder / SRTP, certificates.make_srtp_key())
+        wanted = [credentials.CERTIFICATE, f"{SSH}.pub", *([SRTP] if role == PAYLOAD else [])]
+        if not all((self.of(name) / file).is_file() for file in wanted):
+            shutil.rmtree(self.of(name), ignore_errors=True)  # of an older program that was cut
+            part = self.folder / f"{name}{files.PART}"
+            shutil.rmtree(part, ignore_errors=True)
+            self._sign(name, days, _folder(part))
+            private, public = certificates.make_ssh_key()
+            write_private(part / SSH, private)
+            write_private(part / f"{SSH}.pub", public)
+            if role == PAYLOAD:
+                write_private(part / SRTP, certificates.make_srtp_key())
+            _move(part, self.of(name))
         self.members[name] = {"revoked": False, "days": days}
         self._save()
-        return folder
+        return self.of(name)
+
+    def renew(self, name: str, days: int = CERTIFICATE_DAYS) -> Path:
+        """Gives a member a new certificate and its key; SRTP and SSH keys stay."""
+        credentials.check_name(name)
+        if name not in self.live():
+            raise KeysError(f"{name}: no such member, or revoked")
+        self._sign(name, days, self.of(name))
+        self.members[name]["days"] = days
+        self._save()
+        return self.of(name)
 
     def revoke(self, name: str) -> None:
         """Takes a name out of all access lists; its files move to `revoked/`."""
         credentials.check_name(name)
-        if name not in self.members or self.members[name]["revoked"]:
+        if name not in self.members or not (name in self.live() or self.of(name).exists()):
             raise KeysError(f"{name}: no such member, or revoked already")
         self.members[name]["revoked"] = True
         self._save()
-        _folder(self.folder / "revoked")
-        shutil.move(self.of(name), self.folder / "revoked" / name)
+        _move(self.of(name), self.folder / "revoked" / name)
 
     def rotate(self) -> str:
         """Goes one step of a rotation and says which it was.
@@ -116,7 +145,7 @@ class Authority:
         elif self.step == 1:
             self.signing = self.trusted[-1]
             for name in self.live():
-                self._sign(name, self.members[name]["days"])
+                self._sign(name, self.members[name]["days"], self.of(name))
         else:
             self.trusted = [self.signing]
         self.step = (self.step + 1) % len(STEPS)
@@ -176,7 +205,7 @@ class Authority:
             if set(held.peers) != set(self._peers(name)):
                 problems.append(f"{name}: its access list is not the authority's")
             if until - now < datetime.timedelta(days=soon_days):
-                problems.append(f"{name}: ends on {until:%Y-%m-%d}")
+                problems.append(f"{name}: ends on {until:%Y-%m-%d}; 'renew' mends it")
         for path in sorted(self.folder.rglob("*")):
             if path.is_file() and path.stat().st_mode & 0o077:
                 problems.append(f"{path}: others can read it; allowed is mode 0600")
@@ -186,10 +215,10 @@ class Authority:
         other = GROUND if name.startswith(PAYLOAD) else PAYLOAD
         return [peer for peer in self.live() if peer.startswith(other + ".")]
 
-    def _sign(self, name: str, days: int) -> None:
+    def _sign(self, name: str, days: int, folder: Path) -> None:
         pair = certificates.make_certificate(name, self._pair(self.signing), _until(days))
-        write_private(self.of(name) / credentials.KEY, pair.key, replace=True)
-        write_private(self.of(name) / credentials.CERTIFICATE, pair.certificate, replace=True)
+        write_private(folder / credentials.KEY, pair.key, replace=True)
+        write_private(folder / credentials.CERTIFICATE, pair.certificate, replace=True)
 
     def _make(self, number: int) -> None:
         pair = certificates.make_authority(f"blimp authority {number}", _until(AUTHORITY_DAYS))
@@ -262,6 +291,29 @@ class Authority:
             write_private(folder / file_name, source.read_bytes(), replace=True)
 
 
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """One program changes an authority at a time; raises `KeysError` when another does not end."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:  # whoever reads it says what is wrong
+        yield
+        return
+    try:
+        until_s = time.monotonic() + _LOCK_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until_s:
+                    raise KeysError(f"{folder}: another 'blimp keys' is at work; end it") from None
+                time.sleep(0.05)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_private(path: Path, data: bytes, *, replace: bool = False) -> None:
     """Writes a file that only its owner can read, whole or not at all.
 
@@ -281,6 +333,15 @@ def _folder(path: Path) -> Path:
     except OSError as error:
         raise KeysError(f"{path}: {error.strerror or error}") from None
     return path
+
+
+def _move(part: Path, path: Path) -> None:
+    _folder(path.parent)
+    try:
+        files.replace(part, path)
+        files.sync(part.parent)
+    except OSError as error:
+        raise KeysError(f"{path}: {error.strerror or error}") from None
 
 
 def _member(member: str) -> str:

@@ -30,10 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     actions.add_parser("init", help="make a new authority")
-    for role, what in (("payload", "a payload"), ("ground", "a ground station")):
-        add = actions.add_parser(role, help=f"make the certificate and keys of {what}")
-        add.add_argument("name", help="1 to 32 of a-z, 0-9, - and _")
-        add.add_argument("--days", type=int, default=730, help="valid for, days, 1 to 3650")
+    for verb, name, what in (
+        ("payload", "1 to 32 of a-z, 0-9, - and _", "make the certificate and keys of a payload"),
+        ("ground", "as a payload's", "make the certificate and keys of a ground station"),
+        ("renew", "payload.ID or ground.NAME", "give a member a new certificate"),
+    ):
+        signed = actions.add_parser(verb, help=what)
+        signed.add_argument("name", help=name)
+        signed.add_argument("--days", type=int, default=730, help="valid for, days, 1 to 3650")
     actions.add_parser("list", help="who has a certificate, and until when")
     actions.add_parser("release", help="name the key that signs releases; makes a missing one")
     revoke = actions.add_parser("revoke", help="take a name out of everyone's access list")
@@ -44,18 +48,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Runs one action; raises `BlimpError` with one line."""
-    from ground_station.keys.authority import Authority
+    from ground_station.keys.authority import alone
 
     folder = arguments.folder or user_folders.data() / "keys"
+    with alone(folder):
+        return _act(arguments, folder)
+
+
+def _act(arguments: argparse.Namespace, folder: Path) -> int:
+    from ground_station.keys.authority import Authority
+
     action = arguments.action
     if action == "init":
         Authority.create(folder)
         print(f"authority in {folder}: keep a copy of it away from the network")
         return 0
     authority = Authority(folder)
-    if action in ("payload", "ground"):
+    if action in ("payload", "ground", "renew"):
         if not 1 <= arguments.days <= 3650:
             raise KeysError(f"--days is {arguments.days}; allowed: 1 to 3650")
+        if action == "renew":
+            print(authority.renew(arguments.name, arguments.days))
+            print("copy its folder again, and restart its program")
+            return 0
         print(authority.add(action, arguments.name, arguments.days))
         print("the other side's folders list it now: copy them again, and restart its programs")
     elif action == "revoke":

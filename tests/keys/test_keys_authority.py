@@ -3,14 +3,18 @@
 import datetime
 import itertools
 import json
+import re
+import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from power import PowerCut, cut_after
 
 from ground_station.cli import main
 from ground_station.errors import KeysError
-from ground_station.keys.authority import Authority, write_private
+from ground_station.keys.authority import Authority, alone, write_private
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import TelemetryError
 
@@ -162,6 +166,89 @@ def test_openssh_reads_the_ssh_key(authority: Authority) -> None:
     except FileNotFoundError:
         pytest.skip("ssh-keygen is missing")
     assert shown.stdout.split()[:2] == key.with_suffix(".pub").read_text().split()[:2]
+
+
+Act = Callable[[Authority], object]
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda authority: authority.add("payload", "blimp-2"),
+        lambda authority: authority.add("ground", "spare"),
+        lambda authority: authority.revoke("payload.blimp-1"),
+        lambda authority: authority.renew("payload.blimp-1"),
+        lambda authority: authority.rotate(),
+    ],
+    ids=["payload", "ground", "revoke", "renew", "rotate"],
+)
+def test_what_was_cut_short_is_done_again(tmp_path: Path, act: Act) -> None:
+    clean, folder = tmp_path / "clean", tmp_path / "keys"
+    made = Authority.create(clean)
+    made.add("ground", "main")
+    made.add("payload", "blimp-1")
+    done, changes = False, 0
+    while not done:
+        shutil.copytree(clean, folder)
+        with cut_after(changes):
+            try:
+                act(Authority(folder))
+                done = True
+            except PowerCut:
+                pass
+        if not done:
+            before = set(Authority(folder).live())
+            try:
+                act(Authority(folder))
+            except KeysError as error:  # it was whole already, and says so
+                assert re.search("exists already|revoked already", str(error))
+                assert before != {"ground.main", "payload.blimp-1"}
+        assert Authority(folder).check(NOW) == [], changes
+        shutil.rmtree(folder)
+        changes += 13
+    assert changes > 40
+
+
+def test_an_authority_that_was_cut_short_is_made_again(tmp_path: Path) -> None:
+    for changes in range(0, 24, 5):
+        with cut_after(changes), pytest.raises(PowerCut):
+            Authority.create(tmp_path / f"{changes}")
+        Authority.create(tmp_path / f"{changes}").add("ground", "main")
+        assert Authority(tmp_path / f"{changes}").check(NOW) == []
+
+
+def test_a_folder_that_an_older_program_left_half_is_made_again(authority: Authority) -> None:
+    half = authority.of("payload.blimp-3")
+    half.mkdir()
+    (half / "ssh_ed25519").touch()
+    authority.add("payload", "blimp-3")
+    assert Authority(authority.folder).check(NOW) == []
+
+
+def test_a_member_is_renewed_and_keeps_its_other_keys(authority: Authority) -> None:
+    def files() -> dict[str, bytes]:
+        return {p.name: p.read_bytes() for p in authority.of("payload.blimp-1").iterdir()}
+
+    before = files()
+    assert main(["keys", "--folder", str(authority.folder), "renew", "payload.blimp-1"]) == 0
+    changed = {name for name, data in files().items() if data != before[name]}
+    assert changed == {"certificate.pem", "key.pem"}
+    assert Authority(authority.folder).check(NOW) == []
+    authority.revoke("payload.blimp-2")
+    for name in ("payload.blimp-2", "payload.none"):
+        with pytest.raises(KeysError, match="no such member, or revoked"):
+            authority.renew(name)
+
+
+def test_one_program_at_a_time_changes_an_authority(
+    authority: Authority, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("ground_station.keys.authority._LOCK_S", 0.0)
+    command = ["keys", "--folder", str(authority.folder), "ground", "spare"]
+    with alone(authority.folder):
+        assert main(command) == 2
+    assert "another 'blimp keys' is at work" in capsys.readouterr().err
+    assert main(command) == 0
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
