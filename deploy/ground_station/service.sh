@@ -143,7 +143,8 @@ build_release() {
   say "release $id in $release"
 }
 
-# The shipped configuration with this installation's folders; one that is there is kept.
+# The shipped configuration with this installation's folders and a token, and without the port that
+# every web page in a browser here may read; one that is there is kept.
 configure() {
   mkdir -p "$etc"
   if [ -f "$etc/station.toml" ]; then
@@ -153,6 +154,8 @@ configure() {
   sed -e 's|^folder = "maps/atrium"|folder = "/var/lib/blimp/maps/atrium"|' \
     -e 's|^shelf = "maps"|shelf = "/var/lib/blimp/maps"|' \
     -e 's|^folder = "recordings"|folder = "/var/lib/blimp/recordings"|' \
+    -e 's|^token_file = ""|token_file = "/var/lib/blimp/token"|' \
+    -e '/^\[foxglove\]/,$s|^enabled = true|enabled = false|' \
     ground_station/service/station.toml >"$etc/station.toml.part"
   chmod 644 "$etc/station.toml.part"
   mv "$etc/station.toml.part" "$etc/station.toml"
@@ -176,6 +179,13 @@ fill_state() {
       | tar -xf - -C "$state/maps/atrium.part" --no-same-owner
     mv -T "$state/maps/atrium.part" "$state/maps/atrium"
     changed=1
+  fi
+  if grep -q '^token_file = "/var/lib/blimp/token"' "$etc/station.toml" && [ ! -s "$state/token" ]; then
+    (umask 077 && "$environment/bin/python" -c 'import secrets; print(secrets.token_urlsafe(32))' \
+      >"$state/token.part")
+    mv "$state/token.part" "$state/token"
+    changed=1
+    say "made the token that dashboard and API ask for: sudo cat $state/token"
   fi
   [ "$(stat -c %a "$state")" = 750 ] || chmod 750 "$state"
   [ -n "$root" ] || chown -R "$user:$user" "$state"

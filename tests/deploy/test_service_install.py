@@ -1,5 +1,6 @@
 """The system service: what an installation puts where, that it can be repeated, and what stays."""
 
+import dataclasses
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from ground_station.service import settings
+from ground_station.service.web.access import read_token
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "deploy/ground_station/service.sh"
@@ -124,11 +126,21 @@ def test_the_configuration_is_the_shipped_one_with_this_installation_s_folders(
     assert loaded.map.shelf == "/var/lib/blimp/maps"
     assert loaded.recording.folder == "/var/lib/blimp/recordings"
     shipped = settings.load(settings.SHIPPED)
-    assert (loaded.http, loaded.video, loaded.telemetry) == (
-        shipped.http,
-        shipped.video,
-        shipped.telemetry,
-    )
+    assert (loaded.video, loaded.telemetry) == (shipped.video, shipped.telemetry)
+    assert loaded.http == dataclasses.replace(shipped.http, token_file="/var/lib/blimp/token")
+
+
+def test_no_web_page_and_no_other_user_gets_in(root: Path, checkout: Path) -> None:
+    loaded, path = settings.load(root / "etc/blimp/station.toml"), root / "var/lib/blimp/token"
+    assert not loaded.foxglove.enabled
+    http = dataclasses.replace(loaded.http, token_file=str(path))
+    token = read_token(http)
+    assert token is not None and len(token) > 40
+    install(root, checkout)
+    assert read_token(http) == token
+    path.unlink()
+    install(root, checkout)
+    assert read_token(http) not in (token, None)
 
 
 def test_the_installed_command_runs_its_own_release(installed: Path, tmp_path: Path) -> None:
