@@ -57,4 +57,11 @@ def load_floorplan(path: str | Path) -> FloorPlan:
         raise InputError(f"{path}: needs image, resolution and origin [x, y, yaw]") from None
     if not all(map(math.isfinite, (resolution_m, x, y, yaw))) or not 1e-4 <= resolution_m <= 10:
         raise InputError(f"{path}: resolution is {resolution_m}; allowed: 0.0001 to 10 m a pixel")
-    return FloorPlan(read_grey(path.parent / name), resolution_m, (x, y, yaw))
+    picture = path.parent / name
+    try:
+        inside = picture.resolve().is_relative_to(path.parent.resolve())
+    except (OSError, RuntimeError, ValueError):  # links in a circle, half characters
+        inside = False
+    if not inside:
+        raise InputError(f"{path}: image is {name[:80]!r}; it must lie beside the file")
+    return FloorPlan(read_grey(picture), resolution_m, (x, y, yaw))

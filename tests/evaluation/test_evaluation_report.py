@@ -269,7 +269,7 @@ def test_plots_keep_no_global_state() -> None:
         ({"image": "missing.png"}, "missing.png"),
         ({"image": None}, "needs image, resolution and origin"),
         ({"image": "a\0b"}, "needs image, resolution and origin"),
-        ({"image": "/dev/zero"}, "not a file"),
+        ({"image": "/dev/zero"}, "must lie beside"),
         ({"resolution": 10**400}, "needs image, resolution and origin"),
         ({"note": "x" * 70_000}, "more than 65536 bytes"),
     ],
