@@ -178,6 +178,17 @@ def test_wrong_tokens_cost_time_but_only_who_gives_them():
     rules.check_token("10.0.0.1", station.TOKEN)
 
 
+def test_nobody_locks_out_who_comes_through_a_tunnel():
+    rules = Access(HttpSettings(), station.TOKEN)
+    statuses = []
+    for _ in range(8):
+        with pytest.raises(Refused) as refused:
+            rules.check_token("127.0.0.1", "wrong")
+        statuses.append(refused.value.status)
+    assert statuses == [401] * 5 + [429] * 3
+    rules.check_token("127.0.0.1", station.TOKEN)
+
+
 def test_an_address_of_ipv6_cannot_try_from_its_whole_network():
     rules = Access(HttpSettings(), station.TOKEN)
     statuses = []
