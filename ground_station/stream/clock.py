@@ -11,6 +11,7 @@ from pi_firmware.wire import keys
 from pi_firmware.wire.clock_offset import ASK_TIMEOUT_S, Clock, Offset, OffsetFilter, ask, serve
 
 _PERIOD_S = 1.0
+_KEPT = 64
 
 
 class ClockFollower:
@@ -54,6 +55,11 @@ class ClockFollower:
             known = self._known()
             for payload_id in known:
                 self._follow(payload_id)
+            gone = [payload_id for payload_id in self._served if payload_id not in known]
+            for payload_id in gone[: max(0, len(self._served) - _KEPT)]:
+                self._served.pop(payload_id).undeclare()
+                for kept in (self._filters, self._offsets, self._round_trips_s):
+                    kept.pop(payload_id, None)
             wait_s = _PERIOD_S if known else 0.05
 
     def _follow(self, payload_id: str) -> None:

@@ -183,12 +183,18 @@ class TelemetryListener:
         return replace(state, decisions=dict(state.decisions), events=list(state.events))
 
     def _state_of(self, key_expression: str) -> PayloadState | None:
-        """The state a key belongs to, created at the first; call with the lock held."""
+        """The state a key belongs to, created at the first; call with the lock held.
+
+        It takes the place of the first that is gone where there is none; None where all live.
+        """
         payload_id = keys.payload_of(key_expression)
         if payload_id is None:
             return None
         if payload_id not in self._states and len(self._states) >= _KEPT_PAYLOADS:
-            return None
+            gone = next((name for name, state in self._states.items() if not state.alive), None)
+            if gone is None:
+                return None
+            del self._states[gone]
         return self._states.setdefault(payload_id, PayloadState(payload_id))
 
     def _take(self, sample: Any) -> None:

@@ -18,13 +18,14 @@ class Clock:
         return self.now_s
 
 
-def made(announced: Announced, **settings: object) -> Roster:
+def made(announced: Announced, clock: Clock | None = None, **settings: object) -> Roster:
     recorder = GroundRecorder(RecordingSettings(folder=""), lambda *_: None)
     recorder.close()
     return Roster(
         PayloadSettings(**settings),  # type: ignore[arg-type]
         announced,
         lambda payload_id: Payload(payload_id, None, lambda *_: None, recorder),
+        clock or Clock(),
     )
 
 
@@ -68,6 +69,18 @@ def test_there_is_place_for_so_many_and_the_gone_make_room() -> None:
     two.alive = False
     assert roster.take_up("three") is not None and roster.refused == set()
     assert [payload.id for payload in roster.all()] == ["one", "three"]
+
+
+def test_who_found_no_place_and_went_is_forgotten() -> None:
+    roster = made(Announced(), clock := Clock(), most=1)
+    one = roster.take_up("one")
+    assert one is not None
+    one.alive = True
+    for _ in range(3):  # it is asked for as long as it lives
+        assert roster.take_up("two") is None and roster.refused == {"two"}
+        clock.now_s += 6.0
+    clock.now_s += 6.0
+    assert roster.refused == set()
 
 
 def test_only_those_named_are_taken_up() -> None:

@@ -3,11 +3,14 @@
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import pytest
 
+from ground_station.stream.clock import ClockFollower
 from ground_station.stream.telemetry import FrameCounts, PayloadState, TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
@@ -152,6 +155,30 @@ def test_a_message_of_megabytes_is_dropped_and_its_payload_heard_on(
     state = listener.state("blimp-1")
     assert state is not None and [event.name for event in state.events] == ["small"]
     session.close()
+
+
+def test_who_is_gone_makes_room_for_who_comes(listener: TelemetryListener) -> None:
+    session = listener.session.zenoh
+    for number in range(130):  # names that were never alive
+        body = messages.encode(messages.Autopilot(time_ns=number, connected=True))
+        session.put(keys.key(f"blimp-{number}", keys.AUTOPILOT), body)
+    assert listener.wait("blimp-129", lambda s: s.autopilot is not None, LIMIT_S)
+    assert len(listener.payloads()) == 64
+
+
+def test_clocks_of_those_that_are_gone_are_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ground_station.stream.clock._PERIOD_S", 0.001)
+    monkeypatch.setattr("ground_station.stream.clock._KEPT", 4)
+    names = iter(f"blimp-{number}" for number in range(20))
+    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+        session = listener.session.zenoh
+        alone = ClockFollower(session, lambda: [*islice(names, 1)] or ["last"], time.time_ns)
+        until_s = time.monotonic() + LIMIT_S
+        while "last" not in alone._served and time.monotonic() < until_s:
+            time.sleep(0.01)
+        time.sleep(0.05)
+        alone.close()
+        assert "last" in alone._served and len(alone._served) <= 4
 
 
 def test_events_are_handed_on_as_they_come() -> None:

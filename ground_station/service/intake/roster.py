@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 from ground_station.service.intake.announced import Announced
@@ -14,7 +15,7 @@ GRACE_S = 3.0
 NAMELESS_S = 12.0
 """Longer where that leaves it without a name: telemetry that starts late needs some seconds."""
 NAMELESS = "stream-"
-_REFUSED = 64
+_REFUSED, _REFUSED_S = 64, 10.0
 
 
 class Roster:
@@ -24,13 +25,25 @@ class Roster:
     """
 
     def __init__(
-        self, settings: PayloadSettings, announced: Announced, make: Callable[[str], Payload]
+        self,
+        settings: PayloadSettings,
+        announced: Announced,
+        make: Callable[[str], Payload],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._settings, self._announced, self._make = settings, announced, make
         self._payloads: dict[str, Payload] = {}
         self._lock = threading.Lock()
-        self.refused: set[str] = set()
-        """Those for whom there was no place."""
+        self._clock = clock
+        self._refused_s: dict[str, float] = {}
+
+    @property
+    def refused(self) -> set[str]:
+        """Those for whom there was no place of late."""
+        with self._lock:
+            since_s = self._clock() - _REFUSED_S
+            self._refused_s = {who: at_s for who, at_s in self._refused_s.items() if at_s > since_s}
+            return set(self._refused_s)
 
     def all(self) -> list[Payload]:
         """Those taken up, in the order in which they came."""
@@ -54,13 +67,13 @@ class Roster:
                 if len(self._payloads) >= self._settings.most:
                     gone = [p for p in self._payloads.values() if not p.alive and not p.streaming]
                     if not gone:
-                        if len(self.refused) < _REFUSED:
-                            self.refused.add(payload_id)
+                        if len(self._refused_s) < _REFUSED or payload_id in self._refused_s:
+                            self._refused_s[payload_id] = self._clock()
                         return None
                     left = min(gone, key=lambda payload: payload.seen_ns)
                     del self._payloads[left.id]
                 self._payloads[payload_id] = self._make(payload_id)
-                self.refused.discard(payload_id)
+                self._refused_s.pop(payload_id, None)
             taken = self._payloads[payload_id]
         if left is not None:
             left.close()
