@@ -15,7 +15,8 @@ EXAMPLE = "blimp/blimp-example.toml"
 
 # Started again 10 s after a kernel that gives up; said on the screen, if any, and on no UART: that
 # is the autopilot's.
-_KERNEL_LINE = "rootfstype=ext4 ro rootwait panic=10 fsck.repair=yes"
+# Raspberry Pi's firmware switches the accounting off that MemoryMax= needs.
+_KERNEL_LINE = "rootfstype=ext4 ro rootwait panic=10 fsck.repair=yes cgroup_enable=memory"
 _CONSOLES = {"qemu": "console=tty1 modules_load=vivid"}
 _REAL_CONSOLE = "console=tty1"
 

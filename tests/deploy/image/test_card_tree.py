@@ -215,6 +215,9 @@ def test_a_real_boards_first_stages_get_its_kernel_and_leave_the_uart_alone(boar
     line = tree.read("cmdline.txt").decode()
     assert line.count("\n") == 1 and "vivid" not in line and "console=tty1" in line.split()
     assert all(len(row) <= 98 for row in config), "the first stages read no longer line"
+    # Without this word a real board's kernel holds nobody to MemoryMax=.
+    unit = CHECKOUT / "deploy/board/root/usr/lib/systemd/system/blimp-payload.service"
+    assert "cgroup_enable=memory" in line.split() and "\nMemoryMax=" in unit.read_text()
 
 
 def test_sizes_are_multiples_of_4_mib_and_powers_of_two():
