@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pi_firmware import clocks
+from pi_firmware import clocks, gstreamer, uri
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.live import LiveSource
 from pi_firmware.sources.schemes import v4l2
@@ -96,6 +96,28 @@ def test_a_v4l2_device_is_asked_what_its_times_mark(
     device = Buffers(driver, flags)
     assert v4l2.timestamp_mark(0, device.ioctl, str(parameter)) is expected
     assert device.held == 0
+
+
+@pytest.mark.parametrize("colorimetry", ["2:4:16:1", "1:4:7:1"])
+def test_a_v4l2_device_gives_progressive_pictures_of_one_colorimetry(
+    monkeypatch: pytest.MonkeyPatch, colorimetry: str
+) -> None:
+    monkeypatch.setattr(v4l2.V4l2Source, "_set_up", lambda *_: Mark.MIDDLE)
+    camera = CameraSettings(uri="v4l2:/dev/video0")
+    elements = v4l2.V4l2Source(uri.parse(camera.uri, "camera.uri"), camera).elements()
+    assert "interlace-mode=(string)progressive ! videoconvert" in elements
+    offered = f"video/x-raw,format=YUY2,colorimetry=(string){colorimetry}"
+    device = f"videotestsrc num-buffers=1 ! {offered} ! identity name=source"
+    gst = gstreamer.load()
+    text = elements.replace("v4l2src name=source", device) + " ! fakesink name=end"
+    pipeline = gst.parse_launch(text)
+    pipeline.set_state(gst.State.PLAYING)
+    kinds = gst.MessageType.EOS | gst.MessageType.ERROR
+    message = pipeline.get_bus().timed_pop_filtered(10 * gst.SECOND, kinds)
+    told = pipeline.get_by_name("end").get_static_pad("sink").get_current_caps().to_string()
+    pipeline.set_state(gst.State.NULL)
+    assert message.type == gst.MessageType.EOS
+    assert "interlace-mode=(string)progressive" in told and "colorimetry=(string)bt601" in told
 
 
 def test_a_v4l2_device_that_does_not_tell_is_not_corrected() -> None:
