@@ -6,6 +6,7 @@ And the walks: what a seed draws, how a scenario is kept, and how it is shrunk.
 from __future__ import annotations
 
 import socket
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,14 +15,17 @@ import pytest
 from numbered_flight import GOP, encoded, stamped
 from payload_process import Ended
 from scenarios import accounts
+from scenarios.background import Background
 from scenarios.camera import FLIGHT, Camera, Truth
 from scenarios.heard import Heard, Told
+from scenarios.hostile_steps import Garbage
 from scenarios.judge import OFF_M, poses
 from scenarios.link_steps import Loss, Outage
 from scenarios.matrix import BRIEF, MATRIX
 from scenarios.payload_run import UNBORN_S, PayloadRun
+from scenarios.play import _end
 from scenarios.recordings import CUT_S, NOISE_S, Came, Recorded, lacking, read
-from scenarios.step import Scenario, StepError, as_json, from_json
+from scenarios.step import KINDS, Scenario, Step, StepError, as_json, from_json
 from scenarios.tcp_wire import TcpWire
 from scenarios.walk import DRAWS, WALK_S, drawn, shrunk
 from scenarios.world import combined
@@ -271,6 +275,42 @@ def test_a_wire_carries_is_cut_and_is_mended() -> None:
                 wire.mend()
                 far.settimeout(5.0)
                 assert far.recv(10) == b"two"
+
+
+def test_a_step_that_does_nothing_breaks_the_matrix() -> None:
+    assert all(kind.lacking is not Step.lacking for kind in KINDS.values())
+
+    def world_of(peer: Background | None) -> Any:
+        said: list[str] = []
+        kept = {} if peer is None else {id(step): peer}
+        return SimpleNamespace(kept=kept, complaints=said, complain=said.append, say=lambda _: None)
+
+    def raising() -> None:
+        raise OSError("no such port")
+
+    step = Garbage(0.0, 2.0)
+    for act, found in ((raising, "after 0 times: no such port"), (lambda: False, "after 0 times")):
+        peer = Background(act, 0.001).start()
+        peer._thread.join(0.05)
+        world = world_of(peer)
+        _end(world, step, alone=True)
+        assert found in world.complaints[0]
+    for peer, alone, complaints in ((None, True, 1), (None, False, 0)):
+        world = world_of(peer)
+        _end(world, step, alone=alone)
+        assert len(world.complaints) == complaints
+    busy = Background(lambda: None, 0.001).start()
+    while not busy.acts:
+        time.sleep(0.001)
+    world = world_of(busy)
+    _end(world, step, alone=True)
+    assert world.complaints == []
+
+
+def test_a_fault_is_alone_where_none_overlaps_it() -> None:
+    first, second, third = Loss(0.0, 4.0), Outage(3.0, 4.0), Loss(8.0, 1.0)
+    scenario = Scenario("three", (first, second, third))
+    assert [scenario.alone(step) for step in scenario.steps] == [False, False, True]
 
 
 def test_a_step_says_what_it_does() -> None:

@@ -9,7 +9,6 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from scenarios.burden import MOST
 from scenarios.camera import Cameras
 from scenarios.matrix import BRIEF, MATRIX
 from scenarios.play import found, play
@@ -41,9 +40,6 @@ def test_whatever_befalls_a_flight_the_invariants_hold(
     for verdict in verdicts:
         back_s, burden = verdict.figures.get("recovery_s"), verdict.figures.get("burden")
         print(f"\n{verdict.name}: {verdict.injected}, back {back_s} s, burden {burden}", end="")
-    began = any(verdict.injected for verdict in verdicts)
-    if not began and verdicts[0].figures.get("burden", 1.0) >= MOST:
-        pytest.skip(f"this machine is too busy to fly at all: {found(verdicts)[:1]}")
     assert not found(verdicts), "\n".join(verdicts[-1].said)
     assert all(verdict.injected for verdict in verdicts)
     figures = verdicts[-1].figures

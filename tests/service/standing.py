@@ -70,6 +70,11 @@ def _stat(pid: int) -> list[str]:
     return []
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether a process stands still by SIGSTOP."""
+    return _stat(pid)[:1] == ["T"]
+
+
 def process(name: str, pid: int) -> Process | None:
     """The process with an id now."""
     stat = _stat(pid)

@@ -8,7 +8,10 @@ from collections.abc import Callable
 
 
 class Background:
-    """Calls `act` every `period_s` until `end`; what it raises ends it and is kept in `failure`."""
+    """Calls `act` every `period_s` until `end`; what it raises ends it and is kept in `failure`.
+
+    `acts` counts those that did not say False.
+    """
 
     def __init__(self, act: Callable[[], object], period_s: float) -> None:
         self.failure: Exception | None = None
@@ -38,7 +41,6 @@ class Background:
     def _run(self) -> None:
         try:
             while not self._closing.wait(self._period_s):
-                self._act()
-                self.acts += 1
+                self.acts += self._act() is not False
         except Exception as error:
             self.failure = error

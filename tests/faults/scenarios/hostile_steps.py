@@ -40,6 +40,12 @@ class Peer(Step):
         except BlimpError as error:  # the service may be down at this moment
             world.say(f"{type(self).__name__}: {error}")
 
+    def lacking(self, world: World) -> str:
+        peer = world.kept.get(id(self))
+        if peer is None:
+            return "nobody came"
+        return f"after {peer.acts} times: {peer.failure}" if peer.failure or not peer.acts else ""
+
     def mend(self, world: World) -> None:
         peer = world.kept.pop(id(self), None)
         if peer is None:
@@ -57,11 +63,13 @@ def _datagrams(world: World, next_one: Any, rate_hz: float) -> Background:
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     to = ("127.0.0.1", world.service.video)
 
-    def send() -> None:
+    def send() -> bool:
         datagram = next_one()
         if datagram is not None:
             with contextlib.suppress(ConnectionError):
                 out.sendto(datagram, to)
+                return True
+        return False
 
     return Background(send, 1.0 / rate_hz).at_end(out.close)
 
@@ -154,11 +162,13 @@ class BadTelemetry(Peer):
         draw = world.draw()
         session = _client(world)
 
-        def act() -> None:
+        def act() -> bool:
             kind, text = _twisted(draw)
             who = draw.choice(("blimp-1", "blimp-1", "blimp-9", "NOT-A-NAME", "x" * 40))
             with contextlib.suppress(Exception):  # the service may be down at this moment
                 session.zenoh.put(f"blimp/{who}/{kind}", text)
+                return True
+            return False
 
         return Background(act, 1.0 / self.rate_hz).at_end(session.close)
 
@@ -180,11 +190,13 @@ class CommandFlood(Peer):
             b"[]",
         )
 
-        def act() -> None:
+        def act() -> bool:
             name = draw.choice(("idr", "bitrate", "exposure", "bogus", "reboot"))
             key = f"blimp/blimp-1/command/{name}"
             with contextlib.suppress(Exception):
                 session.zenoh.get(key, lambda _: None, payload=draw.choice(bodies), timeout=0.5)
+                return True
+            return False
 
         return Background(act, 1.0 / self.rate_hz).at_end(session.close)
 
@@ -204,6 +216,10 @@ class SlowViewers(Step):
                     connect(url, max_queue=1, open_timeout=_TIMEOUT_S, close_timeout=0.1)
                 )
         world.say(f"SlowViewers: {len(viewers)} of {self.count} connected")
+
+    def lacking(self, world: World) -> str:
+        came = len(world.kept[id(self)])
+        return f"{came} of {self.count} connected" if came < self.count else ""
 
     def mend(self, world: World) -> None:
         for viewer in world.kept.pop(id(self)):
@@ -237,14 +253,17 @@ class HostileHttp(Peer):
         )
         held: list[socket.socket] = []
 
-        def act() -> None:
+        def act() -> bool:
+            came = len(held)
             with contextlib.suppress(OSError):
                 one = socket.create_connection(("127.0.0.1", world.service.http), _TIMEOUT_S)
                 held.append(one)  # it is kept open, and nothing is read from it
                 one.settimeout(_TIMEOUT_S)
                 one.sendall(draw.choice(kinds))
+            connected = len(held) > came
             while len(held) > 20:
                 held.pop(0).close()
+            return connected
 
         def close() -> None:
             for one in held:

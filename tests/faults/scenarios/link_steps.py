@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from impaired_link import Impairment
 
@@ -14,14 +14,21 @@ if TYPE_CHECKING:
 
 
 class Impairs(Step):
-    """Base of steps that impair the video's link."""
+    """Base of steps that impair the video's link; `COUNT` is the count of it that then grows."""
+
+    COUNT: ClassVar[str] = "lost"
 
     def impairment(self) -> Impairment:
         """What the link does meanwhile."""
         raise NotImplementedError
 
     def inject(self, world: World) -> None:
+        world.kept[id(self)] = getattr(world.link.counts, self.COUNT)
         world.impair(self, self.impairment())
+
+    def lacking(self, world: World) -> str:
+        grown = getattr(world.link.counts, self.COUNT) > world.kept[id(self)]
+        return "" if grown else f"no packet was {self.COUNT}"
 
     def mend(self, world: World) -> None:
         world.impair(self, None)
@@ -53,6 +60,7 @@ class Late(Impairs):
 
     delay_s: float = 0.1
     jitter_s: float = 0.05
+    COUNT: ClassVar[str] = "delayed"
 
     def impairment(self) -> Impairment:
         return Impairment(delay_s=self.delay_s, jitter_s=self.jitter_s)
@@ -64,6 +72,7 @@ class Reordered(Impairs):
 
     share: float = 0.1
     by: int = 3
+    COUNT: ClassVar[str] = "delayed"
 
     def impairment(self) -> Impairment:
         return Impairment(reorder=self.share, reorder_by=self.by)
@@ -74,6 +83,7 @@ class Duplicated(Impairs):
     """A share of the packets comes twice."""
 
     share: float = 0.2
+    COUNT: ClassVar[str] = "duplicated"
 
     def impairment(self) -> Impairment:
         return Impairment(duplicate=self.share)
@@ -86,32 +96,46 @@ class Outage(Step):
     telemetry: bool = False
 
     def inject(self, world: World) -> None:
+        world.kept[id(self)] = world.link.counts.lost
         world.link.gone(self.for_s)
         if self.telemetry:
             world.wire.block(self)
+
+    def lacking(self, world: World) -> str:
+        return "" if world.link.counts.lost > world.kept[id(self)] else "no packet was lost"
 
     def mend(self, world: World) -> None:
         if self.telemetry:
             world.wire.mend(self)
 
 
+class Silences(Step):
+    """Base of steps in which telemetry does not come through."""
+
+    def inject(self, world: World) -> None:
+        world.kept[id(self)] = world.heard_up_to_s()
+
+    def lacking(self, world: World) -> str:
+        heard_s = world.heard_up_to_s() - world.kept[id(self)]
+        return f"{heard_s:.1f} s more of health were heard" if heard_s > self.for_s / 2 else ""
+
+    def mend(self, world: World) -> None:
+        world.wire.mend(self)
+
+
 @dataclass(frozen=True)
-class TelemetryCut(Step):
+class TelemetryCut(Silences):
     """The payload's Zenoh session is reset, and cannot come back meanwhile."""
 
     def inject(self, world: World) -> None:
+        super().inject(world)
         world.wire.cut(self)
-
-    def mend(self, world: World) -> None:
-        world.wire.mend(self)
 
 
 @dataclass(frozen=True)
-class TelemetryBlocked(Step):
+class TelemetryBlocked(Silences):
     """Its connection stays, and nothing comes through in either direction."""
 
     def inject(self, world: World) -> None:
+        super().inject(world)
         world.wire.block(self)
-
-    def mend(self, world: World) -> None:
-        world.wire.mend(self)

@@ -7,11 +7,15 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from standing import is_stopped
+
 from scenarios import disk
 from scenarios.step import Step
 
 if TYPE_CHECKING:
     from scenarios.world import World
+
+NAME = "blimp-1"
 
 GAUGES = {
     "absent": "i2c:ina219@fake:0x40?absent=1",
@@ -31,6 +35,9 @@ class PayloadKilled(Step):
     def inject(self, world: World) -> None:
         world.hold_payload(self, kill=True)
 
+    def lacking(self, world: World) -> str:
+        return "" if world.run.killed else "it flies on"
+
     def mend(self, world: World) -> None:
         world.let_payload(self)
 
@@ -41,6 +48,9 @@ class PayloadRestarted(Step):
 
     same_ssrc: bool = False
     STARTS: ClassVar[bool] = True
+
+    def lacking(self, world: World) -> str:
+        return "" if world.runs[-2 if self.same_ssrc else -1].ended else "it flies on"
 
     def inject(self, world: World) -> None:
         if self.same_ssrc:
@@ -61,6 +71,9 @@ class PayloadStopped(Step):
         world.kept[id(self)] = world.run
         world.run.send(signal.SIGSTOP)
 
+    def lacking(self, world: World) -> str:
+        return "" if is_stopped(world.run.process.pid) else "it runs"
+
     def mend(self, world: World) -> None:
         run = world.kept.pop(id(self))
         if run.ended is None:
@@ -76,6 +89,9 @@ class PayloadClock(Step):
     def inject(self, world: World) -> None:
         world.disturb(self, "stepped_clock", int(1e9 * self.by_s))
 
+    def lacking(self, world: World) -> str:
+        return "" if "stepped_clock" in world.shims else "no shim sets it"
+
     def mend(self, world: World) -> None:
         world.disturb(self, "stepped_clock", 0)
 
@@ -86,6 +102,9 @@ class CameraFault(Step):
 
     kind: str = "black"
     STARTS: ClassVar[bool] = True
+
+    def lacking(self, world: World) -> str:
+        return "" if world.run.camera is world.cameras.get(self.kind) else "another camera flies"
 
     def inject(self, world: World) -> None:
         world.configure(self, {"camera": self.kind})
@@ -100,6 +119,13 @@ class GaugeFault(Step):
 
     kind: str = "nonsense"
     STARTS: ClassVar[bool] = True
+
+    def lacking(self, world: World) -> str:
+        note = world.heard.payload(NAME)
+        battery = note.battery if note is not None else None
+        if battery is None or battery.time_ns / 1e9 < time.time() - 2.0:
+            return "" if self.kind == "absent" else "no battery is told of"
+        return "" if battery.refused + battery.read_errors else "all readings are good"
 
     def inject(self, world: World) -> None:
         options = {"battery.uri": GAUGES[self.kind], "battery.period_s": "0.2"}
@@ -118,6 +144,10 @@ class EncoderStalls(Step):
     def inject(self, world: World) -> None:
         world.disturb(self, "encoder_fault", _ENCODER_GIVES_NONE)
 
+    def lacking(self, world: World) -> str:
+        silent_s = time.monotonic() - max(world.run.watch.at_s, default=0.0)
+        return "" if silent_s > self.for_s / 2 else f"it gave a frame {silent_s:.1f} s ago"
+
     def mend(self, world: World) -> None:
         world.disturb(self, "encoder_fault", 0)
 
@@ -129,6 +159,11 @@ class CardFull(Step):
     def inject(self, world: World) -> None:
         world.kept[id(self)] = (world.run, world.end_recording("card"))
         disk.limit_files(world.run.process.pid, disk.largest(world.card))
+
+    def lacking(self, world: World) -> str:
+        note = world.heard.payload(NAME)
+        file = note.recording if note is not None else ""
+        return f"it records into {file}" if file else ""
 
     def mend(self, world: World) -> None:
         run, window = world.kept.pop(id(self))

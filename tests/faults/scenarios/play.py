@@ -15,7 +15,7 @@ from pi_firmware.wire.messages import Health
 from scenarios.burden import Burden
 from scenarios.camera import Cameras
 from scenarios.judge import TRACKING, Verdict, judge
-from scenarios.step import Scenario, as_json
+from scenarios.step import Scenario, Step, as_json
 from scenarios.world import NAME, RATE_HZ, World, tick
 
 RECOVERED_S, STARTED_S = 10.0, 25.0
@@ -110,10 +110,8 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
         step = scenario.steps[number]
         while time.monotonic() < began_s + due_s:
             tick(world)
-        if ends and number in begun and step.for_s:
-            _do(world, f"mended: {type(step).__name__}", step.mend)
-        elif ends:
-            _do(world, "", step.mend) if number in begun else None
+        if ends and number in begun:
+            _end(world, step, alone=scenario.alone(step))
         else:
             begun.add(number)
             verdict.injected.append(str(step))
@@ -131,6 +129,18 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
     still_s = time.monotonic() + _STILL_S
     while time.monotonic() < still_s:
         tick(world)
+
+
+def _end(world: World, step: Step, *, alone: bool) -> None:
+    """Mends a step; one whose traces no other blurs must have done what it is for."""
+
+    def look(world: World) -> None:
+        if lacks := step.lacking(world):
+            world.complain(f"{step}: nothing befell: {lacks}")
+
+    if alone:
+        _do(world, "", look)
+    _do(world, f"mended: {type(step).__name__}" if step.for_s else "", step.mend)
 
 
 def _do(world: World, text: str, what: Callable[[World], None]) -> None:

@@ -9,6 +9,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from standing import is_stopped
+
 from scenarios import disk
 from scenarios.step import Step
 
@@ -25,14 +27,17 @@ class Killed(Step):
 
     def inject(self, world: World) -> None:
         found = world.child(self.process)
+        world.kept[id(self)] = found
         if found is None:
-            world.say(f"no {self.process} to kill")
             return
         if self.process == "intake":
             world.end_recording("ground")
             world.intake_anew_s.append(time.monotonic())
         with contextlib.suppress(ProcessLookupError):
             os.kill(found.pid, signal.SIGKILL)
+
+    def lacking(self, world: World) -> str:
+        return "" if world.kept[id(self)] else f"no {self.process} to kill"
 
 
 @dataclass(frozen=True)
@@ -44,10 +49,14 @@ class Stopped(Step):
 
     def inject(self, world: World) -> None:
         found = world.kept[id(self)] = world.child(self.process)
-        if found is None:
-            world.say(f"no {self.process} to stop")
-        else:
+        if found is not None:
             os.kill(found.pid, signal.SIGSTOP)
+
+    def lacking(self, world: World) -> str:
+        found = world.kept[id(self)]
+        if found is None:
+            return f"no {self.process} to stop"
+        return "" if is_stopped(found.pid) or not found.living else "it runs"
 
     def mend(self, world: World) -> None:
         found = world.kept.pop(id(self))
@@ -64,21 +73,19 @@ class ServiceKilled(Step):
     def inject(self, world: World) -> None:
         world.hold_service(self)
 
+    def lacking(self, world: World) -> str:
+        return "it serves" if world.service.process.poll() is None else ""
+
     def mend(self, world: World) -> None:
         world.let_service(self)
 
 
 @dataclass(frozen=True)
-class ServiceRestarted(Step):
+class ServiceRestarted(ServiceKilled):
     """The same in order, as for an update."""
-
-    STARTS: ClassVar[bool] = True
 
     def inject(self, world: World) -> None:
         world.hold_service(self, kill=False)
-
-    def mend(self, world: World) -> None:
-        world.let_service(self)
 
 
 @dataclass(frozen=True)
@@ -89,6 +96,9 @@ class GroundClock(Step):
 
     def inject(self, world: World) -> None:
         world.disturb(self, "ground_clock", int(1e9 * self.by_s))
+
+    def lacking(self, world: World) -> str:
+        return "" if "ground_clock" in world.shims else "no shim sets it"
 
     def mend(self, world: World) -> None:
         world.disturb(self, "ground_clock", 0)
@@ -105,6 +115,9 @@ class DiskFull(Step):
         elif found := world.child("intake"):
             disk.limit_files(found.pid, disk.largest(world.service.recordings))
         world.kept[id(self)] = (found, world.end_recording("ground"))
+
+    def lacking(self, world: World) -> str:
+        return "it records" if world.recording() else ""
 
     def mend(self, world: World) -> None:
         found, window = world.kept.pop(id(self))
@@ -130,6 +143,9 @@ class FolderTaken(Step):
         with contextlib.suppress(Exception):  # a web process may be down at this moment
             world.service.client.post("/api/recording", json={"active": False})
             world.service.client.post("/api/recording", json={"active": True})
+
+    def lacking(self, world: World) -> str:
+        return "it records" if id(self) not in world.kept or world.recording() else ""
 
     def mend(self, world: World) -> None:
         if kept := world.kept.pop(id(self), None):

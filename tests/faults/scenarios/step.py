@@ -45,6 +45,10 @@ class Step:
         """Begins the fault."""
         raise NotImplementedError
 
+    def lacking(self, world: World) -> str:
+        """What of the fault cannot be seen at its end, before it is mended; '' where it was one."""
+        raise NotImplementedError
+
     def mend(self, world: World) -> None:
         """Ends it; nothing to do for what mends itself."""
 
@@ -66,6 +70,13 @@ class Scenario:
     steps: tuple[Step, ...]
     disk_MB: int = 0
     foxglove: bool = False
+
+    def alone(self, step: Step) -> bool:
+        """Whether no other fault befalls the flight meanwhile, whose traces it would blur."""
+        return all(
+            other is step or other.until_s < step.at_s or step.until_s < other.at_s
+            for other in self.steps
+        )
 
     @property
     def until_s(self) -> float:

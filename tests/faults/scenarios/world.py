@@ -23,10 +23,10 @@ from scenarios import disk
 from scenarios.camera import Cameras
 from scenarios.heard import Heard
 from scenarios.payload_run import PayloadRun
+from scenarios.payload_steps import NAME
 from scenarios.recordings import Window
 from scenarios.tcp_wire import TcpWire
 
-NAME = "blimp-1"
 RATE_HZ = 10.0
 SPEED = 0.5
 """Of the recorded flight: a machine that is busy, too, skips frames and still tracks."""
@@ -263,6 +263,11 @@ class World:
             together = max if name == "encoder_fault" else sum
             self.shims[name].set(together(numbers.values()))
 
+    def heard_up_to_s(self) -> float:
+        """The payload's uptime in the newest of its health that the ground has; 0 without."""
+        note = self.heard.payload(NAME)
+        return note.health.uptime_s if note is not None and note.health is not None else 0.0
+
     # The link
 
     def impair(self, step: object, impairment: Impairment | None) -> None:
@@ -315,8 +320,7 @@ class World:
         until_s = time.monotonic() + limit_s
         while time.monotonic() < until_s:
             with contextlib.suppress(httpx.HTTPError, AssertionError):
-                recording = self.service.state()["recording"]  # None: it was not told yet
-                if recording is not None and recording["active"]:
+                if self.recording():
                     return
                 self.service.client.post("/api/recording", json={"active": True})
             time.sleep(0.3)
@@ -324,6 +328,11 @@ class World:
     def _listen(self) -> None:
         run, self.service_runs = self.service_runs, self.service_runs + 1
         self.heard.listen(self._bus.enter_context(self.service.bus()), run)
+
+    def recording(self) -> bool:
+        """Whether the ground says that it records."""
+        told = self.service.state()["recording"]
+        return told is not None and bool(told["active"])
 
     def complain(self, text: str) -> None:
         """Something broke an invariant on the way."""
