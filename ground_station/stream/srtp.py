@@ -31,7 +31,8 @@ REPLAY_WINDOW = MAX_JUMP
 """Packets of which it is known whether they came. The reorderer would take older ones for a new
 sender's."""
 STREAMS = 64
-"""SSRCs kept; each of them has authenticated itself, so that no flood fills them."""
+"""SSRCs kept for each key; each of them has authenticated itself, so that no flood fills them, and
+no payload another's."""
 SEARCH_RATE_HZ = 20_000
 """Tags computed a second, at most, to find ROCs, of 1.7 microseconds each where it was measured."""
 SEARCH_TAGS = 2048
@@ -171,7 +172,7 @@ class Unprotector:
             SessionKeys(payload_id, master, SRTP_LABEL) for payload_id, master in keys.items()
         ]
         self._ssrc = ssrc
-        self._streams: dict[int, dict[str, _Stream]] = {}
+        self._streams: dict[str, dict[int, _Stream]] = {payload_id: {} for payload_id in keys}
         # Apart, so that a flood of unknown streams does not keep a known one from coming back.
         self._to_join, self._to_follow = _Budget(clock), _Budget(clock)
         # One half for young streams, the other for older ones, and the payloads share both.
@@ -193,11 +194,11 @@ class Unprotector:
             return None
         stream, index = found
         self.sender = stream.keys.payload_id
-        streams = self._streams.pop(packet.ssrc, {})
-        streams[self.sender] = stream
-        self._streams[packet.ssrc] = streams  # behind those that were heard less lately
-        if len(self._streams) > STREAMS:
-            del self._streams[next(iter(self._streams))]
+        own = self._streams[self.sender]
+        own.pop(packet.ssrc, None)
+        own[packet.ssrc] = stream  # behind those that were heard less lately
+        if len(own) > STREAMS:
+            del own[next(iter(own))]
         if not stream.accept(index):
             self.counters.replayed += 1
             return None
@@ -206,15 +207,15 @@ class Unprotector:
 
     def _find(self, packet: _Packet) -> tuple[_Stream, int] | None:
         """The packet's stream and index, authenticated; None when it is not authentic."""
-        streams = self._streams.get(packet.ssrc, {})
-        for stream in streams.values():
+        known = {who: own[packet.ssrc] for who, own in self._streams.items() if packet.ssrc in own}
+        for stream in known.values():
             index = stream.estimate(packet.sequence)
             if _made_with(stream.keys.begin_tag(packet.authenticated), index >> 16, packet.tag):
                 return stream, index
-        for stream in streams.values():
+        for stream in known.values():
             if (found := self._follow(packet, stream)) is not None:
                 return found
-        return self._join(packet, [own for own in self._keys if own.payload_id not in streams])
+        return self._join(packet, [own for own in self._keys if own.payload_id not in known])
 
     def _follow(self, packet: _Packet, stream: _Stream) -> tuple[_Stream, int] | None:
         """A known stream after a silence of more than half a round of the sequence numbers."""

@@ -251,7 +251,7 @@ def test_a_flood_of_streams_is_searched_within_bounds_and_kept_out(sender: SrtpS
         for hostile in junk(1000):
             unprotector.unprotect(hostile)
         assert unprotector.tags_searched - before <= srtp.SEARCH_RATE_HZ + srtp.SEARCH_TAGS
-    assert len(unprotector._streams) == 1
+    assert sum(map(len, unprotector._streams.values())) == 1
     # A new stream is found as soon as there is something left to search with.
     late = sender.protect([rtp(number, ssrc=78) for number in range(2)])
     assert unprotector.unprotect(late[0]) is None
@@ -277,8 +277,18 @@ def test_streams_are_bounded_and_those_heard_lately_are_kept(sender: SrtpSender)
         own, other = sender.protect([rtp(number, ssrc=1), rtp(number, ssrc=1000 + number)])
         assert unprotector.unprotect(own) is not None
         assert unprotector.unprotect(other) is not None
-    assert len(unprotector._streams) == srtp.STREAMS
-    assert 1 in unprotector._streams and 1000 not in unprotector._streams
+    assert len(unprotector._streams[ID]) == srtp.STREAMS
+    assert 1 in unprotector._streams[ID] and 1000 not in unprotector._streams[ID]
+
+
+def test_a_payload_with_many_ssrcs_takes_no_place_of_anothers_stream(sender: SrtpSender) -> None:
+    unprotector = Unprotector({ID: KEY, "blimp-2": OTHER_KEY})
+    (packet,) = sender.protect([rtp(0, ssrc=1)])
+    assert unprotector.unprotect(packet) is not None
+    with SrtpSender(OTHER_KEY) as other:
+        for protected in other.protect(rtp(0, ssrc=100 + number) for number in range(70)):
+            assert unprotector.unprotect(protected) is not None
+    assert unprotector.unprotect(packet) is None and unprotector.counters.replayed == 1
 
 
 def test_an_earlier_part_played_back_does_not_keep_the_live_stream_away(
@@ -323,7 +333,7 @@ def test_a_counter_at_its_end_does_not_end_the_receiver(sender: SrtpSender) -> N
     packet = sender.protect([rtp(0)])[0]
     unprotector = Unprotector({ID: KEY})
     assert unprotector.unprotect(packet) is not None
-    unprotector._streams[77][ID].highest = (1 << 48) - 1
+    unprotector._streams[ID][77].highest = (1 << 48) - 1
     assert unprotector.unprotect(packet) is None
 
 
