@@ -232,6 +232,7 @@ class World:
             "camera.rate_hz": f"{self._rate_hz:g}",
             "link.port": str(self.link.port),
             "link.ssrc": str(ssrc),
+            "link.history_s": "0",  # what the link loses stays lost: each frame can be told
             "telemetry.connect": json.dumps([f"tcp/127.0.0.1:{self.wire.port}"]),
             "recording.folder": str(self.card),
             "recording.at_start": "true",
