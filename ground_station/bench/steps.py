@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.geometry.trajectory import Trajectory
@@ -33,8 +34,6 @@ from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
 from pi_firmware.wire.recording import TRUTH_TOPIC
 
-Array = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
 Pairs = list[tuple[int, int]]
 
 _FEATURES, _LANDMARKS, _DIMENSION, _RADIUS_PX = 1000, 3000, 256, 40.0
@@ -81,9 +80,9 @@ def association(seed: int, repetitions: int) -> dict[str, Any]:
 
 
 def _associate_by_loop(
-    feature_px: Array,
+    feature_px: F64,
     feature: F32,
-    landmark_px: Array,
+    landmark_px: F64,
     landmark: F32,
     settings: AssociationSettings,
 ) -> Pairs:

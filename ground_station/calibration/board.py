@@ -14,14 +14,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import tomli_w
 
+from ground_station.arrays import F64
 from ground_station.calibration.errors import CalibrationError
 from ground_station.files import write_text
 from pi_firmware.wire import config
-
-Array = npt.NDArray[np.float64]
 
 DICTIONARIES = [f"{bits}X{bits}_{size}" for bits in (4, 5, 6, 7) for size in (50, 100, 250, 1000)]
 """OpenCV's predefined dictionaries of markers, without its prefix `DICT_`."""
@@ -83,7 +81,7 @@ class Board:
         """What it is, in a few words."""
         return f"{self.columns}x{self.rows} squares with markers of {self.dictionary}"
 
-    def points_m(self, measured_mm: tuple[float, float] | None = None) -> Array:
+    def points_m(self, measured_mm: tuple[float, float] | None = None) -> F64:
         """All corners (N, 3), metres, by id: row by row.
 
         `measured_mm` are a square's width and height as measured, for a printer that scales.
@@ -101,7 +99,7 @@ class Board:
         made.setLegacyPattern(self.legacy_pattern)
         return made
 
-    def black_mm(self) -> Array:
+    def black_mm(self) -> F64:
         """What is to be printed: black rectangles (K, 4), x y width height from the top left."""
         board = self.charuco()
         marks: Any = board.getDictionary()

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.calibration import lens, selection, verdict
 from ground_station.calibration.certainty import at_corners_px
 from ground_station.calibration.detection import BoardFinder
@@ -18,8 +18,6 @@ from ground_station.calibration.readout import Readout, readout_of
 from ground_station.calibration.views import View, views_of
 from ground_station.errors import CameraError
 from ground_station.geometry.camera import Camera
-
-Array = npt.NDArray[np.float64]
 
 MAX_VIEWS = 40
 _POOR = 3.0
@@ -53,8 +51,8 @@ class Result:
     seen: list[View]
     readout: Readout | None
     size_px: tuple[int, int]
-    tilts_deg: Array
-    distances_m: Array
+    tilts_deg: F64
+    distances_m: F64
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -174,13 +172,13 @@ def _rms_as_fisheye(result: Result) -> float:
         return np.inf
 
 
-def _outline_m(points_m: Array) -> Array:
+def _outline_m(points_m: F64) -> F64:
     """The board's outermost corners (4, 2), metres."""
     low, high = points_m[:, :2].min(axis=0), points_m[:, :2].max(axis=0)
     return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
-def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: Array, model: str) -> Array:
+def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: F64, model: str) -> F64:
     """A lens (D,) to choose views by: of a few that are unlike each other."""
     begin = selection.spread(usable, size_px, _outline_m(points_m))
     points = [usable[k].points(size_px[1], None) for k in begin]
@@ -198,10 +196,10 @@ class _Chooser:
 
     usable: Sequence[View]
     size_px: tuple[int, int]
-    points_m: Array
+    points_m: F64
     most: int
 
-    def __call__(self, theta: Array, readout_s: float | None) -> tuple[list[View], Fit]:
+    def __call__(self, theta: F64, readout_s: float | None) -> tuple[list[View], Fit]:
         points = [view.points(self.size_px[1], readout_s) for view in self.usable]
         located, poses = _located(theta, points)
         if len(located) < verdict.MIN_VIEWS:
@@ -214,7 +212,7 @@ class _Chooser:
         return [candidates[k] for k in chosen], fit
 
 
-def _located(theta: Array, points: Sequence[Points]) -> tuple[list[int], list[Array]]:
+def _located(theta: F64, points: Sequence[Points]) -> tuple[list[int], list[F64]]:
     """Which views the board has a pose in, and these poses."""
     poses = [lens.locate(theta, one) for one in points]
     found = [(k, pose) for k, pose in enumerate(poses) if pose is not None]

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from ground_station.calibration import lens
 from ground_station.calibration.lens import Fit
 from ground_station.calibration.selection import CORNERS
-
-Array = npt.NDArray[np.float64]
 
 _ACROSS, _DOWN = 9, 7
 

@@ -7,14 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, U8, Bools
 from ground_station.calibration.board import DICTIONARIES, Board, dictionary
 from ground_station.recording.frames import Frame
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Image = npt.NDArray[np.uint8]
 
 MIN_CORNERS = 8
 """A homography needs four corners; twice as many tell when one of them is wrong."""
@@ -38,18 +34,18 @@ class BoardObservation:
     index: int
     name: str
     time_ns: int
-    ids: Ints
-    px: Array
+    ids: I64
+    px: F64
     square_px: float
     edge_px: float
-    H: Array
+    H: F64
 
-    def plane_px(self, points_m: Array) -> Array:
+    def plane_px(self, points_m: F64) -> F64:
         """Where its homography puts board points (N, 2 or 3), pixels."""
         return apply_homography(self.H, points_m[:, :2])
 
 
-def apply_homography(H: Array, points: Array) -> Array:
+def apply_homography(H: F64, points: F64) -> F64:
     """Points (N, 2) through a homography (3, 3)."""
     homogeneous = points @ H[:, :2].T + H[:, 2]
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
@@ -58,7 +54,7 @@ def apply_homography(H: Array, points: Array) -> Array:
 class BoardFinder:
     """Finds one board in grey pictures. `points_m` (N, 3) are its corners' true places."""
 
-    def __init__(self, board: Board, points_m: Array) -> None:
+    def __init__(self, board: Board, points_m: F64) -> None:
         self.board, self.points_m = board, points_m
         self._detector = cv2.aruco.CharucoDetector(board.charuco())
         grid = np.arange(board.corners).reshape(board.rows - 1, board.columns - 1)
@@ -93,16 +89,16 @@ class BoardFinder:
             source, frame.index, frame.name, frame.time_ns, ids, px, square_px, edge_px, H
         )
 
-    def corners_of(self, image: Image) -> int:
+    def corners_of(self, image: U8) -> int:
         """How many corners there are, however few."""
         numbers = self._detector.detectBoard(image)[1]
         return 0 if numbers is None else len(numbers)
 
-    def _on_a_line(self, ids: Ints) -> bool:
+    def _on_a_line(self, ids: I64) -> bool:
         across = self.board.columns - 1
         return min(len(np.unique(ids // across)), len(np.unique(ids % across))) < 2
 
-    def _homography(self, ids: Ints, px: Array, off_px: float) -> tuple[Any, Any]:
+    def _homography(self, ids: I64, px: F64, off_px: float) -> tuple[Any, Any]:
         if len(ids) < MIN_CORNERS:
             return None, np.zeros(len(ids), bool)
         H, mask = cv2.findHomography(self.points_m[ids, :2], px, cv2.RANSAC, off_px)
@@ -110,7 +106,7 @@ class BoardFinder:
             return None, np.zeros(len(ids), bool)
         return H, mask.ravel().astype(bool)
 
-    def _neighbours(self, ids: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
+    def _neighbours(self, ids: I64) -> tuple[I64, Bools]:
         """Places (P, 2) in `ids` of corners that are neighbours; whether each pair is of a row."""
         place = np.full(self.board.corners, -1)
         place[ids] = np.arange(len(ids))
@@ -118,13 +114,13 @@ class BoardFinder:
         both = (pairs >= 0).all(axis=1)
         return pairs[both], self._is_across[both]
 
-    def _square_px(self, ids: Ints, px: Array) -> float | None:
+    def _square_px(self, ids: I64, px: F64) -> float | None:
         pairs, _ = self._neighbours(ids)
         if not len(pairs):
             return None
         return float(np.median(np.linalg.norm(px[pairs[:, 0]] - px[pairs[:, 1]], axis=1)))
 
-    def _edge_px(self, image: Image, ids: Ints, px: Array) -> float | None:
+    def _edge_px(self, image: U8, ids: I64, px: F64) -> float | None:
         """The median width of the edges between squares, of the blurrier direction of the two.
 
         Each edge between neighbouring corners is crossed three times: the contrast of the board
@@ -153,7 +149,7 @@ class BoardFinder:
         return max(float(np.median(group)) for group in groups if len(group))
 
 
-def other_board(board: Board, pictures: list[Image]) -> str | None:
+def other_board(board: Board, pictures: list[U8]) -> str | None:
     """What there is instead of the board in pictures without it: a sentence, or None."""
     finder = BoardFinder(board, board.points_m())
     for image in pictures:

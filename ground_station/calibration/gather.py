@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from ground_station.calibration.detection import BoardFinder, BoardObservation, Image
+from ground_station.arrays import U8
+from ground_station.calibration.detection import BoardFinder, BoardObservation
 from ground_station.errors import InputError
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameSource
@@ -24,7 +25,7 @@ class Gathered:
     frames: int = 0
     size_px: tuple[int, int] = (0, 0)
     observations: list[BoardObservation] = field(default_factory=list)
-    without: list[Image] = field(default_factory=list)
+    without: list[U8] = field(default_factory=list)
     interrupted: bool = False
 
 

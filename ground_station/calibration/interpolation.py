@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F64
 
 
-def lagrange(nodes_s: Array, times_s: Array) -> tuple[Array, Array]:
+def lagrange(nodes_s: F64, times_s: F64) -> tuple[F64, F64]:
     """Lagrange's polynomials of M nodes at N times (N, M), and their derivatives (N, M)."""
     m = len(nodes_s)
     off = times_s[:, None] - nodes_s  # (N, M)

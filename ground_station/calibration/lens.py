@@ -16,14 +16,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.calibration.errors import CalibrationError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens_models import MODELS, KannalaBrandt
-
-Array = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 NAMES = {model: ("fx_px", "fy_px", "cx_px", "cy_px", *kind.NAMES) for model, kind in MODELS.items()}
 """Each model's numbers, in the order of OpenCV's Jacobian."""
@@ -47,8 +44,8 @@ _CONVERGED = 1e-7
 class Points:
     """A view as the adjustment takes it: board points (N, 3), metres, pixels (N, 2), deviation."""
 
-    points_m: Array
-    px: Array
+    points_m: F64
+    px: F64
     sigma_px: float
 
 
@@ -62,12 +59,12 @@ class Fit:
     view (1 where views' deviations were right).
     """
 
-    theta: Array
-    poses: Array
-    residuals: list[Array]
+    theta: F64
+    poses: F64
+    residuals: list[F64]
     used: list[Bools]
-    information: Array
-    covariance: Array
+    information: F64
+    covariance: F64
     sigma: float
 
     @property
@@ -105,23 +102,23 @@ class Fit:
         return Camera(readout_s=readout_s, **values)
 
 
-def model_of(theta: Array) -> str:
+def model_of(theta: F64) -> str:
     """The model of a lens (D,), as in the camera's file."""
     return _MODEL[len(theta)]
 
 
-def rms(residuals: Array) -> float:
+def rms(residuals: F64) -> float:
     """The root of the mean square of (N, 2) residuals' lengths; NaN of none."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else math.nan
 
 
-def matrix(theta: Array) -> Array:
+def matrix(theta: F64) -> F64:
     """K (3, 3)."""
     fx, fy, cx, cy = theta[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-def project(theta: Array, pose: Array, points_m: Array) -> tuple[Array, Array, Array]:
+def project(theta: F64, pose: F64, points_m: F64) -> tuple[F64, F64, F64]:
     """Pixels (N, 2) of board points, and their derivatives by pose (2N, 6) and lens (2N, D)."""
     if model_of(theta) == "fisheye":
         px, jacobian = cv2.fisheye.projectPoints(
@@ -134,7 +131,7 @@ def project(theta: Array, pose: Array, points_m: Array) -> tuple[Array, Array, A
     return np.asarray(px, np.float64).reshape(-1, 2), J[:, :6], J[:, 6:15]
 
 
-def locate(theta: Array, view: Points) -> Array | None:
+def locate(theta: F64, view: Points) -> F64 | None:
     """The board's pose (6,) in a view, None where there is none in front of the camera."""
     points, px, K, numbers = view.points_m, view.px, matrix(theta), theta[4:]
     if model_of(theta) == "fisheye":
@@ -151,14 +148,14 @@ def locate(theta: Array, view: Points) -> Array | None:
     return pose if np.isfinite(pose).all() and pose[5] > 0 else None
 
 
-def information(theta: Array, pose: Array, view: Points) -> Array:
+def information(theta: F64, pose: F64, view: Points) -> F64:
     """What one view tells of the lens (D, D) when its pose is not known."""
     _, Jp, Jl = project(theta, pose, view.points_m)
     U, C, V = Jp.T @ Jp, Jp.T @ Jl, Jl.T @ Jl
     return np.asarray((V - C.T @ np.linalg.lstsq(U, C, rcond=None)[0]) / view.sigma_px**2)
 
 
-def first_guess(views: Sequence[Points], size_px: tuple[int, int], model: str = "opencv5") -> Array:
+def first_guess(views: Sequence[Points], size_px: tuple[int, int], model: str = "opencv5") -> F64:
     """A lens (D,) to begin with: Zhang's closed form for the focal length, no distortion.
 
     Of a fisheye that closed form knows nothing: of equidistant lenses, the one that fits best.
@@ -182,7 +179,7 @@ def first_guess(views: Sequence[Points], size_px: tuple[int, int], model: str = 
     return np.array([focal, focal, *centre, 0, 0, 0, 0, 0])
 
 
-def _misfit_px(theta: Array, views: Sequence[Points]) -> float:
+def _misfit_px(theta: F64, views: Sequence[Points]) -> float:
     """How far corners are off in the middle one of views, each at its own pose; inf without any."""
     off = [math.inf]
     for view in views:
@@ -193,7 +190,7 @@ def _misfit_px(theta: Array, views: Sequence[Points]) -> float:
     return float(np.median(off))
 
 
-def weak_prior(size_px: tuple[int, int], model: str = "opencv5") -> Array:
+def weak_prior(size_px: tuple[int, int], model: str = "opencv5") -> F64:
     """Information (D,) of what any lens is like, which keeps a first adjustment from running off.
 
     Principal point within a tenth of the width, mild distortion.
@@ -204,7 +201,7 @@ def weak_prior(size_px: tuple[int, int], model: str = "opencv5") -> Array:
 
 
 def adjust(
-    views: Sequence[Points], theta: Array, poses: Sequence[Array], prior: Array | None = None
+    views: Sequence[Points], theta: F64, poses: Sequence[F64], prior: F64 | None = None
 ) -> Fit:
     """The lens and poses of least robust squares from a beginning; gross corners do not count.
 
@@ -228,7 +225,7 @@ def adjust(
     return problem.fit(state, used)
 
 
-def _spread(residuals: Sequence[Array], views: Sequence[Points]) -> float:
+def _spread(residuals: Sequence[F64], views: Sequence[Points]) -> float:
     """A corner's deviation over its view's, by the median: wrong corners do not change it."""
     scaled = [np.abs(r).ravel() / v.sigma_px for r, v in zip(residuals, views, strict=True)]
     least = _LEAST_SIGMA_PX / min(view.sigma_px for view in views)
@@ -238,17 +235,17 @@ def _spread(residuals: Sequence[Array], views: Sequence[Points]) -> float:
 class _Problem:
     """The equations of an adjustment."""
 
-    def __init__(self, views: Sequence[Points], theta0: Array, prior: Array) -> None:
+    def __init__(self, views: Sequence[Points], theta0: F64, prior: F64) -> None:
         self.views, self.theta0, self.prior = views, theta0, prior
 
-    def residuals(self, state: tuple[Array, Array]) -> list[Array]:
+    def residuals(self, state: tuple[F64, F64]) -> list[F64]:
         theta, poses = state
         return [
             view.px - project(theta, pose, view.points_m)[0]
             for view, pose in zip(self.views, poses, strict=True)
         ]
 
-    def minimise(self, state: tuple[Array, Array], used: Sequence[Bools]) -> tuple[Array, Array]:
+    def minimise(self, state: tuple[F64, F64], used: Sequence[Bools]) -> tuple[F64, F64]:
         """Levenberg–Marquardt with Huber's weights, reweighted each step (IRLS)."""
         damping = 1e-3
         scale = _spread(self.residuals(state), self.views)
@@ -278,12 +275,12 @@ class _Problem:
         return state
 
     def _linearise(
-        self, state: tuple[Array, Array], used: Sequence[Bools], scale: float
-    ) -> tuple[float, list[tuple[Array, ...]]]:
+        self, state: tuple[F64, F64], used: Sequence[Bools], scale: float
+    ) -> tuple[float, list[tuple[F64, ...]]]:
         theta, poses = state
         off = theta - self.theta0
         cost = float(self.prior @ off**2)
-        parts: list[tuple[Array, ...]] = []
+        parts: list[tuple[F64, ...]] = []
         for view, pose, kept in zip(self.views, poses, used, strict=True):
             px, Jp, Jl = project(theta, pose, view.points_m)
             r = view.px - px
@@ -297,8 +294,8 @@ class _Problem:
         return (cost if math.isfinite(cost) else math.inf), parts
 
     def _step(
-        self, state: tuple[Array, Array], parts: Sequence[tuple[Array, ...]], damping: float
-    ) -> tuple[Array, Array]:
+        self, state: tuple[F64, F64], parts: Sequence[tuple[F64, ...]], damping: float
+    ) -> tuple[F64, F64]:
         theta, poses = state
         S = np.diag(self.prior)
         g = self.prior * (self.theta0 - theta)
@@ -316,7 +313,7 @@ class _Problem:
         d_poses = np.array([both[:, count] - both[:, :count] @ d_theta for both in solved])
         return theta + d_theta, poses + d_poses
 
-    def fit(self, state: tuple[Array, Array], used: list[Bools]) -> Fit:
+    def fit(self, state: tuple[F64, F64], used: list[Bools]) -> Fit:
         """The result with its covariance: of the corners' noise, or of the views' scatter.
 
         Corners of one view may err alike (a bent board, a shutter that rolls): each view's own

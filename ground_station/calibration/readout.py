@@ -19,15 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64
 from ground_station.calibration import lens
 from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
 from ground_station.calibration.views import View
-
-Array = npt.NDArray[np.float64]
 
 FRAMES = 4
 """Of one window. With four, the errors of a cubic's velocity at its frames cancel each other."""
@@ -64,17 +62,17 @@ class Readout:
 class _Window:
     """Frames in a row: board points, pixels, frame times (after the second frame), poses."""
 
-    points_m: Array
-    px: Array
-    row: Array
-    frame_s: Array
-    nodes_s: Array
-    R0: Array
-    turn: Array
-    shift_m: Array
+    points_m: F64
+    px: F64
+    row: F64
+    frame_s: F64
+    nodes_s: F64
+    R0: F64
+    turn: F64
+    shift_m: F64
 
 
-def readout_of(views: Sequence[View], theta: Array, height_px: int) -> Readout | None:
+def readout_of(views: Sequence[View], theta: F64, height_px: int) -> Readout | None:
     """The readout time by the views in motion; None where no frames in a row are in motion.
 
     `views` are sorted by input and time, `theta` (D,) is the lens.
@@ -143,7 +141,7 @@ def _moving(views: Sequence[View]) -> list[list[View]]:
     return parts
 
 
-def _window(part: Sequence[View], theta: Array, height_px: int) -> _Window | None:
+def _window(part: Sequence[View], theta: F64, height_px: int) -> _Window | None:
     poses = [lens.locate(theta, Points(v.points_m, v.seen.px, 1.0)) for v in part]
     found = [pose for pose in poses if pose is not None]
     if len(found) < FRAMES:
@@ -165,14 +163,14 @@ def _window(part: Sequence[View], theta: Array, height_px: int) -> _Window | Non
     )
 
 
-def _cross(v: Array) -> Array:
+def _cross(v: F64) -> F64:
     """The matrices [v]× (N, 3, 3) of (N, 3)."""
     x, y, z = v.T
     o = np.zeros_like(x)
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
 
 
-def _left_jacobian(v: Array) -> Array:
+def _left_jacobian(v: F64) -> F64:
     """SO(3)'s left Jacobians (N, 3, 3) of rotation vectors (N, 3). Barfoot 2017, eq. 7.77."""
     angle = np.linalg.norm(v, axis=1)
     small = angle < 1e-4
@@ -183,7 +181,7 @@ def _left_jacobian(v: Array) -> Array:
     return np.asarray(np.eye(3) + first[:, None, None] * X + second[:, None, None] * (X @ X))
 
 
-def _linearise(w: _Window, theta: Array, readout_s: float) -> tuple[Array, Array, Array]:
+def _linearise(w: _Window, theta: F64, readout_s: float) -> tuple[F64, F64, F64]:
     """Residuals (2N,), their derivatives by the nodes (2N, 6·FRAMES) and by the readout (2N,)."""
     times_s = w.frame_s + w.row * readout_s
     L, dL = lagrange(w.nodes_s, times_s)
@@ -206,11 +204,11 @@ class _Solved:
 
     told: float
     slope: float
-    nodes: Array
-    coupling: Array
+    nodes: F64
+    coupling: F64
 
 
-def _eliminate(part: tuple[Array, Array, Array], scale: float) -> _Solved:
+def _eliminate(part: tuple[F64, F64, F64], scale: float) -> _Solved:
     r, J, h = part
     norm = np.repeat(np.linalg.norm(r.reshape(-1, 2), axis=1), 2) / scale
     weight = np.where(norm <= _HUBER, 1.0, _HUBER / np.maximum(norm, 1e-9)) / scale**2

@@ -10,14 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools, Indices
 from ground_station.calibration import lens
 from ground_station.calibration.detection import apply_homography
 from ground_station.calibration.lens import Points
 from ground_station.calibration.views import View
-
-Array = npt.NDArray[np.float64]
 
 MAX_EDGE_PX = 4.5
 """Views with wider edges are blurred: their corners are off by more than they tell."""
@@ -34,7 +32,7 @@ CORNER_SHARE = 0.2
 CORNERS = ("upper left", "upper right", "lower left", "lower right")
 
 
-def in_corner(px: Array, size_px: tuple[int, int], name: str) -> npt.NDArray[np.bool_]:
+def in_corner(px: F64, size_px: tuple[int, int], name: str) -> Bools:
     """Which of (N, 2) pixels lie in that corner of the picture."""
     w, h = size_px
     across = px[:, 0] < CORNER_SHARE * w if "left" in name else px[:, 0] > (1 - CORNER_SHARE) * w
@@ -51,7 +49,7 @@ def sharp(views: Sequence[View]) -> list[View]:
     return [kept[min(stretch, key=lambda k: kept[k].sigma_px)] for stretch in stretches]
 
 
-def spread(views: Sequence[View], size_px: tuple[int, int], outline_m: Array) -> list[int]:
+def spread(views: Sequence[View], size_px: tuple[int, int], outline_m: F64) -> list[int]:
     """Some views as unlike each other as can be, by place, size and perspective of the board.
 
     No lens is needed for it. `outline_m` (4, 2) are the board's outer corners, metres.
@@ -84,10 +82,10 @@ def spread(views: Sequence[View], size_px: tuple[int, int], outline_m: Array) ->
 def informative(
     views: Sequence[View],
     points: Sequence[Points],
-    theta: Array,
-    poses: Sequence[Array],
+    theta: F64,
+    poses: Sequence[F64],
     size_px: tuple[int, int],
-    outline_m: Array,
+    outline_m: F64,
     most: int,
 ) -> list[int]:
     """Up to `most` views that together tell most of the lens, at the lens and poses known so far.
@@ -112,7 +110,7 @@ def informative(
                 free[j] &= apart_s >= _APART_S
         free[k] = False
 
-    def gains(among: npt.NDArray[np.intp]) -> Array:
+    def gains(among: Indices) -> F64:
         return np.asarray(
             np.linalg.slogdet(total + tells[among])[1] - np.linalg.slogdet(total)[1], np.float64
         )

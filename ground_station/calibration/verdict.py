@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64
 from ground_station.calibration import selection
 from ground_station.calibration.board import Board
 from ground_station.calibration.detection import BoardFinder, other_board
@@ -16,8 +16,6 @@ from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.gather import Gathered
 from ground_station.calibration.lens import Fit
 from ground_station.calibration.views import View
-
-Array = npt.NDArray[np.float64]
 
 MAX_FOCAL_SHARE = 0.0015
 """Of the focal length, one standard deviation: two of them are the 0.3 % asked of a calibration."""
@@ -30,13 +28,13 @@ _DISTANCES = 1.25
 _MAX_RMS_SHARE = 3 / 640
 
 
-def tilts_deg(poses: Array) -> Array:
+def tilts_deg(poses: F64) -> F64:
     """Angle (V,) between the board and the picture's plane, of poses (V, 6)."""
     z = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, 2, 2]
     return np.asarray(np.degrees(np.arccos(np.clip(np.abs(z), 0, 1))))
 
 
-def distances_m(poses: Array, middle_m: Array) -> Array:
+def distances_m(poses: F64, middle_m: F64) -> F64:
     """Depth (V,) of the board's middle (3,)."""
     turned = Rotation.from_rotvec(poses[:, :3]).apply(middle_m)
     return np.asarray(turned[:, 2] + poses[:, 5])
@@ -85,7 +83,7 @@ def empty_corners(views: Sequence[View], size_px: tuple[int, int]) -> list[str]:
 
 
 def check_determined(
-    fit: Fit, usable: Sequence[View], size_px: tuple[int, int], middle_m: Array
+    fit: Fit, usable: Sequence[View], size_px: tuple[int, int], middle_m: F64
 ) -> None:
     """Refuses a lens that its views leave open, by its covariance, and says which are missing."""
     missing = []
@@ -114,7 +112,7 @@ def check_determined(
         )
 
 
-def _why(fit: Fit, focal: float, centre: float, middle_m: Array) -> str:
+def _why(fit: Fit, focal: float, centre: float, middle_m: F64) -> str:
     tilt = float(tilts_deg(fit.poses).max())
     distance = distances_m(fit.poses, middle_m)
     known = (

@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.calibration.detection import BoardObservation
 from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
-
-Array = npt.NDArray[np.float64]
 
 MAX_GAP_S = 0.15
 """Frames further apart tell no velocity: hands move at a few hertz."""
@@ -34,8 +32,8 @@ class View:
     """
 
     seen: BoardObservation
-    points_m: Array
-    velocity_px_s: Array | None
+    points_m: F64
+    velocity_px_s: F64 | None
     speed_px_s: float
     doubt_px_s: float
     corner_px: float
@@ -70,9 +68,7 @@ def _skew_px(speed_px_s: float, readout_s: float) -> float:
     return speed_px_s * readout_s / math.sqrt(12)
 
 
-def views_of(
-    observations: list[BoardObservation], points_m: Array, timed: list[bool]
-) -> list[View]:
+def views_of(observations: list[BoardObservation], points_m: F64, timed: list[bool]) -> list[View]:
     """Every observation, sorted by input and time, as a view.
 
     `points_m` (N, 3) are the board's corners by id; `timed` says of each input whether its frames'
@@ -91,8 +87,8 @@ def views_of(
 
 
 def _velocity(
-    observations: list[BoardObservation], k: int, points_m: Array
-) -> tuple[Array | None, float]:
+    observations: list[BoardObservation], k: int, points_m: F64
+) -> tuple[F64 | None, float]:
     """Of the k-th observation's corners, pixels a second, and how far that is off.
 
     By the parabola through three frames, or the quartic through five: what the one differs from the
@@ -118,7 +114,7 @@ def _follows(observations: list[BoardObservation], k: int) -> bool:
     return 0 < observations[k].time_ns - observations[k - 1].time_ns <= MAX_GAP_S * 1e9
 
 
-def _slope(observations: list[BoardObservation], k: int, near: range, points_m: Array) -> Array:
+def _slope(observations: list[BoardObservation], k: int, near: range, points_m: F64) -> F64:
     """The derivative (N, 2) at the k-th observation of the polynomial through some around it."""
     nodes_s = np.array([(observations[j].time_ns - observations[k].time_ns) / 1e9 for j in near])
     _, slopes = lagrange(nodes_s, np.zeros(1))

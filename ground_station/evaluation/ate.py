@@ -12,13 +12,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Indices
 from ground_station.errors import GeometryError, InputError
 from ground_station.geometry import alignment, poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 ALIGNMENTS = ("none", "se3", "sim3")
 MAX_DIFF_S = 0.01
@@ -54,9 +52,9 @@ class Errors:
     origin.
     """
 
-    position_m: Array
-    rotation_deg: Array
-    position_zhang_m: Array
+    position_m: F64
+    rotation_deg: F64
+    position_zhang_m: F64
     alignment: Alignment
 
     def rmse(self) -> dict[str, float]:
@@ -99,8 +97,8 @@ class Evaluation:
 
 
 def associate(
-    estimate_ns: npt.NDArray[np.int64],
-    truth_ns: npt.NDArray[np.int64],
+    estimate_ns: I64,
+    truth_ns: I64,
     max_diff_s: float = MAX_DIFF_S,
 ) -> tuple[Indices, Indices]:
     """Indices of the pairs nearest in time, at most `max_diff_s` apart; both inputs sorted.
@@ -125,7 +123,7 @@ def associate(
     return (partner, chosen) if swap else (chosen, partner)
 
 
-def _seconds(time_ns: npt.NDArray[np.int64]) -> Array:
+def _seconds(time_ns: I64) -> F64:
     """The doubles nearest to the decimal seconds; numpy would round a large int64 twice."""
     return np.array([t / 1_000_000_000 for t in time_ns.tolist()])
 
@@ -206,9 +204,7 @@ def shares(
     ]
 
 
-def coverage(
-    estimate: Trajectory, frame_ns: npt.NDArray[np.int64], max_diff_s: float = MAX_DIFF_S
-) -> float:
+def coverage(estimate: Trajectory, frame_ns: I64, max_diff_s: float = MAX_DIFF_S) -> float:
     """The share of frames (their times, sorted, (N,) ns) that have an estimated pose, 0 to 1."""
     if not len(frame_ns) or not len(estimate):
         return 0.0

@@ -13,13 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
+from ground_station.arrays import F64
 from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend, sheet, themed
-
-Array = npt.NDArray[np.float64]
 
 GAP_S = 1.0
 """A pause longer than this breaks a line: nothing was estimated there."""
@@ -173,12 +172,12 @@ def _aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
     )
 
 
-def broken(time_s: npt.ArrayLike, *rows: npt.ArrayLike) -> list[Array]:
+def broken(time_s: npt.ArrayLike, *rows: npt.ArrayLike) -> list[F64]:
     """Times and rows of values (N,), each with a NaN in every pause, which the line leaves out."""
     gaps = np.flatnonzero(np.diff(np.asarray(time_s, np.float64)) > GAP_S) + 1
     return [np.insert(np.asarray(row, np.float64), gaps, np.nan) for row in (time_s, *rows)]
 
 
-def broken_path(trajectory: Trajectory) -> list[Array]:
+def broken_path(trajectory: Trajectory) -> list[F64]:
     """x and y with a NaN in every pause."""
     return broken(trajectory.time_ns / 1e9, *trajectory.position_m[:, :2].T)[1:]

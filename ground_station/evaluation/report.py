@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.errors import GroundStationError
 from ground_station.evaluation import plots
 from ground_station.evaluation.ate import ALIGNMENTS
@@ -22,9 +23,6 @@ from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import load_floorplan
 from ground_station.presentation.pages import Shown, data_uri, shown, write_page
 from ground_station.presentation.text import columns, flat
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
 
 _TEMPLATE = Path(__file__).parent / "templates" / "report.html"
 
@@ -56,7 +54,7 @@ _LEGEND = [
 class MatchPicture:
     """A frame with its matches drawn (`draw_matches`), (H, W, 3) RGB uint8."""
 
-    image: Image
+    image: U8
     caption: str
 
 
@@ -156,7 +154,7 @@ def draw_matches(
     pixels: npt.ArrayLike,
     projected: npt.ArrayLike,
     residual_px: npt.ArrayLike,
-) -> Image:
+) -> U8:
     """A frame (H, W) or (H, W, 3) with its matches, as (2H, 2W, 3) RGB.
 
     A ring marks each observed key point (N, 2), a line leads to where its landmark projects
@@ -267,7 +265,7 @@ def _figures(data: ReportData) -> list[Shown]:
     return figures
 
 
-def _jpeg(image: Image) -> str:
+def _jpeg(image: U8) -> str:
     ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     if not ok:
         raise GroundStationError("report: a match picture cannot be encoded")

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8, Bools
 from ground_station.experiments.declaration import Alteration
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import Frame
@@ -19,7 +19,7 @@ PACKET_BYTES = 1200
 
 
 def altered(
-    frames: Iterable[Frame], alteration: Alteration, arrived: npt.NDArray[np.bool_] | None = None
+    frames: Iterable[Frame], alteration: Alteration, arrived: Bools | None = None
 ) -> Iterator[Frame]:
     """The frames that a localizer sees.
 
@@ -34,7 +34,7 @@ def altered(
         yield replace(frame, image=_seen(frame, alteration, (frame.time_ns - start_ns) / 1e9))
 
 
-def _seen(frame: Frame, alteration: Alteration, time_s: float) -> npt.NDArray[np.uint8]:
+def _seen(frame: Frame, alteration: Alteration, time_s: float) -> U8:
     image = frame.image
     if is_dark(alteration, time_s):
         image = np.zeros_like(image)
@@ -78,7 +78,7 @@ def scaled_camera(camera: Camera, scale: float) -> Camera:
     )
 
 
-def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> npt.NDArray[np.bool_]:
+def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> Bools:
     """Which access units of an H.264 stream can be decoded when packets are lost one by one (n,).
 
     A unit goes in packets of `PACKET_BYTES`; one that misses a packet is useless, and so is all

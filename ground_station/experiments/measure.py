@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.evaluation import ate
 from ground_station.experiments.alter import altered, arrivals, scaled_camera
 from ground_station.experiments.declaration import Alteration
@@ -23,8 +23,6 @@ from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
 
 _SAME_S = 0.005
 """A frame is judged by a true pose within this time of its own."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
+from ground_station.arrays import F64
 from ground_station.evaluation.plots import show_floorplan
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import Theme, sheet, themed
@@ -173,9 +173,7 @@ def _hues(count: int) -> list[str]:
     return [_HUES[k % len(_HUES)] for k in range(count)]
 
 
-def _broken(
-    time_s: Sequence[float], values: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _broken(time_s: Sequence[float], values: F64) -> tuple[F64, F64]:
     """With a NaN where more than two frames are missing: no line over a gap."""
     t = np.asarray(time_s, np.float64)
     steps = np.diff(t)

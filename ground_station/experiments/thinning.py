@@ -10,15 +10,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Indices
 from ground_station.experiments.viewpoints import ExpectedObservations, expected_observations
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.progress import Progress
-
-F64 = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 _ROUNDS = 200
 """Those that gain most are taken together in so many rounds, whatever the map's size; one by one

@@ -13,15 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from ground_station.arrays import F32, F64, I32, I64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.inspection.visibility import PRIOR, View
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-I32 = npt.NDArray[np.int32]
-F32 = npt.NDArray[np.float32]
 
 CELLS = (8, 6)
 """Columns and rows that a picture is divided into."""
@@ -91,7 +87,7 @@ class _Surrounding:
     chance: F32
     view: View
 
-    def seen_from(self, wTc: F64) -> tuple[Indices, F64]:
+    def seen_from(self, wTc: F64) -> tuple[I64, F64]:
         """Which of the landmarks lie in a view's picture, and at which distorted pixel (n, 2)."""
         local = poses.transform(poses.inverse(wTc), self.position)
         index = np.flatnonzero(self.view.inside(local))
@@ -148,7 +144,7 @@ def _beside(wTc: F64, neighbours: F64) -> list[F64]:
     return made
 
 
-def _surrounding(map_: Map, view: View, group: Indices, views: F64) -> _Surrounding:
+def _surrounding(map_: Map, view: View, group: I64, views: F64) -> _Surrounding:
     kf = map_.keyframes
     observations = [kf.landmark[kf.offset[n] : kf.offset[n + 1]] for n in group.tolist()]
     landmark, found = np.unique(np.concatenate(observations), return_counts=True)
@@ -162,7 +158,7 @@ def _surrounding(map_: Map, view: View, group: Indices, views: F64) -> _Surround
     return _Surrounding(views, landmark, points, chance, view)
 
 
-def _cell(pixel_px: npt.NDArray[np.floating], camera: Camera) -> Indices:
+def _cell(pixel_px: npt.NDArray[np.floating], camera: Camera) -> I64:
     """The cells (N,) of distorted pixels (N, 2), row by row."""
     columns, rows = CELLS
     x = np.clip(pixel_px[:, 0] / camera.width_px * columns, 0, columns - 1).astype(np.int64)

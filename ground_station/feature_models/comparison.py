@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.feature_models import homographic
 from ground_station.feature_models.homographic import Matching
 from ground_station.feature_models.quantize import network_input
@@ -20,8 +20,6 @@ from ground_station.recording.frames import FrameSource
 
 MAX_FEATURES = 1000
 _TIMED = 15
-
-Image = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Comparison:
 
 
 def compare(
-    reference: Model, variant: Model, images: Sequence[Image], threads: int, seed: int
+    reference: Model, variant: Model, images: Sequence[U8], threads: int, seed: int
 ) -> Comparison:
     """Matches each picture (H, W) uint8 with a warp of it, and runs both in turn for the time."""
     networks = [Network(model, threads=threads) for model in (reference, variant)]
@@ -65,12 +63,12 @@ def compare(
     )
 
 
-def evenly(source: FrameSource, count: int) -> list[Image]:
+def evenly(source: FrameSource, count: int) -> list[U8]:
     """`count` pictures of an input, evenly over it; all where it has no more.
 
     In one pass and with memory for twice as many: when these are full, every second goes.
     """
-    kept: list[Image] = []
+    kept: list[U8] = []
     step = 1
     with Progress("frames", source.count()) as progress:
         for number, frame in enumerate(source):

@@ -6,14 +6,12 @@ from fractions import Fraction
 
 import av
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.features.extractor import FeatureError
 
-Bytes = npt.NDArray[np.uint8]
 
-
-def round_trip(pictures: list[Bytes], quantizer: int) -> Bytes:
+def round_trip(pictures: list[U8], quantizer: int) -> U8:
     """The last of grey pictures (H, W), equal in size, after encoding and decoding all of them.
 
     x264 with the payload's settings (main profile, veryfast, zerolatency, no B-frames), but at a

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.feature_models.compression import round_trip
 
-Bytes = npt.NDArray[np.uint8]
-F32 = npt.NDArray[np.float32]
 Rng = np.random.Generator
 
 
@@ -32,7 +31,7 @@ class Chances:
     compression: float = 0.55
 
 
-def degrade(picture: Bytes, rng: Rng, chances: Chances | None = None) -> Bytes:
+def degrade(picture: U8, rng: Rng, chances: Chances | None = None) -> U8:
     """A picture (H, W), H and W even, as a payload in other light might have sent it."""
     c = chances or Chances()
     linear = (picture.astype(np.float32) * np.float32(1 / 255)) ** np.float32(2.2)
@@ -64,7 +63,7 @@ def degrade(picture: Bytes, rng: Rng, chances: Chances | None = None) -> Bytes:
     return result
 
 
-def quantized(code: F32) -> Bytes:
+def quantized(code: F32) -> U8:
     """Values 0..1, clipped, as eight bits."""
     return (np.clip(code, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 

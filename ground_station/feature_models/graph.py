@@ -15,6 +15,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from ground_station import files
+from ground_station.arrays import F32, F64
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import ModelInfo
 
@@ -209,7 +210,7 @@ def fold_batch_norm(
     mean: Array,
     variance: Array,
     epsilon: float,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+) -> tuple[F32, F32]:
     """Weight and bias of the convolution that is a convolution and then a batch normalisation.
 
     All but `weight` (out, in, h, w) are (out,). Reckoned in float64 (Ioffe and Szegedy, 2015).
@@ -222,7 +223,7 @@ def fold_batch_norm(
 
 def batch_norm_terms(
     scale: Array, shift: Array, mean: Array, variance: Array, epsilon: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+) -> tuple[F64, F64]:
     """A batch normalisation as factor · x + offset, each (C,) float64."""
     factor = np.asarray(scale, np.float64) / np.sqrt(np.asarray(variance, np.float64) + epsilon)
     return factor, np.asarray(shift, np.float64) - np.asarray(mean, np.float64) * factor

@@ -6,18 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, U8, Indices
 from ground_station.features.extractor import Extractor, Features
 
 LIMIT_PX = 3.0
 _SHIFT = 0.2
 """How far a corner of what the second picture shows lies inside the first, of its sides."""
-
-Image = npt.NDArray[np.uint8]
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 
 @dataclass
@@ -34,7 +29,7 @@ class Matching:
         return float(np.mean(self.shares)) if self.shares else 0.0
 
 
-def warp(image: Image, random: np.random.Generator) -> tuple[Image, F64]:
+def warp(image: U8, random: np.random.Generator) -> tuple[U8, F64]:
     """A view of an inner quadrangle of a picture (H, W), as large, and the H (3, 3) to it.
 
     H takes (x, y, 1) of the first to the second. No part of the second is made up.
@@ -48,7 +43,7 @@ def warp(image: Image, random: np.random.Generator) -> tuple[Image, F64]:
     return np.asarray(warped, np.uint8), np.asarray(matrix, np.float64)
 
 
-def matching(extractor: Extractor, pairs: list[tuple[Image, Image, F64]]) -> Matching:
+def matching(extractor: Extractor, pairs: list[tuple[U8, U8, F64]]) -> Matching:
     """How well an extractor's key points are found again, by mutual nearest descriptors."""
     result = Matching(0, 0, [])
     for first, second, matrix in pairs:

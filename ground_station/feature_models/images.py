@@ -12,12 +12,10 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
-Bytes = npt.NDArray[np.uint8]
-F32 = npt.NDArray[np.float32]
 Rng = np.random.Generator
 Painter = Callable[[TextureBank, tuple[int, int], Rng], F32]
 
@@ -34,7 +32,7 @@ def _bank(seed: int, number: int) -> TextureBank:
     return TextureBank(int(np.random.SeedSequence([seed, 7, number]).generate_state(1)[0]))
 
 
-def procedural(seed: int, index: int, size: tuple[int, int]) -> Bytes:
+def procedural(seed: int, index: int, size: tuple[int, int]) -> U8:
     """Picture `index` of a seed, (rows, columns); the same each time."""
     rng = np.random.default_rng([seed, 1, index])
     bank = _bank(seed, index // _PER_BANK)
@@ -46,7 +44,7 @@ def procedural(seed: int, index: int, size: tuple[int, int]) -> Bytes:
     return _coded(np.asarray(small, np.float32), rng)
 
 
-def _coded(radiance: F32, rng: Rng) -> Bytes:
+def _coded(radiance: F32, rng: Rng) -> U8:
     """Linear radiance to eight bits: its 1st and 99th percentile to a random range, gamma 2.2."""
     low, high = np.percentile(radiance[::4, ::4], (1, 99))
     level = (radiance - low) / max(high - low, 1e-6)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import (
@@ -20,6 +19,7 @@ from onnxruntime.quantization import (
     quantize_static,
 )
 
+from ground_station.arrays import F32, U8
 from ground_station.feature_models.graph import serialized
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model, ModelInfo
@@ -35,10 +35,8 @@ _FEW_VALUES = 64
 _LONGEST_ORIGIN = 180
 """Of the characters that `ModelInfo` allows a source."""
 
-Image = npt.NDArray[np.uint8]
 
-
-def variant(model: Model, kind: str, images: Sequence[Image], name: str) -> tuple[bytes, ModelInfo]:
+def variant(model: Model, kind: str, images: Sequence[U8], name: str) -> tuple[bytes, ModelInfo]:
     """The file of a model in another form, with its own name, and what it is.
 
     `images` (H, W) uint8 calibrate int8: static, per channel of the weights, unsigned activations,
@@ -65,13 +63,13 @@ def check(model: Model, kind: str) -> onnx.ModelProto:
     return proto
 
 
-def network_input(info: ModelInfo, image: Image) -> npt.NDArray[np.float32]:
+def network_input(info: ModelInfo, image: U8) -> F32:
     """What a model's network takes, (1, channels, H', W') 0..1, of a picture (H, W)."""
     grey = padded(image, info.multiple).astype(np.float32)[None, None] * np.float32(1 / 255)
     return grey if info.layout == "cells" else np.repeat(grey, 3, axis=1)
 
 
-def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[Image]) -> onnx.ModelProto:
+def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[U8]) -> onnx.ModelProto:
     if not images:
         raise FeatureError("int8 needs pictures to calibrate by, and there is none")
     helper.set_model_props(proto, dict([_READY]))
@@ -103,7 +101,7 @@ def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[Image]) -> o
 class _Reader(CalibrationDataReader):
     """Gives the quantizer one picture after the other."""
 
-    def __init__(self, info: ModelInfo, images: Sequence[Image]) -> None:
+    def __init__(self, info: ModelInfo, images: Sequence[U8]) -> None:
         self._inputs = ({"image": network_input(info, image)} for image in images)
 
     def get_next(self) -> dict[str, Any] | None:

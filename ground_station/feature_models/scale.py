@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.feature_models import homographic
 from ground_station.feature_models.degrade import degrade
 from ground_station.feature_models.images import procedural
@@ -34,9 +34,7 @@ _SHARE = 0.9
 _LEAST = 200
 """Right matches below which nothing is said: the network is none, or not for such pictures."""
 
-Image = npt.NDArray[np.uint8]
-F64 = npt.NDArray[np.float64]
-Pairs = list[tuple[Image, Image, F64]]
+Pairs = list[tuple[U8, U8, F64]]
 
 
 def measured(data: bytes, info: ModelInfo) -> float:
@@ -77,7 +75,7 @@ def _rootsift() -> float:
     return float(np.quantile(_right_distances(ruler, _pairs()), _SHARE))
 
 
-def _right_distances(extractor: Extractor, pairs: Pairs) -> npt.NDArray[np.float64]:
+def _right_distances(extractor: Extractor, pairs: Pairs) -> F64:
     """The descriptor distances of all mutual nearest matches that are where the truth says."""
     found = [np.empty(0)]
     for first, second, matrix in pairs:

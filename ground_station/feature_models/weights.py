@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32
 from ground_station.features.extractor import FeatureError
 
 Shape = tuple[int, ...]
-F32 = npt.NDArray[np.float32]
 
 
 class WeightsError(FeatureError):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.features import detection, sampling
 from ground_station.features.extractor import Features, check_image
 from ground_station.features.inference import Network
@@ -34,7 +34,7 @@ class CellFeatures(LearnedFeatures):
         super().__init__(network, max_features, settings)
         self._border_px = max(_BORDER_PX, self._info.subpixel_px)
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""
         check_image(image)
         whole = padded(image, self._info.multiple)
@@ -43,8 +43,8 @@ class CellFeatures(LearnedFeatures):
 
     def of_outputs(
         self,
-        logits: npt.NDArray[np.float32],
-        descriptors: npt.NDArray[np.float32],
+        logits: F32,
+        descriptors: F32,
         shape: tuple[int, ...],
     ) -> Features:
         """Features of a picture of `shape` (H, W) from what the network said of the padded one.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
+from ground_station.arrays import F32, Bools, Indices
 
 _FEW = 2000
 """Points that are sooner gone through one by one than by another pass over the picture."""
@@ -115,7 +113,7 @@ def _one_by_one(scores: F32, radius_px: int, border_px: int, most: int) -> Indic
     return np.array(found, np.intp)
 
 
-def _off_border(places: Indices, shape: tuple[int, ...], border_px: int) -> npt.NDArray[np.bool_]:
+def _off_border(places: Indices, shape: tuple[int, ...], border_px: int) -> Bools:
     rows, columns = np.divmod(places, shape[1])
     return np.asarray(
         (rows >= border_px)

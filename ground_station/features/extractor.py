@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, U8, Bools
 from ground_station.errors import GroundStationError
 
 
@@ -23,14 +23,14 @@ class Features:
     `scores` (N,) float32, higher is better; `descriptors` (N, D) float32, unit L2 norm.
     """
 
-    keypoints_px: npt.NDArray[np.float32]
-    scores: npt.NDArray[np.float32]
-    descriptors: npt.NDArray[np.float32]
+    keypoints_px: F32
+    scores: F32
+    descriptors: F32
 
     def __len__(self) -> int:
         return len(self.keypoints_px)
 
-    def where(self, keep: npt.NDArray[np.bool_]) -> Features:
+    def where(self, keep: Bools) -> Features:
         """Those alone; `keep` (N,)."""
         if keep.all():
             return self
@@ -48,12 +48,12 @@ class Extractor(Protocol):
     dimension: int
     distance_scale: float
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8."""
         ...
 
 
-def check_image(image: npt.NDArray[np.uint8]) -> None:
+def check_image(image: U8) -> None:
     """Raises `FeatureError` unless the image is (H, W) uint8 and at least 16 pixels each way."""
     if image.ndim != 2 or image.dtype != np.uint8 or min(image.shape) < 16:
         raise FeatureError(

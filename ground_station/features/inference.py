@@ -6,13 +6,11 @@ import os
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import onnxruntime
 
+from ground_station.arrays import F32
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model
-
-F32 = npt.NDArray[np.float32]
 
 _SUFFIX = "ExecutionProvider"
 _WARM_UP_PX = (480, 640)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
+
+from ground_station.arrays import U8
 
 
-def padded(image: npt.NDArray[np.uint8], multiple: int) -> npt.NDArray[np.uint8]:
+def padded(image: U8, multiple: int) -> U8:
     """The image (H, W), its last row and column repeated to the next multiples: no edge is added.
 
     The image itself where it has such a size.

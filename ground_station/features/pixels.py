@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.features import detection, sampling
 from ground_station.features.extractor import Features, check_image
 from ground_station.features.inference import Network
@@ -34,7 +34,7 @@ class PixelFeatures(LearnedFeatures):
         super().__init__(network, max_features, settings)
         self._window_px = self._info.subpixel_px or NMS_PX
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""
         check_image(image)
         whole = padded(image, self._info.multiple).astype(np.float32) * np.float32(1 / 255)
@@ -44,8 +44,8 @@ class PixelFeatures(LearnedFeatures):
 
     def of_outputs(
         self,
-        scores: npt.NDArray[np.float32],
-        descriptors: npt.NDArray[np.float32],
+        scores: F32,
+        descriptors: F32,
         shape: tuple[int, ...],
     ) -> Features:
         """Features of a picture of `shape` (H, W) from what the network said of the padded one.

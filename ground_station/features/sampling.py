@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array
 
-F32 = npt.NDArray[np.float32]
+from ground_station.arrays import F32, I32, Bools
 
 _A = -0.75
 """The cubic's slope; what TensorFlow, PyTorch and OpenCV interpolate with."""
@@ -47,7 +46,7 @@ def bilinear(descriptors: F32, at: F32) -> F32:
     return np.ascontiguousarray(total.T, np.float32)
 
 
-def unit(descriptors: F32) -> tuple[F32, npt.NDArray[np.bool_]]:
+def unit(descriptors: F32) -> tuple[F32, Bools]:
     """Rows (N, D) at unit L2 norm, and which of them had one: finite and not nought (N,)."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors))
@@ -70,7 +69,7 @@ def _cubic(t: F32) -> F32:
     ).astype(np.float32)
 
 
-def _weighted(descriptors: F32, place: npt.NDArray[np.int32], weight: F32) -> F32:
+def _weighted(descriptors: F32, place: I32, weight: F32) -> F32:
     """Sums of weight (N, …) times the descriptors at flat indices place (N, …)."""
     n = len(place)
     taps = place[0].size if n else 1

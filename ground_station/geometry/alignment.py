@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import GeometryError
-
-Array = npt.NDArray[np.float64]
 
 MIN_POINTS = 3
 RANK_TOLERANCE = 1e-12
@@ -20,15 +19,15 @@ RANK_TOLERANCE = 1e-12
 class Alignment:
     """target = scale · rotation · source + translation: (3, 3), (3,) in target units, a number."""
 
-    rotation: Array
-    translation: Array
+    rotation: F64
+    translation: F64
     scale: float
 
-    def apply(self, points: npt.ArrayLike) -> Array:
+    def apply(self, points: npt.ArrayLike) -> F64:
         """Points (N, 3) of the source frame in the target frame."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
-    def apply_poses(self, wTc: npt.ArrayLike) -> Array:
+    def apply_poses(self, wTc: npt.ArrayLike) -> F64:
         """Poses (N, 4, 4) of the source frame in the target frame; rotations stay rotations."""
         source = np.asarray(wTc, dtype=np.float64)
         result = source.copy()
@@ -70,7 +69,7 @@ def align(
     return Alignment(rotation, translation, float(scale))
 
 
-def similarities(x: Array, y: Array, w: Array) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+def similarities(x: F64, y: F64, w: F64) -> tuple[F64, F64, F64, Bools]:
     """`align` with scale for many sets at once: x and y (..., N, 3), finite; weights w (N,), sum 1.
 
     Rotations (..., 3, 3), translations (..., 3), scales (...), and which sets determine theirs.
@@ -90,7 +89,7 @@ def similarities(x: Array, y: Array, w: Array) -> tuple[Array, Array, Array, npt
     return rotation, translation, scale, determined
 
 
-def _normalized(weights: npt.ArrayLike | None, n: int) -> Array:
+def _normalized(weights: npt.ArrayLike | None, n: int) -> F64:
     """Weights (n,) that sum to 1."""
     if weights is None:
         return np.full(n, 1.0 / n) if n else np.empty(0)

@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import CameraError
 from ground_station.geometry.lens_models import MODELS, KannalaBrandt, LensModel
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -84,14 +83,14 @@ class Camera:
         return chosen(**{name: getattr(self, name) for name in chosen.NAMES})
 
     @property
-    def matrix(self) -> Array:
+    def matrix(self) -> F64:
         """K, 3×3, pixels."""
         return np.array(
             [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
         )
 
     @property
-    def distortion(self) -> Array:
+    def distortion(self) -> F64:
         """The lens's numbers in OpenCV's order: k1, k2, p1, p2, k3, or a fisheye's k1 to k4."""
         return np.array([getattr(self, name) for name in self.lens.NAMES])
 
@@ -105,7 +104,7 @@ class Camera:
         """Whether its pictures are undistorted as they are."""
         return self.lens.is_none
 
-    def project(self, points_c: npt.ArrayLike) -> Array:
+    def project(self, points_c: npt.ArrayLike) -> F64:
         """Points in camera coordinates (N, 3), metres, to distorted pixels (N, 2).
 
         NaN for points that the lens does not see: at or behind the camera (z <= 0), and of a
@@ -113,15 +112,15 @@ class Camera:
         """
         return self._pixels(self.lens.bend_points(np.asarray(points_c, np.float64).reshape(-1, 3)))
 
-    def distort(self, normalized: npt.ArrayLike) -> Array:
+    def distort(self, normalized: npt.ArrayLike) -> F64:
         """Undistorted coordinates on the plane z = 1 (N, 2) to distorted pixels (N, 2)."""
         return self._pixels(self.lens.bend(np.asarray(normalized, np.float64).reshape(-1, 2)))
 
-    def _pixels(self, bent: Array) -> Array:
+    def _pixels(self, bent: F64) -> F64:
         x, y = bent[:, 0], bent[:, 1]
         return np.stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px], axis=1)
 
-    def undistort(self, pixels: npt.ArrayLike) -> Array:
+    def undistort(self, pixels: npt.ArrayLike) -> F64:
         """Distorted pixels (N, 2) to undistorted coordinates on the plane z = 1 (N, 2).
 
         NaN for pixels of a fisheye that are not used: see `uses`.
@@ -129,34 +128,34 @@ class Camera:
         uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         return self.lens.unbend(uv, self.matrix) if len(uv) else np.empty((0, 2))
 
-    def undistort_to_pinhole(self, pixels: npt.ArrayLike) -> Array:
+    def undistort_to_pinhole(self, pixels: npt.ArrayLike) -> F64:
         """Distorted pixels (N, 2) to the pixels a camera with the same K and no lens would see."""
         xy = self.undistort(pixels)
         return xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
 
-    def rays(self, pixels: npt.ArrayLike) -> Array:
+    def rays(self, pixels: npt.ArrayLike) -> F64:
         """Distorted pixels (N, 2) to directions in camera coordinates (N, 3), not of length 1.
 
         Those of a fisheye may point behind the plane z = 1; NaN where it sees nothing.
         """
         return self.lens.rays(np.asarray(pixels, np.float64).reshape(-1, 2), self.matrix)
 
-    def uses(self, pixels: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def uses(self, pixels: npt.ArrayLike) -> Bools:
         """Whether distorted pixels (N, 2) are near enough to the axis to be used (N,)."""
         return self.lens.uses(np.asarray(pixels, np.float64).reshape(-1, 2), self.matrix)
 
-    def drawn_in(self, pixels: npt.ArrayLike) -> Array:
+    def drawn_in(self, pixels: npt.ArrayLike) -> F64:
         """Distorted pixels (N, 2) that are not used drawn to the axis until they are (N, 2)."""
         bent = self.lens.drawn_in((np.asarray(pixels, np.float64) - [self.cx_px, self.cy_px])
                                   / [self.fx_px, self.fy_px])  # fmt: skip
         return self._pixels(bent)
 
-    def stretch(self, pinhole_px: npt.ArrayLike) -> Array:
+    def stretch(self, pinhole_px: npt.ArrayLike) -> F64:
         """By how much a pixel's noise is longer at undistorted pixels (N, 2): (N,)."""
         pixels = np.asarray(pinhole_px, np.float64).reshape(-1, 2)
         return self.lens.stretch((pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px])
 
-    def rows(self, pinhole_px: Array) -> Array:
+    def rows(self, pinhole_px: F64) -> F64:
         """About which row of the picture (N,) undistorted pixels (N, 2) are in.
 
         The five-parameter lens is not looked at, as it moves rows by a few.

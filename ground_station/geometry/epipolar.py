@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
-
-F64 = npt.NDArray[np.float64]
 
 
 def essential(first_wTc: F64, second_wTc: F64) -> F64:

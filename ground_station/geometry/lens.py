@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry.camera import Camera
-
-Array = npt.NDArray[np.float64]
 
 NEAREST_M = 0.05
 """Nearer than this a landmark has no useful projection."""
@@ -28,7 +26,7 @@ class Lens:
         reach = camera.lens.reach
         self.max_radius = farthest if farthest < reach else reach  # also where that is not a number
 
-    def inside(self, normalized: Array) -> npt.NDArray[np.bool_]:
+    def inside(self, normalized: F64) -> Bools:
         """Whether directions (N, 2) on the plane z = 1 land in the image; (N,)."""
         camera = self.camera
         near = np.einsum("ij,ij->i", normalized, normalized) <= self.max_radius**2

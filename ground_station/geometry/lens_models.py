@@ -13,10 +13,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from ground_station.arrays import F64, Bools
 
 WIDEST = math.radians(65.0)
 """From the optical axis, the largest angle at which a fisheye's key points are used.
@@ -53,7 +51,7 @@ class BrownConrady:
         """Whether the camera is a pinhole."""
         return not any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
-    def bend(self, xy: Array) -> Array:
+    def bend(self, xy: F64) -> F64:
         """Rays on the plane z = 1 (N, 2) to bent coordinates (N, 2)."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
@@ -62,12 +60,12 @@ class BrownConrady:
         yd = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
         return np.stack([xd, yd], axis=1)
 
-    def bend_points(self, points: Array) -> Array:
+    def bend_points(self, points: F64) -> F64:
         """Points (N, 3) to bent coordinates (N, 2); NaN for those with z <= 0."""
         z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
         return self.bend(points[:, :2] / z[:, None])
 
-    def unbend(self, pixels: Array, matrix: Array) -> Array:
+    def unbend(self, pixels: F64, matrix: F64) -> F64:
         """Pixels (N, 2) of a camera with K (3, 3) to rays on the plane z = 1 (N, 2)."""
         import cv2  # a tenth of a second for a process that only passes the numbers on
 
@@ -77,19 +75,19 @@ class BrownConrady:
         xy = cv2.undistortPointsIter(uv, matrix, numbers, np.eye(3), np.eye(3), criteria)
         return np.asarray(xy, np.float64).reshape(-1, 2)
 
-    def rays(self, pixels: Array, matrix: Array) -> Array:
+    def rays(self, pixels: F64, matrix: F64) -> F64:
         """Pixels (N, 2) to directions (N, 3) of any length."""
         return np.column_stack([self.unbend(pixels, matrix), np.ones(len(pixels))])
 
-    def uses(self, pixels: Array, matrix: Array) -> Flags:
+    def uses(self, pixels: F64, matrix: F64) -> Bools:
         """Whether what is seen at pixels (N, 2) is used (N,): all of it."""
         return np.ones(len(pixels), bool)
 
-    def drawn_in(self, bent: Array) -> Array:
+    def drawn_in(self, bent: F64) -> F64:
         """Bent coordinates (N, 2), nearer to the axis where they are not used: all are."""
         return bent
 
-    def stretch(self, xy: Array) -> Array:
+    def stretch(self, xy: F64) -> F64:
         """How much longer a pixel's noise is on the plane than on a pinhole's (N,): taken as 1."""
         return np.ones(len(xy))
 
@@ -124,33 +122,33 @@ class KannalaBrandt:
         """The largest tangent that is used."""
         return math.tan(min(WIDEST, self.fold))
 
-    def radius(self, angle: Array) -> Array:
+    def radius(self, angle: F64) -> F64:
         """d(θ) of angles (N,), radians."""
         t = angle * angle
         return angle * (1 + t * (self.k1 + t * (self.k2 + t * (self.k3 + t * self.k4))))
 
-    def slope(self, angle: Array) -> Array:
+    def slope(self, angle: F64) -> F64:
         """d'(θ) of angles (N,), radians."""
         t = angle * angle
         return 1 + t * (3 * self.k1 + t * (5 * self.k2 + t * (7 * self.k3 + t * 9 * self.k4)))
 
-    def bend(self, xy: Array) -> Array:
+    def bend(self, xy: F64) -> F64:
         """Rays on the plane z = 1 (N, 2) to bent coordinates (N, 2); NaN beyond the fold."""
         r = np.hypot(xy[:, 0], xy[:, 1])
         return xy * self._over(r, np.arctan(r))[:, None]
 
-    def bend_points(self, points: Array) -> Array:
+    def bend_points(self, points: F64) -> F64:
         """Points (N, 3) to bent coordinates (N, 2), also of z <= 0; NaN beyond the fold."""
         r = np.hypot(points[:, 0], points[:, 1])
         return points[:, :2] * self._over(r, np.arctan2(r, points[:, 2]))[:, None]
 
-    def _over(self, r: Array, angle: Array) -> Array:
+    def _over(self, r: F64, angle: F64) -> F64:
         """d(θ)/r (N,), at the axis as a pinhole's; NaN beyond the fold, and opposite the axis."""
         bent = np.where(angle < self.fold, self.radius(angle), np.nan)
         near = r < 1e-12
         return np.where(near, np.where(angle < 1, 1.0, np.nan), bent / np.where(near, 1.0, r))
 
-    def unbend(self, pixels: Array, matrix: Array) -> Array:
+    def unbend(self, pixels: F64, matrix: F64) -> F64:
         """Pixels (N, 2) of a camera with K (3, 3) to rays on the plane z = 1 (N, 2).
 
         NaN for those that are farther from the axis than `WIDEST` or the fold.
@@ -159,13 +157,13 @@ class KannalaBrandt:
         tangent = np.tan(np.where(angle <= WIDEST, angle, np.nan))
         return bent * np.where(r > 1e-12, tangent / np.maximum(r, 1e-12), tangent + 1)[:, None]
 
-    def rays(self, pixels: Array, matrix: Array) -> Array:
+    def rays(self, pixels: F64, matrix: F64) -> F64:
         """Pixels (N, 2) to directions (N, 3) of length 1; NaN where no direction is seen."""
         bent, r, angle = self._angles(pixels, matrix)
         aside = bent * (np.sin(angle) / np.maximum(r, 1e-12))[:, None]
         return np.column_stack([aside, np.cos(angle)])
 
-    def uses(self, pixels: Array, matrix: Array) -> Flags:
+    def uses(self, pixels: F64, matrix: F64) -> Bools:
         """Whether what is seen at pixels (N, 2) is used (N,): up to `WIDEST` from the axis."""
         bent = _unscaled(pixels, matrix)
         return np.asarray(np.hypot(bent[:, 0], bent[:, 1]) < self._widest)
@@ -175,12 +173,12 @@ class KannalaBrandt:
         """The bent radius that is used; not at the very limit, where a last bit would decide."""
         return (1 - 1e-9) * float(self.radius(np.array(min(WIDEST, self.fold))))
 
-    def drawn_in(self, bent: Array) -> Array:
+    def drawn_in(self, bent: F64) -> F64:
         """Bent coordinates (N, 2), nearer to the axis where they are not used."""
         r = np.hypot(bent[:, 0], bent[:, 1])
         return bent * np.minimum(1.0, (1 - 1e-9) * self._widest / np.maximum(r, 1e-12))[:, None]
 
-    def stretch(self, xy: Array) -> Array:
+    def stretch(self, xy: F64) -> F64:
         """How much longer a pixel's noise is on the plane than on a pinhole's (N,), RMS.
 
         Along the radius 1/(d'(θ)·cos²θ), the inverse of d(θ)'s derivative by tan θ, and across it
@@ -191,7 +189,7 @@ class KannalaBrandt:
         across = np.where(r > 1e-6, r / np.maximum(self.radius(angle), 1e-12), 1.0)
         return np.asarray(np.sqrt(0.5 * (along * along + across * across)))
 
-    def _angles(self, pixels: Array, matrix: Array) -> tuple[Array, Array, Array]:
+    def _angles(self, pixels: F64, matrix: F64) -> tuple[F64, F64, F64]:
         """Bent coordinates (N, 2), their length (N,), and θ (N,) by Newton's method.
 
         NaN where the lens turns back before. The start is never beyond: d' only has to stay
@@ -229,6 +227,6 @@ _STEPS = 60
 _CONVERGED = 1e-12
 
 
-def _unscaled(pixels: Array, matrix: Array) -> Array:
+def _unscaled(pixels: F64, matrix: F64) -> F64:
     """Pixels (N, 2) to bent coordinates (N, 2)."""
     return np.asarray((pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]])

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F64
 
 
-def pose(rotation: npt.ArrayLike, translation_m: npt.ArrayLike) -> Array:
+def pose(rotation: npt.ArrayLike, translation_m: npt.ArrayLike) -> F64:
     """4×4 (or N×4×4) from rotation matrices (…, 3, 3) and translations (…, 3), metres."""
     R = np.asarray(rotation, dtype=np.float64)
     result = np.zeros((*R.shape[:-2], 4, 4))
@@ -24,31 +24,31 @@ def pose(rotation: npt.ArrayLike, translation_m: npt.ArrayLike) -> Array:
     return result
 
 
-def from_quaternion(position_m: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> Array:
+def from_quaternion(position_m: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> F64:
     """Positions (…, 3), metres, and unit quaternions x, y, z, w (…, 4) to poses (…, 4, 4)."""
     return pose(Rotation.from_quat(np.asarray(quaternion_xyzw)).as_matrix(), position_m)
 
 
-def to_quaternion(wTc: npt.ArrayLike) -> Array:
+def to_quaternion(wTc: npt.ArrayLike) -> F64:
     """The rotation of poses (…, 4, 4) as unit quaternions x, y, z, w (…, 4), w >= 0."""
     T = np.asarray(wTc)
     return np.asarray(Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True))
 
 
-def inverse(aTb: npt.ArrayLike) -> Array:
+def inverse(aTb: npt.ArrayLike) -> F64:
     """`bTa` of poses (…, 4, 4), by transposition."""
     T = np.asarray(aTb, dtype=np.float64)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return pose(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
 
 
-def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> Array:
+def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> F64:
     """Points (N, 3) in b to coordinates in a, for one pose (4, 4)."""
     T = np.asarray(aTb)
     return np.asarray(np.asarray(points_b) @ T[:3, :3].T + T[:3, 3])
 
 
-def exp(xi: npt.ArrayLike) -> Array:
+def exp(xi: npt.ArrayLike) -> F64:
     """SE(3) exponential of a tangent vector (6,), rotation first. Barfoot 2017, eq. 7.26.
 
     On plain numbers: arrays of three cost several times as much, and trackers call this often.
@@ -94,7 +94,7 @@ def exp(xi: npt.ArrayLike) -> Array:
     )
 
 
-def log(aTb: npt.ArrayLike) -> Array:
+def log(aTb: npt.ArrayLike) -> F64:
     """The inverse of `exp`: the tangent vector (6,) of one pose (4, 4). Barfoot 2017, eq. 7.35."""
     T = np.asarray(aTb, dtype=np.float64)
     (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.tolist()
@@ -122,12 +122,12 @@ def log(aTb: npt.ArrayLike) -> Array:
     )
 
 
-def rotation_angle(aRb: npt.ArrayLike) -> Array:
+def rotation_angle(aRb: npt.ArrayLike) -> F64:
     """‖log R‖ of rotations (…, 3, 3), radians."""
     return np.asarray(Rotation.from_matrix(np.asarray(aRb)).magnitude())
 
 
-def interpolate(wTa: npt.ArrayLike, wTb: npt.ArrayLike, fraction: float) -> Array:
+def interpolate(wTa: npt.ArrayLike, wTb: npt.ArrayLike, fraction: float) -> F64:
     """The pose at `fraction` of the constant-twist motion from a (0) to b (1), also beyond."""
     wTa = np.asarray(wTa)
     return wTa @ exp(fraction * log(inverse(wTa) @ np.asarray(wTb)))

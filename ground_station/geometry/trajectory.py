@@ -11,20 +11,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import GeometryError
 from ground_station.files import write_text
 from ground_station.geometry import poses
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """`wTc` at N times: `time_ns` (N,) int64, `position_m` (N, 3), `quaternion_xyzw` (N, 4)."""
 
-    time_ns: npt.NDArray[np.int64]
-    position_m: Array
-    quaternion_xyzw: Array
+    time_ns: I64
+    position_m: F64
+    quaternion_xyzw: F64
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
@@ -48,7 +47,7 @@ class Trajectory:
         return cls(np.asarray(time_ns, dtype=np.int64), T[:, :3, 3].copy(), quaternions)
 
     @property
-    def wTc(self) -> Array:
+    def wTc(self) -> F64:
         """All poses, (N, 4, 4)."""
         return poses.from_quaternion(self.position_m, self.quaternion_xyzw)
 
@@ -58,7 +57,7 @@ class Trajectory:
             raise GeometryError("trajectory: it has no poses")
         return int(np.argmin(np.abs(self.time_ns - time_ns)))
 
-    def at(self, time_ns: int) -> Array:
+    def at(self, time_ns: int) -> F64:
         """The pose at a time between two others by constant twist; held constant past the ends."""
         if not len(self):
             raise GeometryError("trajectory: it has no poses")

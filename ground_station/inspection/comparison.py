@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import spearmanr
 
+from ground_station.arrays import F64
 from ground_station.errors import InputError
 from ground_station.evaluation.ate import associate
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.inspection.prediction import Prediction, Predictor
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
 
 _MAX_DIFF_S = 0.005
 _LEAST_SHARE = 0.6

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import MapError
 from ground_station.inspection.prediction import Prediction, Predictor
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
 
 MOST_CELLS = 600
 """Cells are as small as one, two or five times a power of ten that gives no more."""
@@ -47,7 +45,7 @@ class LocalizabilityMap:
     """
 
     place: F64
-    cell: npt.NDArray[np.int64]
+    cell: I64
     shape: tuple[int, int]
     origin: tuple[float, float]
     cell_m: float
@@ -145,7 +143,7 @@ def _sides(size: F64, asked: float | None) -> list[float]:
 
 def _grid(
     low: F64, high: F64, side: float, plan: FloorPlan | None
-) -> tuple[F64, tuple[int, int], npt.NDArray[np.int64]]:
+) -> tuple[F64, tuple[int, int], I64]:
     """Its lower left corner, columns and rows, and the cells (N, 2) with free space."""
     columns, rows = (max(1, math.ceil(length / side - 1e-9)) for length in high - low)
     # The grid lies about the region's middle.
@@ -158,7 +156,7 @@ def _grid(
     return origin, (columns, rows), cell
 
 
-def _has_free_space(plan: FloorPlan, centre: F64, side: float) -> npt.NDArray[np.bool_]:
+def _has_free_space(plan: FloorPlan, centre: F64, side: float) -> Bools:
     """Whether any of a raster of points in each cell (N, 2) is free in the plan; (N,)."""
     steps = (np.arange(8) + 0.5) / 8 - 0.5
     raster = side * np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

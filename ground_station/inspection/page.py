@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.inspection import scripts, tables
 from ground_station.inspection.comparison import Comparison
@@ -21,8 +22,6 @@ from ground_station.map.floorplan import FloorPlan
 from ground_station.map.store import Map
 from ground_station.map.summary import describe, figures, sigma
 from ground_station.presentation.pages import data_uri, write_page
-
-F64 = npt.NDArray[np.float64]
 
 MOST_POINTS, MOST_CAMERAS, MOST_FLIGHT = 150_000, 4_000, 4_000
 """Of more, one in so many is drawn: a browser's graphics memory, and the file's size."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.inspection.visibility import View, Visibility
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
 
 _LEAST_CHANCE = 0.02
 """Landmarks less likely than this are not projected."""
@@ -45,7 +44,7 @@ class Prediction:
     needs: Needs
 
     @property
-    def lost(self) -> npt.NDArray[np.bool_]:
+    def lost(self) -> Bools:
         """Where fewer landmarks are expected than are followed; to be found anew it takes more."""
         return self.count < self.needs.count
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.inspection.comparison import Comparison
 from ground_station.inspection.localizability import LocalizabilityMap
 from ground_station.map.store import Map, MapInfo
 
-F64 = npt.NDArray[np.float64]
 Rows = list[tuple[str, str]]
 
 _STRUCTURE = {

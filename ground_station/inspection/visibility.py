@@ -10,14 +10,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.map.store import Map
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 ANGLE_RAD = np.deg2rad(25.0)
 """A keyframe that looked from so far aside counts exp(-1/2): in three dimensions no detector and
@@ -45,7 +42,7 @@ class View:
         """That of a map's camera; lengths of a map that is not registered say nothing of metres."""
         return cls(map_.info.camera, NEAREST_M if map_.info.registered else 0.0)
 
-    def inside(self, points_c: F64) -> Mask:
+    def inside(self, points_c: F64) -> Bools:
         """Whether points in camera coordinates (..., 3) are in front and in the image; (...)."""
         shape = points_c.shape[:-1]
         points = points_c.reshape(-1, 3)
@@ -75,9 +72,9 @@ class Visibility:
         at = np.full(len(lm), -1, np.int64)
         at[self.rows] = np.arange(len(self.rows))
         view = View.of(map_)
-        landmark: list[npt.NDArray[np.int64]] = []
+        landmark: list[I64] = []
         ray: list[F64] = []
-        seen: list[Mask] = []
+        seen: list[Bools] = []
         for k in range(0, len(kf), max(1, -(-len(kf) // most_keyframes))):
             here = np.zeros(len(self.rows), bool)
             observations = at[kf.landmark[kf.offset[k] : kf.offset[k + 1]]]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.features.extractor import Extractor
 from ground_station.geometry import poses
 from ground_station.localization.attempt import Conditions, Stopwatch
@@ -25,10 +25,6 @@ from ground_station.localization.relocalization import Relocalization, Relocaliz
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe, spread_out
 from ground_station.map.store import Map
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
-
 
 _ALLOWED = 32.9
 """Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
@@ -98,7 +94,7 @@ class Acquirer:
             else None
         )
 
-    def describe(self, image: Image, taken: Conditions) -> Described:
+    def describe(self, image: U8, taken: Conditions) -> Described:
         """The features of a grey frame (H, W)."""
         return describe(self._extractor.extract(image), self.matcher.camera, taken)
 
@@ -175,7 +171,7 @@ class Acquirer:
         located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
         return replace(located, relocalized=True, significance=sole.significance)
 
-    def _open(self, found: Relocalization) -> Array:
+    def _open(self, found: Relocalization) -> F64:
         """The covariance (6, 6) of a find: before a wall a turn is hard to tell from a step aside,
         so that a direction which is open leaves a place open by as much of the depth."""
         depth_m = poses.transform(
@@ -207,7 +203,7 @@ class Acquirer:
         located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX, solution.state)
         return None if located.solution.state is None else located
 
-    def keyframe(self, time_ns: int, image: Image, wTc: Array, found: Located) -> Keyframe:
+    def keyframe(self, time_ns: int, image: U8, wTc: F64, found: Located) -> Keyframe:
         """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.
 
         Those of surely the same descriptor; others only where these are few, and less trusted: the
@@ -230,7 +226,7 @@ class Acquirer:
     def promote(
         self,
         time_ns: int,
-        image: Image,
+        image: U8,
         state: Kinematics,
         estimator: Estimator,
         taken: Conditions,
@@ -252,7 +248,7 @@ class Acquirer:
     def search(
         self,
         time_ns: int,
-        image: Image,
+        image: U8,
         expected: Sequence[Kinematics],
         make: Callable[[], Estimator],
         taken: Conditions,
@@ -280,7 +276,7 @@ class Acquirer:
         return _nothing(seen, reason)
 
     def _acquired(
-        self, time_ns: int, image: Image, found: Located, watch: Stopwatch, *, searched: bool
+        self, time_ns: int, image: U8, found: Located, watch: Stopwatch, *, searched: bool
     ) -> Acquired:
         keyframe, state = None, found.solution.state
         reason, count = found.solution.reason, int(found.observations.inlier.sum())

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, Bools, Indices
 from ground_station.localization.settings import AssociationSettings
-
-Array = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
 
 _BAND_PX = 80.0
 """Least height of a band of features; four times the radius, where that is more (measured)."""
@@ -45,12 +42,12 @@ class Associations:
 
 
 def associate(
-    feature_px: Array,
+    feature_px: F64,
     feature_descriptors: F32,
-    candidate_px: Array,
+    candidate_px: F64,
     candidate_descriptors: F32,
     settings: AssociationSettings,
-    radius_px: float | Array | None = None,
+    radius_px: float | F64 | None = None,
     max_distance: float | None = None,
     shows: Indices | None = None,
 ) -> Associations:
@@ -157,9 +154,9 @@ def _bounding(descriptors: F32) -> F32:
 
 
 def _near_in_both(
-    feature_px: Array,
+    feature_px: F64,
     feature_rows: F32,
-    candidate_px: Array,
+    candidate_px: F64,
     candidate_rows: F32,
     radius_px: float,
     least_product: float,
@@ -208,7 +205,7 @@ def _near_in_both(
     )
 
 
-def _near(offset_px: Array, candidate: Indices, radius_px: Array) -> npt.NDArray[np.bool_]:
+def _near(offset_px: F64, candidate: Indices, radius_px: F64) -> Bools:
     """Whether offsets (N, 2) from candidates (N,) are within their radius."""
     radius = radius_px[candidate] if radius_px.ndim else radius_px
     near = np.einsum("ij,ij->i", offset_px, offset_px) <= np.copysign(radius**2, radius)

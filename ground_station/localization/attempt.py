@@ -5,13 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import Indices
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.kinematics import Kinematics
-
-Indices = npt.NDArray[np.intp]
 
 
 class Stopwatch:

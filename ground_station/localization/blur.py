@@ -24,10 +24,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.geometry.camera import Camera
 from ground_station.localization.settings import BlurSettings
-
-Array = npt.NDArray[np.float64]
 
 _REDUCTION = 2
 """Averaged over as many pixels each way, noise falls and blur of a few pixels is still seen."""
@@ -47,7 +46,7 @@ kept 0.72, 0.58, 0.51, 0.41 and 0.35 of their energy.
 
 def expected_blur_px(
     camera: Camera, points_c: npt.ArrayLike, twist: npt.ArrayLike, exposure_s: float | None
-) -> Array:
+) -> F64:
     """The length (N,) of the path of points in the (distorted) image during an exposure, px.
 
     `points_c` (N, 3), metres, in the camera's axes at the middle of the exposure; `twist` (6,), the
@@ -64,7 +63,7 @@ def expected_blur_px(
     return np.asarray(first + np.linalg.norm(after - middle, axis=1))
 
 
-def gradient_energy(image: npt.NDArray[np.uint8]) -> float:
+def gradient_energy(image: U8) -> float:
     """The mean squared gradient over the variance of a grey image (H, W) uint8, at half its size.
 
     Free of brightness and exposure; 0 for a picture without contrast. Blur lowers it.
@@ -102,7 +101,7 @@ def blurred_sigma_px(
     blur_px: npt.ArrayLike,
     sharpness: float = 1.0,
     settings: BlurSettings | None = None,
-) -> Array:
+) -> F64:
     """Standard deviations (N,) of N features' coordinates in a blurred frame, px.
 
     `sigma_px` (N,) or one for all, what they are without blur; `blur_px` (N,) as expected, NaN

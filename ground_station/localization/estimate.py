@@ -6,9 +6,8 @@ import enum
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F32, F64, Bools, Indices
 
 
 class State(enum.Enum):
@@ -45,10 +44,10 @@ class Observations:
     map's landmarks; `residual_px` (N,), at the solution; `inlier` (N,).
     """
 
-    pixel_px: npt.NDArray[np.float32]
-    landmark: npt.NDArray[np.intp]
-    residual_px: Array
-    inlier: npt.NDArray[np.bool_]
+    pixel_px: F32
+    landmark: Indices
+    residual_px: F64
+    inlier: Bools
 
     def __len__(self) -> int:
         return len(self.landmark)
@@ -80,10 +79,10 @@ class PoseEstimate:
     index: int
     state: State
     reason: str = ""
-    wTc: Array | None = None
-    twist: Array | None = None
-    covariance: Array | None = None
-    predicted_wTc: Array | None = None
+    wTc: F64 | None = None
+    twist: F64 | None = None
+    covariance: F64 | None = None
+    predicted_wTc: F64 | None = None
     counts: Counts = Counts()
     observations: Observations = field(default_factory=no_observations)
     stage_ms: dict[str, float] = field(default_factory=dict)

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.kinematics import (
     Kinematics,
@@ -22,15 +22,13 @@ from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import LocalizerSettings, PoseSettings
 from ground_station.localization.smoother import FixedLagSmoother
 
-Array = npt.NDArray[np.float64]
-
 _POSE_SOLVERS = {"graph": solve_graph, "direct": solve_direct}
 
 
 class Estimator(Protocol):
     """What the localizer believes about the camera between two frames."""
 
-    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+    def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
         """A pose (4, 4) from elsewhere with its covariance (6, 6), and no known velocity."""
         ...
 
@@ -71,7 +69,7 @@ class PoseEstimator:
         self._solve = _POSE_SOLVERS[settings.pose.solver]
         self._motion = MotionModel(settings.motion)
 
-    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+    def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
         self._motion.restart(time_ns, wTc)
 
     def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
@@ -121,7 +119,7 @@ class FilterEstimator:
         self._camera, self._settings = camera, settings
         self._smoother = FixedLagSmoother(settings.motion, keep=smoothing)
 
-    def restart(self, time_ns: int, wTc: Array, covariance: Array | None = None) -> None:
+    def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
         start = self._settings.start
         sigma = np.r_[
             np.full(3, np.deg2rad(start.sigma_deg)), np.full(3, start.sigma_m),

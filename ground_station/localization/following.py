@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.localization.acquisition import Acquired, believed
 from ground_station.localization.attempt import Attempt
 from ground_station.localization.estimate import Counts, Observations
@@ -15,9 +15,6 @@ from ground_station.localization.kinematics import Kinematics, Solution, no_solu
 from ground_station.localization.matching import Matcher
 from ground_station.localization.settings import LocalizerSettings, PoseSettings
 from ground_station.localization.tracking import Keyframe, track
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
 
 REMEMBERED = 12
 """Frames kept for catching up with a search's result: it may take 0.4 s at 30 Hz."""
@@ -43,7 +40,7 @@ class Followed:
 def follow(
     keyframe: Keyframe,
     attempt: Attempt,
-    image: Image,
+    image: U8,
     predicted: Kinematics,
     matcher: Matcher,
     estimator: Estimator,
@@ -88,7 +85,7 @@ def better(landed: Keyframe, present: Keyframe | None, followed: Followed | None
 
 def catch_up(
     landed: Acquired,
-    recent: list[tuple[int, Image]],
+    recent: list[tuple[int, U8]],
     matcher: Matcher,
     estimator: Estimator,
 ) -> bool:

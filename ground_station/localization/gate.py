@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.localization.settings import GateSettings
 from pi_firmware.wire.entropy import of_counts
-
-Image = npt.NDArray[np.uint8]
 
 _BLOCK_PX = 8
 
 
-def entropy_bits(image: Image) -> float:
+def entropy_bits(image: U8) -> float:
     """Shannon's entropy of a picture (H, W), as the payload measures it, in less time."""
     return of_counts(cv2.calcHist([image], [0], None, [256], [0, 256]).ravel().astype(np.int64))
 
 
-def contrast(image: Image) -> float:
+def contrast(image: U8) -> float:
     """The brightest less the darkest block of 8x8 px of a picture (H, W), grey levels.
 
     A block's mean has an eighth of the sensor's noise, and one small dark thing on a white wall
@@ -41,7 +39,7 @@ def low_entropy(entropy: float, settings: GateSettings) -> str:
     return f"entropy {entropy:.2f} below {settings.min_entropy_bits:g} bits"
 
 
-def low_contrast(image: Image, settings: GateSettings) -> str:
+def low_contrast(image: U8, settings: GateSettings) -> str:
     """Why nothing can be seen in a grey picture (H, W); empty when something can."""
     if settings.min_contrast <= 0 or (shown := contrast(image)) >= settings.min_contrast:
         return ""

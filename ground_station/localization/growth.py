@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.errors import GroundStationError
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -31,8 +31,6 @@ from ground_station.localization.visibility import LandmarkIndex
 from ground_station.map import store
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
-
-Array = npt.NDArray[np.float64]
 
 _FEATURES, _DIMENSION = 1000, 128
 _SIZE_M = 50.0
@@ -56,7 +54,7 @@ class MadeUp:
     name, sha256, dimension = "made-up", "0" * 64, _DIMENSION
     distance_scale = 1.0
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Never asked: the features are made. Raises `BenchError` if it is."""
         raise BenchError("a made-up map has no pictures")
 
@@ -65,7 +63,7 @@ class MadeUp:
 class _View:
     """A pose (4, 4), another near it to start from, and what is seen."""
 
-    guess: Array
+    guess: F64
     features: Features
 
 
@@ -187,7 +185,7 @@ def building(rng: np.random.Generator, inner: int, total: int) -> Landmarks:
     )
 
 
-def _described(rng: np.random.Generator, count: int) -> npt.NDArray[np.uint8]:
+def _described(rng: np.random.Generator, count: int) -> U8:
     """Descriptors (count, 128) as a map's file holds them."""
     return np.asarray(_BYTES[rng.integers(0, 256, (count, _DIMENSION), np.uint8)])
 

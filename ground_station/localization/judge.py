@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.localization.estimate import State
 from ground_station.localization.settings import StateSettings
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Evidence:
     observations: int
     spread: float
     residual_px: float
-    covariance: Array
+    covariance: F64
     innovation: float = float("nan")
     support_ns: int = 0
     denied: int = 0

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry import poses
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -23,11 +20,11 @@ class Kinematics:
     """
 
     time_ns: int
-    wTc: Array
-    twist: Array
-    covariance: Array
+    wTc: F64
+    twist: F64
+    covariance: F64
 
-    def after(self, dt_s: float) -> Array:
+    def after(self, dt_s: float) -> F64:
         """The pose (4, 4) `dt_s` later at the same twist."""
         return np.asarray(self.wTc @ poses.exp(self.twist * dt_s))
 
@@ -42,12 +39,12 @@ class LandmarkObservations:
     (N,), how many undistorted pixels one of the picture's is there, by which residuals are judged.
     """
 
-    points_m: Array
-    pinhole_px: Array
-    row_s: Array
-    sigma_px: Array
-    covariance_m2: Array
-    stretch: Array
+    points_m: F64
+    pinhole_px: F64
+    row_s: F64
+    sigma_px: F64
+    covariance_m2: F64
+    stretch: F64
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -65,10 +62,10 @@ class Solution:
     `inlier` (N,) belong to the observations given; `reason` says why there is no state."""
 
     state: Kinematics | None
-    information: Array
-    gradient: Array
-    residual_px: Array
-    inlier: Flags
+    information: F64
+    gradient: F64
+    residual_px: F64
+    inlier: Bools
     innovation: float = float("nan")
     iterations: int = 0
     reason: str = ""

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import U8, Indices
 from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry import poses
@@ -34,10 +35,6 @@ from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
 from ground_station.map.accuracy import accuracy
 from ground_station.map.store import Map, check_features
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
-
 
 _USUAL_DEPTH_M = 5.0
 """How far off the landmarks of a map without units are taken to be: it says how fast is fast."""
@@ -91,9 +88,9 @@ class Localizer:
         self._followed: Followed | None = None
         self._located: Located | None = None
         self._refused = ""
-        self._recent: deque[tuple[int, Image]] = deque(maxlen=following.REMEMBERED)
+        self._recent: deque[tuple[int, U8]] = deque(maxlen=following.REMEMBERED)
         self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
-        self._seen: npt.NDArray[np.intp] | None = None
+        self._seen: Indices | None = None
         self._last_frame_ns: int | None = None
         self._last_worked_ns: int | None = None
         self._last_search_ns: int | None = None
@@ -140,7 +137,7 @@ class Localizer:
         return final
 
     def process(
-        self, time_ns: int, image: Image, index: int = 0, exposure_s: float | None = None
+        self, time_ns: int, image: U8, index: int = 0, exposure_s: float | None = None
     ) -> PoseEstimate:
         """The pose of a grey frame (H, W) uint8 taken at `time_ns`.
 
@@ -184,7 +181,7 @@ class Localizer:
         self._last_frame_ns = self._last_worked_ns = time_ns
         return self._locate(attempt, describe(features, self.camera, self._conditions(None, None)))
 
-    def _conditions(self, image: Image | None, exposure_s: float | None) -> Conditions:
+    def _conditions(self, image: U8 | None, exposure_s: float | None) -> Conditions:
         sharp = 1.0
         if image is not None and self.settings.blur.enabled:
             energy = gradient_energy(image)
@@ -224,7 +221,7 @@ class Localizer:
 
     # Frames that are described themselves
 
-    def _describe(self, attempt: Attempt, image: Image) -> PoseEstimate:
+    def _describe(self, attempt: Attempt, image: U8) -> PoseEstimate:
         self._worker.drop()
         began_s = perf_counter()
         seen = self._acquirer.describe(image, attempt.taken)
@@ -278,7 +275,7 @@ class Localizer:
 
     # Frames that are followed from a keyframe
 
-    def _follow(self, attempt: Attempt, image: Image) -> PoseEstimate:
+    def _follow(self, attempt: Attempt, image: U8) -> PoseEstimate:
         relocalized = self._land(attempt)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
         reason = f"searching; last refused: {self._refused}" if self._refused else "searching"
@@ -298,7 +295,7 @@ class Localizer:
         self._search(attempt, image)
         return self._unsolved(attempt, reason)
 
-    def _renew(self, attempt: Attempt, image: Image, followed: Followed) -> None:
+    def _renew(self, attempt: Attempt, image: U8, followed: Followed) -> None:
         """Asks for the next keyframe when this one is old, far or half out of view.
 
         Under overload only the last counts, or a doubt: an old one costs some accuracy and no pose.
@@ -324,7 +321,7 @@ class Localizer:
                 lag_s,
             )
 
-    def _search(self, attempt: Attempt, image: Image) -> None:
+    def _search(self, attempt: Attempt, image: U8) -> None:
         """Asks for this frame to be found, near its prediction or anywhere."""
         if self._worker.busy or not self._may_search(attempt.time_ns):
             return

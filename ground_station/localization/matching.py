@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
@@ -22,10 +23,6 @@ from ground_station.localization.verification import Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.map.modes import described
 from ground_station.map.store import Map
-
-Array = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
 
 _WIDTH_PX = 640.0
 """Of the pictures for which the settings name a search radius."""
@@ -43,8 +40,8 @@ class Described:
     """A frame's finite features; `normalized` (F, 2) and `pinhole_px` (F, 2) are without lens."""
 
     features: Features
-    normalized: Array
-    pinhole_px: Array
+    normalized: F64
+    pinhole_px: F64
     taken: Conditions
 
     def __len__(self) -> int:
@@ -127,7 +124,7 @@ class Matcher:
             among = self._covisibility.covisible(seen.taken.recent, expected.wTc, among)
         projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
         where = projected.pinhole_px
-        radius: float | Array = radius_px or self.radius_px
+        radius: float | F64 = radius_px or self.radius_px
         if self.camera.model == "fisheye":  # or an array of ones would cost the others time
             radius = radius * self.camera.stretch(where)
         if self._rolling and len(where):
@@ -176,7 +173,7 @@ class Matcher:
             len(pairs),
         )
 
-    def reach_px(self, step: Array) -> float:
+    def reach_px(self, step: F64) -> float:
         """How far a tangent step (6,) of the pose moves the picture of what lies at usual depth."""
         angle = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:]) / self._depth_m
         return float(self.camera.fx_px * angle)
@@ -186,14 +183,14 @@ class Matcher:
         sigma = np.sqrt(np.diag(expected.covariance)[:6])
         return not self.reach_px(_REACH * sigma) > self.radius_px
 
-    def doubt_px(self, points_m: Array, expected: Kinematics) -> float:
+    def doubt_px(self, points_m: F64, expected: Kinematics) -> float:
         """How far off nine in ten of landmarks (N, 3) may be from where they are expected."""
         if not len(points_m):
             return 0.0
         variance = _variance_px2(points_m, expected, self.camera)
         return float(_REACH * np.sqrt(np.quantile(variance, 0.9)))
 
-    def significance(self, seen: Described, wTc: Array) -> float:
+    def significance(self, seen: Described, wTc: F64) -> float:
         """By how many standard deviations a pose (4, 4) explains more landmarks than chance does.
 
         Near a wrong pose features pair up as well, and agree with each other as far as they were
@@ -207,7 +204,7 @@ class Matcher:
         self,
         pixel_px: npt.ArrayLike,
         landmark: Indices,
-        sigma_px: float | Array,
+        sigma_px: float | F64,
         expected: Kinematics,
         taken: Conditions,
     ) -> LandmarkObservations:
@@ -234,12 +231,12 @@ class Matcher:
             stretch,
         )
 
-    def row_s(self, pixel_px: Array) -> Array:
+    def row_s(self, pixel_px: F64) -> F64:
         """When the rows of distorted pixels (N, 2) are exposed after the frame's time, seconds."""
         last = self.camera.height_px - 1
         return np.asarray((pixel_px[:, 1] - last / 2) / last * self._readout_s)
 
-    def _at_rows(self, points_m: Array, pinhole_px: Array, expected: Kinematics) -> Array:
+    def _at_rows(self, points_m: F64, pinhole_px: F64, expected: Kinematics) -> F64:
         """Pinhole pixels (N, 2) moved by what the camera moves until their rows are exposed."""
         if self._readout_s == 0 or not np.any(expected.twist):
             return pinhole_px
@@ -248,7 +245,7 @@ class Matcher:
         row_s = (row / (self.camera.height_px - 1) - 0.5) * self._readout_s
         return np.asarray(pinhole_px + flow * np.clip(row_s, -1, 1)[:, None])
 
-    def _radius_px(self, points_m: Array, pinhole_px: Array, expected: Kinematics) -> Array:
+    def _radius_px(self, points_m: F64, pinhole_px: F64, expected: Kinematics) -> F64:
         """How far from its prediction (N, 2) each landmark (N, 3) is looked for, by the covariance.
 
         The limits, as a pixel's noise, are of the picture, whose pixels the lens stretches.
@@ -261,13 +258,13 @@ class Matcher:
         return np.clip(np.nan_to_num(radius, nan=np.inf), least * stretch, most)
 
 
-def _variance_px2(points_m: Array, expected: Kinematics, camera: Camera) -> Array:
+def _variance_px2(points_m: F64, expected: Kinematics, camera: Camera) -> F64:
     """The variance (N,) of where points (N, 3) are seen, by the pose's covariance, both axes'."""
     J = pixel_jacobian(points_m, expected.wTc, camera)
     return np.asarray(np.einsum("nij,nij->n", J @ expected.covariance[:6, :6], J))
 
 
-def pixel_jacobian(points_m: Array, wTc: Array, camera: Camera) -> Array:
+def pixel_jacobian(points_m: F64, wTc: F64, camera: Camera) -> F64:
     """∂(pinhole pixel)/∂ξ (N, 2, 6) of points (N, 3), ξ the right tangent of wTc; z is kept > 0."""
     x, y, z = poses.transform(poses.inverse(wTc), points_m).T
     z = np.maximum(z, 1e-3)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.localization.settings import MotionSettings
 
-Array = npt.NDArray[np.float64]
 
-
-def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fraction: float) -> Array:
+def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fraction: float) -> F64:
     """The pose (4, 4) a `fraction` of the last step after `wTc_last`.
 
     With equal steps, fraction 1, wT̂(k+1) = wT(k)·wT(k−1)⁻¹·wT(k): the step in the camera's own
@@ -35,26 +34,26 @@ class MotionModel:
 
     def __init__(self, settings: MotionSettings) -> None:
         self.settings = settings
-        self._last: tuple[int, Array] | None = None
-        self._before: tuple[int, Array] | None = None
+        self._last: tuple[int, F64] | None = None
+        self._before: tuple[int, F64] | None = None
 
     @property
     def last_time_ns(self) -> int | None:
         """The time of the last solved pose, or of the given first one."""
         return self._last[0] if self._last else None
 
-    def restart(self, time_ns: int, wTc: Array) -> None:
+    def restart(self, time_ns: int, wTc: F64) -> None:
         """A pose from elsewhere, with no velocity: a given first one or a relocalization."""
         self._last, self._before = (time_ns, wTc), None
 
-    def update(self, time_ns: int, wTc: Array) -> None:
+    def update(self, time_ns: int, wTc: F64) -> None:
         """A solved pose (4, 4), later than the last."""
         if self._last is None or time_ns <= self._last[0]:
             self.restart(time_ns, wTc)
         else:
             self._before, self._last = self._last, (time_ns, wTc)
 
-    def predict(self, time_ns: int) -> Array | None:
+    def predict(self, time_ns: int) -> F64 | None:
         """The expected pose (4, 4) at a time, or None when no pose was ever known.
 
         The velocity is that of the last two solved poses, whatever the time between them up to

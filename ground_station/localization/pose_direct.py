@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.pose_graph import PoseSolution, failure, reprojection_px
 from ground_station.localization.pose_newton import Reprojection, descend
 from ground_station.localization.settings import PoseSettings
 
-Array = npt.NDArray[np.float64]
-
 
 def solve_direct(
-    wTc: Array, points_w: Array, pinhole_px: Array, camera: Camera, settings: PoseSettings
+    wTc: F64, points_w: F64, pinhole_px: F64, camera: Camera, settings: PoseSettings
 ) -> PoseSolution:
     """The pose that explains undistorted pixels (N, 2) of landmarks (N, 3), from a guess (4, 4).
 

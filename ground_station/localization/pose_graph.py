@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 from gtsam.symbol_shorthand import L, X
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry.camera import Camera
 from ground_station.localization.settings import PoseSettings
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -23,10 +21,10 @@ class PoseSolution:
     as of GTSAM's Pose3. `residual_px` (N,) belongs to the observations given, `inlier` (N,) too.
     """
 
-    wTc: Array | None
-    covariance: Array | None
-    residual_px: Array
-    inlier: npt.NDArray[np.bool_]
+    wTc: F64 | None
+    covariance: F64 | None
+    residual_px: F64
+    inlier: Bools
     iterations: int
     reason: str = ""
 
@@ -38,7 +36,7 @@ def failure(count: int, iterations: int, reason: str) -> PoseSolution:
     )
 
 
-def reprojection_px(camera: Camera, wTc: Array, points_w: Array, pinhole_px: Array) -> Array:
+def reprojection_px(camera: Camera, wTc: F64, points_w: F64, pinhole_px: F64) -> F64:
     """Distances (N,) between undistorted pixels (N, 2) and projected points (N, 3), pixels.
 
     Points behind the camera are infinitely far off.
@@ -53,7 +51,7 @@ def reprojection_px(camera: Camera, wTc: Array, points_w: Array, pinhole_px: Arr
 
 
 def solve_graph(
-    wTc: Array, points_w: Array, pinhole_px: Array, camera: Camera, settings: PoseSettings
+    wTc: F64, points_w: F64, pinhole_px: F64, camera: Camera, settings: PoseSettings
 ) -> PoseSolution:
     """The pose that explains undistorted pixels (N, 2) of landmarks (N, 3), from a guess (4, 4).
 

@@ -15,14 +15,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.row_motion import RowMotion, adjoint
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 NEAREST_M = 1e-3
 """A point nearer than this, or behind, has no projection."""
@@ -46,15 +43,15 @@ _CONVERGED = 1e-4
 class Prior:
     """A Gaussian of pose and twist: means, and the information (12, 12) of their right tangent."""
 
-    cTw: Array
-    twist: Array
-    information: Array
+    cTw: F64
+    twist: F64
+    information: F64
 
-    def apart(self, wTc: Array, twist: Array) -> Array:
+    def apart(self, wTc: F64, twist: F64) -> F64:
         """The tangent step (12,) from the mean to a pose (4, 4) and twist (6,)."""
         return np.concatenate([poses.log(self.cTw @ wTc), twist - self.twist])
 
-    def at(self, wTc: Array, twist: Array) -> tuple[Array, Array, float]:
+    def at(self, wTc: F64, twist: F64) -> tuple[F64, F64, float]:
         """Information (12, 12), gradient (12,) and cost for steps from a pose and twist."""
         step = self.apart(wTc, twist)
         ad = adjoint(step[:6])
@@ -77,14 +74,14 @@ class Linear:
     px², that reweighting adds beyond Huber's reach.
     """
 
-    information: Array
-    gradient: Array
+    information: F64
+    gradient: F64
     cost: float
-    moved_m: Array
-    spread_px2: Array
-    reach: Array
-    rows: Array | None
-    excess: Array
+    moved_m: F64
+    spread_px2: F64
+    reach: F64
+    rows: F64 | None
+    excess: F64
 
 
 @dataclass(frozen=True)
@@ -95,11 +92,11 @@ class Reprojection:
     `row_s` (N,) is None for a global shutter: then the pose is all that is asked for.
     """
 
-    points_m: Array
-    offset_px: Array
-    covariance_m2: Array
-    variance_px2: Array
-    row_s: Array | None
+    points_m: F64
+    offset_px: F64
+    covariance_m2: F64
+    variance_px2: F64
+    row_s: F64 | None
     camera: Camera
     huber_k: float
 
@@ -108,7 +105,7 @@ class Reprojection:
         """The number of observations."""
         return int(self.points_m.shape[1])
 
-    def where(self, keep: Flags) -> Reprojection:
+    def where(self, keep: Bools) -> Reprojection:
         """Of those observations alone."""
         return replace(
             self,
@@ -119,7 +116,7 @@ class Reprojection:
             row_s=None if self.row_s is None else self.row_s[keep],
         )
 
-    def view(self, wTc: Array, twist: Array, moved_m: Array | None = None) -> View:
+    def view(self, wTc: F64, twist: F64, moved_m: F64 | None = None) -> View:
         """What a pose (4, 4) and twist (6,) have the camera see, landmarks moved by `moved_m`."""
         world = self.points_m if moved_m is None else self.points_m + moved_m
         points = wTc[:3, :3].T @ (world - wTc[:3, 3:])
@@ -136,7 +133,7 @@ class Reprojection:
         residual -= self.offset_px
         return View(camera, wTc[:3, :3], motion, uv, inverse_z, residual, front, all_front)
 
-    def reach(self, view: View) -> tuple[Array, Array, Array]:
+    def reach(self, view: View) -> tuple[F64, F64, F64]:
         """Rows ∂pixel/∂landmark in world axes (2, 3, N), their products with the landmarks'
         covariances (2, 3, N), and these in the image, px² (3, N): uu, uv, vv."""
         rows = view.rows()
@@ -148,8 +145,8 @@ class Reprojection:
 
     def linearize(
         self,
-        wTc: Array,
-        twist: Array,
+        wTc: F64,
+        twist: F64,
         last: Linear | None = None,
         *,
         move: bool = False,
@@ -190,9 +187,7 @@ class Reprojection:
             flat @ flat.T, gradient, cost, -best, spread, reach, rows if move else None, excess
         )
 
-    def _whiten(
-        self, r: Array, spread: Array, excess: Array | None, sharp: bool
-    ) -> tuple[Array, Array, Array]:
+    def _whiten(self, r: F64, spread: F64, excess: F64 | None, sharp: bool) -> tuple[F64, F64, F64]:
         """y (2, N) of the module's text, (t − 1)·sigma² (N,), and L's uu, vu, vv (3, N).
 
         L Lᵀ is (t·sigma²·I + S)⁻¹ or, with `sharp`, ∂y/∂r; S is `spread` (3, N). `excess` is what
@@ -221,7 +216,7 @@ class Reprojection:
             factor[0, far], factor[1, far], factor[2, far] = -rest * b, rest * a, 0.0
         return y, excess, factor
 
-    def _newton(self, total: Array, r: Array, spread: Array, variance: Array) -> Array:
+    def _newton(self, total: F64, r: F64, spread: F64, variance: F64) -> F64:
         """A t·sigma² (N,) nearer to sigma·‖y‖ = k: one step of Newton's on the inverse of both.
 
         Moré and Sorensen's iteration for the same equation in a trust region. One step is exact
@@ -234,7 +229,7 @@ class Reprojection:
         return np.asarray(np.maximum(total + square * over / (curved * inverse), variance))
 
 
-def solve2(variance: Array | float, spread: Array, r: Array) -> tuple[Array, Array, Array, Array]:
+def solve2(variance: F64 | float, spread: F64, r: F64) -> tuple[F64, F64, F64, F64]:
     """(variance·I + S)⁻¹ r (2, N); one over that matrix's determinant, and its diagonal (N,)."""
     uu, vv, uv = variance + spread[0], variance + spread[2], spread[1]
     inverse = 1.0 / (uu * vv - uv * uv)
@@ -250,15 +245,15 @@ class View:
     (2, N) and which are in `front` (N,) of it; those behind have numbers that mean nothing."""
 
     camera: Camera
-    wRc: Array
+    wRc: F64
     motion: RowMotion | None
-    uv: Array
-    inverse_z: Array
-    residual_px: Array
-    front: Flags
+    uv: F64
+    inverse_z: F64
+    residual_px: F64
+    front: Bools
     all_front: bool
 
-    def rows(self) -> Array:
+    def rows(self) -> F64:
         """∂pixel/∂landmark (2, 3, N) in world axes."""
         (u, v), camera = self.uv, self.camera
         rows = np.zeros((2, 3, len(u)))
@@ -270,7 +265,7 @@ class View:
             rows = self.motion.turned_back(rows)
         return self.wRc @ rows
 
-    def jacobian(self) -> Array:
+    def jacobian(self) -> F64:
         """∂pixel/∂(pose, twist) (12, 2, N), or ∂pixel/∂pose (6, 2, N) without a motion.
 
         Right tangent: the pinhole's derivative times ∂p_c/∂ξ = [hat(p_c), −I].
@@ -295,8 +290,8 @@ class View:
 class Descent:
     """Where a descent ended; `linear` is of the observations alone. `reason`: why there is none."""
 
-    wTc: Array
-    twist: Array
+    wTc: F64
+    twist: F64
     linear: Linear
     iterations: int
     reason: str = ""
@@ -304,8 +299,8 @@ class Descent:
 
 def descend(
     observations: Reprojection,
-    wTc: Array,
-    twist: Array,
+    wTc: F64,
+    twist: F64,
     prior: Prior | None,
     max_iterations: int,
     rough: bool = False,
@@ -361,9 +356,7 @@ def descend(
     return Descent(wTc, twist, linear, max_iterations, reason)
 
 
-def _with(
-    prior: Prior | None, linear: Linear, wTc: Array, twist: Array
-) -> tuple[Array, Array, float]:
+def _with(prior: Prior | None, linear: Linear, wTc: F64, twist: F64) -> tuple[F64, F64, float]:
     if prior is None:
         return linear.information, linear.gradient, linear.cost
     information, gradient, cost = prior.at(wTc, twist)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.kinematics import (
@@ -15,8 +15,6 @@ from ground_station.localization.kinematics import (
 )
 from ground_station.localization.pose_newton import Prior, Reprojection, descend, solve2
 from ground_station.localization.settings import PoseSettings
-
-Array = npt.NDArray[np.float64]
 
 _WIDENING = 9.0
 """Squared: an observation may miss by three deviations of its landmark beside `inlier_px`."""
@@ -134,7 +132,7 @@ def _prior(predicted: Kinematics) -> Prior | None:
     return Prior(poses.inverse(predicted.wTc), predicted.twist, information)
 
 
-def _inverse(information: Array) -> Array | None:
+def _inverse(information: F64) -> F64 | None:
     """The covariance of an information matrix (12, 12); None when it is singular."""
     scale = 1.0 / np.sqrt(np.diag(information))
     try:
@@ -145,8 +143,8 @@ def _inverse(information: Array) -> Array | None:
 
 
 def _judge(
-    observations: Reprojection, wTc: Array, twist: Array, spread_px2: Array, inlier_px: Array
-) -> tuple[Array, npt.NDArray[np.bool_]]:
+    observations: Reprojection, wTc: F64, twist: F64, spread_px2: F64, inlier_px: F64
+) -> tuple[F64, Bools]:
     """Distances (N,) of observations from projected landmarks, pixels; which are inliers (N,)."""
     view = observations.view(wTc, twist)
     r = view.residual_px

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.settings import MotionSettings
-
-Array = npt.NDArray[np.float64]
 
 _SHORTEST_S = 2e-3
 """Frames that are nearer count as this far apart: no noise becomes too small for a graph."""
@@ -35,8 +33,8 @@ class Step:
     """
 
     state: Kinematics
-    transition: Array
-    noise: Array
+    transition: F64
+    noise: F64
 
 
 @dataclass(frozen=True)
@@ -46,32 +44,32 @@ class Density:
     rotation: float
     translation: float
 
-    def diagonal(self) -> Array:
+    def diagonal(self) -> F64:
         """(6,), rotation first."""
         return np.array([self.rotation] * 3 + [self.translation] * 3)
 
 
-def adjoint(aTb: Array) -> Array:
+def adjoint(aTb: F64) -> F64:
     """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
     return np.asarray(gtsam.Pose3(aTb).AdjointMap())
 
 
-def right_jacobian(xi: Array) -> Array:
+def right_jacobian(xi: F64) -> F64:
     """(6, 6) J of exp(ξ + δ) ≈ exp(ξ)·exp(J·δ). Barfoot 2017, section 7.1.5."""
     return np.asarray(gtsam.Pose3.ExpmapDerivative(xi))
 
 
-def inverse_right_jacobian(xi: Array) -> Array:
+def inverse_right_jacobian(xi: F64) -> F64:
     """(6, 6) J⁻¹ of log(exp(ξ)·exp(δ)) ≈ ξ + J⁻¹·δ."""
     return np.asarray(gtsam.Pose3.LogmapDerivative(gtsam.Pose3.Expmap(xi)))
 
 
-def difference(a: Kinematics, b: Kinematics) -> Array:
+def difference(a: Kinematics, b: Kinematics) -> F64:
     """The tangent step (12,) from state a to state b."""
     return np.concatenate([poses.log(poses.inverse(a.wTc) @ b.wTc), b.twist - a.twist])
 
 
-def moved(state: Kinematics, step: Array, covariance: Array) -> Kinematics:
+def moved(state: Kinematics, step: F64, covariance: F64) -> Kinematics:
     """The state a tangent step (12,) away, with this covariance (12, 12)."""
     wTc = _rotation_again(state.wTc @ poses.exp(step[:6]))
     return Kinematics(state.time_ns, wTc, state.twist + step[6:], covariance)
@@ -82,7 +80,7 @@ def advance(
     time_ns: int,
     settings: MotionSettings,
     density: Density,
-    rest_up: Array | None = None,
+    rest_up: F64 | None = None,
 ) -> Step:
     """The step of the settings' process from a state to a later time.
 
@@ -116,9 +114,7 @@ def advance(
     return Step(Kinematics(time_ns, _rotation_again(wTc), twist, covariance), transition, noise)
 
 
-def _static(
-    state: Kinematics, dt_s: float, settings: MotionSettings
-) -> tuple[Array, Array, Array, Array]:
+def _static(state: Kinematics, dt_s: float, settings: MotionSettings) -> tuple[F64, F64, F64, F64]:
     # A velocity that is drawn anew each time: over one step its variance is walk/dt, so that the
     # pose walks at random, and nothing of the old one is kept.
     walk = np.array([settings.walk_rotation_rad2_s] * 3 + [settings.walk_translation_m2_s] * 3)
@@ -129,14 +125,14 @@ def _static(
 
 def _constant_velocity(
     state: Kinematics, dt_s: float, density: Density
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[F64, F64, F64, F64]:
     """White noise on acceleration: Anderson and Barfoot, IROS 2015, in right tangents."""
     step = state.twist * dt_s
     transition = _transition(step, dt_s * _ONE)
     return state.wTc @ poses.exp(step), state.twist, transition, _integrated(density, dt_s)
 
 
-def _transition(step: Array, by_twist: Array) -> Array:
+def _transition(step: F64, by_twist: F64) -> F64:
     """(12, 12) of wTc·exp(step) when a twist's step δ changes the tangent `step` by by_twist·δ."""
     result = np.eye(12)
     result[:6, :6] = adjoint(poses.exp(-step))
@@ -144,7 +140,7 @@ def _transition(step: Array, by_twist: Array) -> Array:
     return result
 
 
-def _integrated(density: Density, dt_s: float) -> Array:
+def _integrated(density: Density, dt_s: float) -> F64:
     """(12, 12): the white acceleration of `dt_s` in pose and twist. Barfoot 2017, eq. 3.129."""
     q = density.diagonal()
     result = np.zeros((12, 12))
@@ -155,8 +151,8 @@ def _integrated(density: Density, dt_s: float) -> Array:
 
 
 def _blimp(
-    state: Kinematics, dt_s: float, settings: MotionSettings, density: Density, rest_up: Array
-) -> tuple[Array, Array, Array, Array]:
+    state: Kinematics, dt_s: float, settings: MotionSettings, density: Density, rest_up: F64
+) -> tuple[F64, F64, F64, F64]:
     """Drag, and pitch and roll as damped pendulums about the hull's turning point above the camera.
 
     All is linear in (tilt, rates, speed) at the turning point; a constant adjoint takes tangents
@@ -201,7 +197,7 @@ def _blimp(
     return wTc, to_camera @ moved_twist, back @ transition @ there, back @ noise @ back.T
 
 
-def _swing_axes(rest_up: Array) -> Array:
+def _swing_axes(rest_up: F64) -> F64:
     """(3, 3), columns: the axes of pitch and roll in the camera's axes, and up.
 
     Pitch is about the camera's x axis as far as that is level; a camera that looks along its
@@ -213,7 +209,7 @@ def _swing_axes(rest_up: Array) -> Array:
     return np.stack([pitch, np.cross(rest_up, pitch), rest_up], axis=1)
 
 
-def _oscillators(settings: MotionSettings, after_s: Array) -> Array:
+def _oscillators(settings: MotionSettings, after_s: F64) -> F64:
     """(3, 2, 2, N): what becomes of angle and rate of pitch, roll and yaw after N times.
 
     Damped oscillators for pitch and roll; yaw keeps its rate.
@@ -233,7 +229,7 @@ def _oscillators(settings: MotionSettings, after_s: Array) -> Array:
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis: Array) -> Array:
+def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis: F64) -> F64:
     """(12, 12) at the turning point: each axis's answer to white acceleration, by quadrature."""
     after_s = (_NODES + 1) * dt_s / 2
     fade = np.exp(-after_s / settings.drag_time_s)
@@ -251,7 +247,7 @@ def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis:
     return noise
 
 
-def _rotation_again(wTc: Array) -> Array:
+def _rotation_again(wTc: F64) -> F64:
     # Products of products grow their rounding error: see motion.constant_velocity. A step of Newton
     # and Schulz's iteration for the polar factor (Higham 1986) squares what is wrong.
     R = wTc[:3, :3]

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.map.store import Landmarks
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class Projected:
     """N landmarks in view: `landmark` (N,) indices, `pinhole_px` (N, 2), undistorted pixels."""
 
     landmark: Indices
-    pinhole_px: Array
+    pinhole_px: F64
 
 
 def project(
@@ -55,8 +53,8 @@ def project(
 
 
 def in_cone(
-    landmarks: Landmarks, index: Indices, position_m: Array, settings: ProjectionSettings
-) -> npt.NDArray[np.bool_]:
+    landmarks: Landmarks, index: Indices, position_m: F64, settings: ProjectionSettings
+) -> Bools:
     """Whether landmarks `index` (N,) are looked at from within their widened cones; (N,).
 
     `position_m` (3,) is the camera's, in the world. The distances that keyframes had count, too.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.attempt import Attempt
 from ground_station.localization.estimate import PoseEstimate, State
@@ -14,10 +14,8 @@ from ground_station.localization.relocalization import spread
 from ground_station.localization.settings import CovarianceSettings
 from ground_station.map.accuracy import Accuracy
 
-Array = npt.NDArray[np.float64]
 
-
-def covariance_in_map(covariance: Array, information: Array, settings: CovarianceSettings) -> Array:
+def covariance_in_map(covariance: F64, information: F64, settings: CovarianceSettings) -> F64:
     """The pose's covariance (6, 6) in the map: scaled, and with what frames share added.
 
     A filter takes the errors of two frames for independent; the errors of the landmarks they both
@@ -32,7 +30,7 @@ def covariance_in_map(covariance: Array, information: Array, settings: Covarianc
     return np.asarray(published)
 
 
-def covariance_in_world(in_map: Array, of_map: Accuracy, wTc: Array, share: float) -> Array:
+def covariance_in_world(in_map: F64, of_map: Accuracy, wTc: F64, share: float) -> F64:
     """The pose's covariance (6, 6) as it goes out: in the map, and the map's own in the world.
 
     The first cannot know how the map is bent and how well it is registered, and the more images a
@@ -44,7 +42,7 @@ def covariance_in_world(in_map: Array, of_map: Accuracy, wTc: Array, share: floa
 def evidence_of(
     attempt: Attempt,
     solution: Solution,
-    covariance: Array,
+    covariance: F64,
     camera: Camera,
     support_ns: int,
     denied: int,
@@ -74,7 +72,7 @@ def publish(
     reason: str,
     *,
     found: Kinematics | None = None,
-    covariance: Array | None = None,
+    covariance: F64 | None = None,
     relocalized: bool = False,
     gated: bool = False,
     tracked: bool = False,

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
@@ -21,10 +22,6 @@ from ground_station.localization.settings import RecoverySettings
 from ground_station.localization.verification import Witness
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks, Map
-
-Array = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
 
 _BLOCK = 8_000_000
 """Descriptor products held at once: 32 MB."""
@@ -39,7 +36,7 @@ class Relocalization:
     their depth.
     """
 
-    wTc: Array
+    wTc: F64
     feature: Indices
     landmark: Indices
     significance: float = 0.0
@@ -102,8 +99,8 @@ def spread(pixel_px: npt.ArrayLike, camera: Camera) -> float:
 
 
 def pose_from_matches(
-    points_m: Array, pinhole_px: Array, camera: Camera, settings: RecoverySettings, seed: int
-) -> tuple[Array, Indices] | None:
+    points_m: F64, pinhole_px: F64, camera: Camera, settings: RecoverySettings, seed: int
+) -> tuple[F64, Indices] | None:
     """wTc (4, 4) that most points (N, 3) at undistorted pixels (N, 2) agree with, and which do.
 
     P3P in RANSAC with MAGSAC's score and local optimisation; None where nothing is found.
@@ -151,7 +148,7 @@ class _Search:
     def __init__(
         self,
         features: Features,
-        normalized: Array,
+        normalized: F64,
         landmarks: Landmarks,
         lens: Lens,
         settings: RecoverySettings,
@@ -166,7 +163,7 @@ class _Search:
         self.pinhole_px = normalized * focal + centre
         self.witness = Witness(features, lens, modes)
 
-    def propose(self, candidates: Indices) -> tuple[Array, Indices] | str:
+    def propose(self, candidates: Indices) -> tuple[F64, Indices] | str:
         """wTc and its inliers from matches with some landmarks (M,), or why there is none."""
         settings, lm = self.settings, self.landmarks
         rows, mode = described(lm.descriptor, self.modes, candidates)
@@ -187,7 +184,7 @@ class _Search:
             return f"{len(inliers)} inliers of {len(feature)} matches"
         return wTc, candidates[row[inliers]]
 
-    def confirm(self, wTc: Array, expected: Indices) -> Relocalization | str:
+    def confirm(self, wTc: F64, expected: Indices) -> Relocalization | str:
         """The pose refined over all landmarks that should be seen, or why it is refused."""
         settings = self.settings
         support = self.witness.support(wTc, self.landmarks, expected)
@@ -211,7 +208,7 @@ class _Search:
         open_by = self._sigma(wTc, landmark)
         return Relocalization(wTc, feature, landmark, support.significance, open_by)
 
-    def _sigma(self, wTc: Array, landmark: Indices) -> float:
+    def _sigma(self, wTc: F64, landmark: Indices) -> float:
         """Standard deviation of the position over the inliers' depth, at half the threshold."""
         X, Y, Z = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark]).T
         x, y, none = X / Z, Y / Z, np.zeros_like(Z)
@@ -224,14 +221,14 @@ class _Search:
             return float("inf")
         return float(np.sqrt(np.trace(covariance[3:, 3:])) / np.median(Z))
 
-    def _residual_px(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
+    def _residual_px(self, wTc: F64, feature: Indices, landmark: Indices) -> F64:
         points = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark])
         projected = points @ self.camera.matrix.T
         seen = self.pinhole_px[feature]
         offset = projected[:, :2] / projected[:, 2:] - seen
         return np.asarray(np.linalg.norm(offset, axis=1) / self.camera.stretch(seen), np.float64)
 
-    def _refine(self, wTc: Array, feature: Indices, landmark: Indices) -> Array:
+    def _refine(self, wTc: F64, feature: Indices, landmark: Indices) -> F64:
         """Least squares over the matches (Levenberg-Marquardt)."""
         cTw = poses.inverse(wTc)
         rvec, tvec = cv2.solvePnPRefineLM(
@@ -252,7 +249,7 @@ class Relocalizer:
         if len(map_.keyframes):
             self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed, map_.modes)
 
-    def find(self, features: Features, normalized: Array) -> Relocalization | str:
+    def find(self, features: Features, normalized: F64) -> Relocalization | str:
         """The pose of a frame anywhere in the map, or the reason why there is none.
 
         Of two places that fit nearly as well, neither is believed. Takes what `candidates` takes.
@@ -260,7 +257,7 @@ class Relocalizer:
         found = self.candidates(features, normalized)
         return found if isinstance(found, str) else self.alone(found)
 
-    def candidates(self, features: Features, normalized: Array) -> list[Relocalization] | str:
+    def candidates(self, features: Features, normalized: F64) -> list[Relocalization] | str:
         """The poses that a frame may have anywhere in the map, or the reason why there is none.
 
         `normalized` (F, 2) are the features undistorted, on the plane z = 1. The most alike

@@ -12,12 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from ground_station.arrays import F32, Indices
 from ground_station.map.descriptors import Descriptors, joined
 from ground_station.map.modes import Modes
 from ground_station.map.store import Keyframes, Landmarks
-
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
 
 _WORDS_PER_ROOT, _MAX_WORDS = 1.5, 2048
 """Words grow with the root of the landmarks: finding a word and searching it then cost alike."""

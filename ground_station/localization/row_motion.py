@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F64
 
 
-def adjoint(xi: Array) -> Array:
+def adjoint(xi: F64) -> F64:
     """The 6×6 matrix of the Lie bracket [xi, ·] of se(3), rotation first; Barfoot, eq. 7.32."""
     a, b, c, x, y, z = xi.tolist()
     return np.array(
@@ -32,7 +31,7 @@ class RowMotion:
     at wTc·exp(twist·row_s).
     """
 
-    def __init__(self, row_s: Array, twist: Array) -> None:
+    def __init__(self, row_s: F64, twist: F64) -> None:
         self.row_s, self.ad = row_s, adjoint(twist)
         self.hat = self.ad[:3, :3]
         self.square = self.hat @ self.hat
@@ -57,7 +56,7 @@ class RowMotion:
         np.matmul(self.square, drift[:, 0], out=drift[:, 2])
         self.drift = drift @ coefficients
 
-    def forward(self, points: Array) -> Array:
+    def forward(self, points: F64) -> F64:
         """Points (3, N) of the frame's camera in those of the rows: exp(−twist·row_s)·p."""
         result = self.hat @ points
         result *= self.first
@@ -68,7 +67,7 @@ class RowMotion:
         result += self.drift
         return result
 
-    def turned_back(self, directions: Array) -> Array:
+    def turned_back(self, directions: F64) -> F64:
         """Directions (A, 3, N) of the rows' cameras in the frame's."""
         result = self.square @ directions
         result *= self.second
@@ -78,7 +77,7 @@ class RowMotion:
         result += directions
         return result
 
-    def jacobian(self, J: Array) -> Array:
+    def jacobian(self, J: F64) -> F64:
         """Columns (6, 2, N) for steps of the rows' poses to (12, 2, N) for pose and twist.
 
         Right tangents, to first order in the motion between the frame's time and the row's.

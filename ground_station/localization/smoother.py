@@ -13,15 +13,13 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 from gtsam.symbol_shorthand import X
 
+from ground_station.arrays import F64
 from ground_station.localization import process
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.process import Density, Step
 from ground_station.localization.settings import MotionSettings
-
-Array = npt.NDArray[np.float64]
 
 _ZERO = np.zeros(12)
 _UNIT = gtsam.noiseModel.Unit.Create(12)
@@ -165,7 +163,7 @@ class FixedLagSmoother:
         self._nodes: deque[_Node] = deque()  # those not yet read
         self._key = 0
         self._sound = True
-        self._up: Array | None = None
+        self._up: F64 | None = None
 
     def _start(self, state: Kinematics) -> Kinematics:
         self._clear()
@@ -307,7 +305,7 @@ class _Adaptation:
         )
 
     def learn(
-        self, latest: Kinematics, step: Step, error: Array, information: Array, wild: bool
+        self, latest: Kinematics, step: Step, error: F64, information: F64, wild: bool
     ) -> bool:
         """Takes one frame's deviation (12,) into account; whether the densities have changed.
 
@@ -333,7 +331,7 @@ class _Adaptation:
         return True
 
 
-def _error_jacobians(error: Array, transition: Array) -> tuple[Array, Array]:
+def _error_jacobians(error: F64, transition: F64) -> tuple[F64, F64]:
     """(12, 12) each: how the error (12,) of a state against its prediction moves with steps of that
     state and, through the process, of the one before."""
     by_state, by_predicted = np.eye(12), -np.eye(12)
@@ -346,7 +344,7 @@ def _finite(state: Kinematics) -> bool:
     return bool(np.isfinite(state.wTc).all() and np.isfinite(state.twist).all())
 
 
-def _usable(covariance: Array) -> tuple[Array, Array]:
+def _usable(covariance: F64) -> tuple[F64, F64]:
     """A covariance (12, 12) and its inverse; a vague one when it has none."""
     if covariance.shape == (12, 12) and np.isfinite(covariance).all():
         covariance = (covariance + covariance.T) / 2

@@ -15,14 +15,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, U8, Bools, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.settings import TrackingSettings
-
-Array = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
-Indices = npt.NDArray[np.intp]
-Image = npt.NDArray[np.uint8]
 
 _EPSILON_PX = 0.02
 """A step shorter than this ends KLT's iteration: well below its noise."""
@@ -70,18 +66,18 @@ class Keyframe:
     """
 
     time_ns: int
-    image: Image
-    wTc: Array
+    image: U8
+    wTc: F64
     pixel_px: F32
     landmark: Indices
-    points_m: Array
-    sigma_px: Array
+    points_m: F64
+    sigma_px: F64
 
     def __len__(self) -> int:
         return len(self.landmark)
 
     @cached_property
-    def even(self) -> Image:
+    def even(self) -> U8:
         """Its picture (H, W), evenly lit."""
         return evenly_lit(self.image)
 
@@ -98,7 +94,7 @@ class Tracks:
     sought: int
 
 
-def evenly_lit(image: Image) -> Image:
+def evenly_lit(image: U8) -> U8:
     """A grey picture (H, W) with the same mean and contrast around each of its pixels.
 
     What is as bright as before times a gain plus an offset, be they of exposure, light or row,
@@ -136,8 +132,8 @@ def spread_out(pixel_px: npt.ArrayLike, most: int) -> Indices:
 
 def track(
     keyframe: Keyframe,
-    image: Image,
-    predicted: Array,
+    image: U8,
+    predicted: F64,
     camera: Camera,
     settings: TrackingSettings,
     doubt_px: float = np.inf,
@@ -158,7 +154,7 @@ def track(
 
 
 def _track(
-    keyframe: Keyframe, image: Image, predicted: Array, camera: Camera, settings: TrackingSettings
+    keyframe: Keyframe, image: U8, predicted: F64, camera: Camera, settings: TrackingSettings
 ) -> Tracks:
     expected, was = (
         camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
@@ -195,8 +191,8 @@ def _levels(settings: TrackingSettings, doubt_px: float) -> TrackingSettings:
 
 
 def _follow(
-    before: Image, after: Image, start: F32, guess: F32, settings: TrackingSettings
-) -> tuple[F32, npt.NDArray[np.bool_]]:
+    before: U8, after: U8, start: F32, guess: F32, settings: TrackingSettings
+) -> tuple[F32, Bools]:
     """Where pixels (N, 2) went, and whether each was found (N,)."""
     if not len(start):
         return start, np.empty(0, bool)

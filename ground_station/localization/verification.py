@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
@@ -15,9 +15,6 @@ from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 _RADIUS_PX = 5.0
 """A feature this near to where a landmark should be may be it."""
@@ -61,7 +58,7 @@ class Witness:
         self.features, self.lens, self._modes = features, lens, modes
         self._tree = cKDTree(features.keypoints_px)
 
-    def support(self, wTc: Array, landmarks: Landmarks, index: Indices) -> Support:
+    def support(self, wTc: F64, landmarks: Landmarks, index: Indices) -> Support:
         """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
         cTw = poses.inverse(wTc)
         points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
@@ -91,9 +88,7 @@ class Witness:
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
         return Support(feature[rows], index[rows], len(index), float(found.mean()), float(chance))
 
-    def _near(
-        self, pixel_px: Array, descriptors: npt.NDArray[np.float32], mode: Indices | None
-    ) -> tuple[Indices, Array]:
+    def _near(self, pixel_px: F64, descriptors: F32, mode: Indices | None) -> tuple[Indices, F64]:
         """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).
 
         Descriptors are a row each and then one for each pixel of `mode` (Q,), ascending.

@@ -12,13 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from ground_station.arrays import F32, F64, I64, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.map.store import Keyframes, Landmarks
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 _CELL_M = 2.0
 _CELLS_A_BLOCK = 8
@@ -40,9 +38,9 @@ class _Spheres:
     """Bounding spheres of groups of consecutive points: group k is starts[k]:starts[k + 1]."""
 
     starts: Indices
-    centre_m: Array
-    radius_m: Array
-    farthest_m: Array
+    centre_m: F64
+    radius_m: F64
+    farthest_m: F64
     """The largest distance from which a keyframe saw a landmark of the group."""
 
 
@@ -112,9 +110,7 @@ class Covisibility:
         return left if len(left) >= _FEWEST else among
 
 
-def _bound(
-    position_m: Array, farthest_m: npt.NDArray[np.float32], group: npt.NDArray[np.int64]
-) -> _Spheres:
+def _bound(position_m: F64, farthest_m: F32, group: I64) -> _Spheres:
     """Spheres around points (M, 3) that are sorted by their group's three indices (M, 3)."""
     if not len(position_m):
         none = np.empty(0)
@@ -132,7 +128,7 @@ def _bound(
 
 
 def _in_view(
-    spheres: _Spheres, which: slice | Indices, cTw: Array, lens: Lens, settings: ProjectionSettings
+    spheres: _Spheres, which: slice | Indices, cTw: F64, lens: Lens, settings: ProjectionSettings
 ) -> Indices:
     """Of the spheres `which`, the indices of those that reach into the cone around the image.
 

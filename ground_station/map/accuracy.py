@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.map.store import MapInfo
 from ground_station.map.uncertainty import Uncertainty, jacobian
-
-F64 = npt.NDArray[np.float64]
 
 _MOST = 1e6
 """Of a deviation, a variance, metres or radians: what is more is no registration's."""

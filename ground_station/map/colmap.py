@@ -18,13 +18,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap as pycolmap  # others have it from here, after zlib
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap_files
 from ground_station.map.model import Model
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 HALF_PIXEL = 0.5
 CAMERA_ID = 1

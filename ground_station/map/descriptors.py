@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32
 from ground_station.errors import MapError
-
-F32 = npt.NDArray[np.float32]
 
 NAMES: dict[str, np.dtype[Any]] = {
     "descriptor": np.dtype("<f4"),

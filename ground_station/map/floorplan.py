@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import yaml
 
+from ground_station.arrays import U8
 from ground_station.errors import InputError
 from ground_station.recording.folder import read_grey
 
@@ -23,7 +22,7 @@ class FloorPlan:
     `origin` is x, y (metres) and yaw (rad, counter-clockwise); `resolution_m` is one pixel's side.
     """
 
-    image: npt.NDArray[np.uint8]
+    image: U8
     resolution_m: float
     origin: tuple[float, float, float]
 

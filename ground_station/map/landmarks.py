@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, I64
 from ground_station.map.model import Model
 from ground_station.map.store import Landmarks
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 
 def residuals_px(model: Model) -> F64:
@@ -128,7 +124,7 @@ def landmarks_of_blocks(model: Model, blocks: Sequence[tuple[I64, F32]]) -> Land
     )
 
 
-def seen_again(lm: Landmarks, landmark: npt.NDArray[np.int64], position: F64) -> Landmarks:
+def seen_again(lm: Landmarks, landmark: I64, position: F64) -> Landmarks:
     """The landmarks after O further observations: of `landmark` (O,), from camera positions (O, 3).
 
     Cones and distances hold the old observations and the new ones, and the observations are

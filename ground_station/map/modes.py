@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, I32, I64, Bools, Indices
 from ground_station.map.descriptors import Descriptors, joined
-
-F32 = npt.NDArray[np.float32]
-I32 = npt.NDArray[np.int32]
-Indices = npt.NDArray[np.intp]
 
 MOST = 8
 """Modes that one landmark may have: a file that claims more is refused."""
@@ -43,14 +39,14 @@ class Modes:
         shift = first - (np.cumsum(count) - count)
         return np.arange(len(place)) + shift[place], place
 
-    def among(self, kept: npt.NDArray[np.bool_]) -> Modes | None:
+    def among(self, kept: Bools) -> Modes | None:
         """Those of the landmarks that are kept of all M, (M,), which are counted anew."""
         rows = np.flatnonzero(kept[self.landmark])
         landmark = (np.cumsum(kept) - 1)[self.landmark[rows]]
         return Modes(landmark.astype(np.int32), _some(self.descriptor, rows)) if len(rows) else None
 
 
-def with_modes(modes: Modes | None, landmark: npt.NDArray[np.int64], descriptor: F32) -> Modes:
+def with_modes(modes: Modes | None, landmark: I64, descriptor: F32) -> Modes:
     """The modes and further ones of landmarks (N,), unit rows (N, D), in any order."""
     rows: F32 | Descriptors = descriptor
     if modes is not None:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from ground_station.arrays import F32, F64, I64
 from ground_station.errors import CameraError, MapError
 from ground_station.files import write_bytes
 from ground_station.geometry.camera import Camera
@@ -53,11 +54,11 @@ class FlightObservations:
     map: str
     landmarks_sha256: str
     camera: Camera
-    time_ns: npt.NDArray[np.int64]
-    wTc: npt.NDArray[np.float64]
-    offset: npt.NDArray[np.int64]
-    landmark: npt.NDArray[np.int64]
-    pixel_px: npt.NDArray[np.float32]
+    time_ns: I64
+    wTc: F64
+    offset: I64
+    landmark: I64
+    pixel_px: F32
 
     def __len__(self) -> int:
         return len(self.time_ns)

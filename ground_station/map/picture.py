@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from ground_station.arrays import F64
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
 from ground_station.map.store import Map
 from ground_station.presentation.theme import Theme, sheet, themed
-
-F64 = npt.NDArray[np.float64]
 
 _LONGEST_IN, _LEAST_IN = 8.0, 3.0
 _LABELS_IN = 1.2

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import I64
 from ground_station.errors import MapError
 from ground_station.map.store import Map
-
-I64 = npt.NDArray[np.int64]
 
 FRAME_TIME = "frame"
 """`pixels_at` of a map whose observations are where a global shutter would have seen them."""

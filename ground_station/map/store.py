@@ -13,6 +13,7 @@ import tomli_w
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from ground_station.arrays import F32, F64, I32, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.descriptors import Descriptors, open_descriptors, quantised
@@ -25,10 +26,6 @@ FORMAT = 1
 
 _COMPRESSED = 2
 """The format of maps that earlier versions compressed; it is not read any more."""
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I32 = npt.NDArray[np.int32]
 
 
 @dataclass
@@ -43,7 +40,7 @@ class Landmarks:
     `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,).
     """
 
-    id: npt.NDArray[np.int64]
+    id: I64
     position_m: F64
     covariance_m2: F32
     descriptor: F32 | Descriptors
@@ -67,9 +64,9 @@ class Keyframes:
     """
 
     names: list[str]
-    time_ns: npt.NDArray[np.int64]
+    time_ns: I64
     wTc: F64
-    offset: npt.NDArray[np.int64]
+    offset: I64
     landmark: I32
     pixel_px: F32
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.map import landmarks
 from ground_station.map.levelling import levelled
 from ground_station.map.model import model_of
 from ground_station.map.refined import Refined
 from ground_station.map.sizes import sizes
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
 
 _JUDGED = ("doubts", "parts", "left_out", "noise_px", "lens_prior", "lens")
 """What a build has written of its own doubts, as it is."""

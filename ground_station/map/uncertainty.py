@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import fdtri
 
-F64 = npt.NDArray[np.float64]
+from ground_station.arrays import F64
 
 PROBABILITY = 0.9
 _REGION = (0.01, 0.99)

@@ -7,9 +7,9 @@ from fractions import Fraction
 
 import av
 import numpy as np
-import numpy.typing as npt
 from av.video.frame import PictureType
 
+from ground_station.arrays import U8
 from ground_station.errors import GroundStationError
 
 
@@ -63,9 +63,7 @@ class H264Encoder:
         self._context = context
         self._count = 0
 
-    def encode(
-        self, picture: npt.NDArray[np.uint8], *, idr: bool = False
-    ) -> Iterator[tuple[int, bytes]]:
+    def encode(self, picture: U8, *, idr: bool = False) -> Iterator[tuple[int, bytes]]:
         """Takes a picture, (H, W, 3) RGB or (H, W) grey of full range; as an IDR if asked.
 
         Yields (index, access unit) of those that are ready.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import av
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens_models import MODELS
@@ -77,9 +77,7 @@ class FlightRecording:
         if missing and not is_empty:
             raise InputError(f"{self.path}: its video carries no H.264 parameter sets (SPS/PPS)")
 
-    def _frame(
-        self, number: int, time_ns: int, image: npt.NDArray[np.uint8], exposure_s: float | None
-    ) -> Frame:
+    def _frame(self, number: int, time_ns: int, image: U8, exposure_s: float | None) -> Frame:
         height, width = image.shape
         if self.camera and (width, height) != (self.camera.width_px, self.camera.height_px):
             raise InputError(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
@@ -60,7 +60,7 @@ class ImageFolder:
             yield Frame(k, path.name, round(k * 1e9 / self._rate_hz), image)
 
 
-def read_grey(path: Path) -> npt.NDArray[np.uint8]:
+def read_grey(path: Path) -> U8:
     """An image file as (H, W) grey, as stored (no turning by EXIF); raises `InputError`."""
     try:
         if path.exists() and not path.is_file():  # a device may have no end

@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import U8
 from ground_station.geometry.camera import Camera
 
 
@@ -22,7 +20,7 @@ class Frame:
     index: int
     name: str
     time_ns: int
-    image: npt.NDArray[np.uint8]
+    image: U8
     exposure_s: float | None = None
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import av
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from pi_firmware.wire import annexb
 
 _LUMA_8_BIT = {"yuv420p", "yuv422p", "yuv444p", "nv12", "nv21", "gray"}
@@ -36,7 +36,7 @@ def parameter_sets_in(blocks: Iterable[bytes]) -> bool:
     return False
 
 
-def grey(frame: av.VideoFrame) -> npt.NDArray[np.uint8]:
+def grey(frame: av.VideoFrame) -> U8:
     """The picture (H, W) as full-range grey, 0 black to 255 white.
 
     8-bit luma is taken from the decoder's plane as it is; limited range, which H.264 has unless it

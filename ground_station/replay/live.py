@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.localization.estimate import PoseEstimate
 from ground_station.replay.rig import Running
 from ground_station.replay.station import Station
@@ -57,7 +57,7 @@ class LiveResult:
     """
 
     frames: list[LiveFrame] = field(default_factory=list)
-    pictures: list[tuple[npt.NDArray[np.uint8], EstimateMessage]] = field(default_factory=list)
+    pictures: list[tuple[U8, EstimateMessage]] = field(default_factory=list)
     payload: PayloadMessage = field(default_factory=lambda: PayloadMessage(False, 0))
     clock: dict[str, int] | None = None
     events: list[EventMessage] = field(default_factory=list)
@@ -84,7 +84,7 @@ class LiveResult:
             "localized": sum(frame.estimate.localized for frame in self.frames),
         }
 
-    def latency_ms(self) -> npt.NDArray[np.float64]:
+    def latency_ms(self) -> F64:
         """Capture to pose of every frame, (N,), milliseconds, both on the ground's clock.
 
         Of frames that came before the payload's clock had answered by its first answer; if it never
@@ -107,7 +107,7 @@ class Inbox:
         self, station: Station, payload_id: str, keep_picture: Callable[[int], bool]
     ) -> None:
         self.frames: dict[tuple[int, int], FrameMessage] = {}
-        self.pictures: dict[tuple[int, int], npt.NDArray[np.uint8]] = {}
+        self.pictures: dict[tuple[int, int], U8] = {}
         self._keep, self._reader = keep_picture, PictureReader(station.folder, payload_id)
         self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         subscribe, put = station.bus.subscribe, self._messages.put

@@ -14,16 +14,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64, I64, Bools
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 CAMERA = Camera(240, 180, 120.0, 120.0, 119.5, 89.5, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A small picture, 90 degrees wide."""
@@ -64,7 +60,7 @@ class Campus:
     looks: F32
     wTc: F64
     time_ns: I64
-    free: npt.NDArray[np.bool_]
+    free: Bools
     corner: F64
     seed: int
 
@@ -96,7 +92,7 @@ class Campus:
             pixels.astype(np.float32), np.ones(len(chosen), np.float32), looks.astype(np.float32)
         )
 
-    def _unhidden(self, eye: F64, points: F64) -> npt.NDArray[np.bool_]:
+    def _unhidden(self, eye: F64, points: F64) -> Bools:
         """Whether the straight way from the eye to a point on a wall (N, 2) is free, (N,)."""
         along = np.arange(_CELL_M, _SEEN_M, _CELL_M)
         way = points - eye
@@ -194,7 +190,7 @@ def _poses(nodes: I64, images: int) -> F64:
     return wTc
 
 
-def _points(free: npt.NDArray[np.bool_], corner: F64, rng: np.random.Generator) -> F64:
+def _points(free: Bools, corner: F64, rng: np.random.Generator) -> F64:
     """Points (M, 3) on the walls, where free cells meet others, and on floor and ceiling."""
     found = []
     for axis, side in ((0, 1), (0, -1), (1, 1), (1, -1)):

@@ -13,13 +13,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ground_station.simulator.motion import Motion, Mount
 from ground_station.simulator.plans import Reference
 from hw.flight import flight_model
-
-Array = npt.NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.81
 _STEP_S = 1 / 200

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import yaml
 
+from ground_station.arrays import U8
 from ground_station.files import write_bytes
 from ground_station.simulator.scene import Footprint, Scene, SimulatorError
 
@@ -19,7 +19,7 @@ _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
 _FILLED = ("wall", "pillar", "furniture", "glass")
 
 
-def draw_floorplan(scene: Scene) -> tuple[npt.NDArray[np.uint8], tuple[float, float, float]]:
+def draw_floorplan(scene: Scene) -> tuple[U8, tuple[float, float, float]]:
     """The plan (H, W), 254 free, 0 occupied, 205 unknown, and the origin map_server wants.
 
     Rows go down as y falls; the origin is the world pose (x, y, yaw) of the lower left corner of

@@ -11,12 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.simulator.motion import Motion, Mount
 from ground_station.simulator.plans import Plan, Reference
-
-Array = npt.NDArray[np.float64]
 
 _STEP_S = 1 / 400
 
@@ -54,7 +52,7 @@ _STILL_M, _STILL_DEG = (0.04, 0.04, 0.02), (2.0, 1.5, 1.0)
 
 def _band_noise(
     count: int, columns: int, band_Hz: tuple[float, float], rng: np.random.Generator
-) -> Array:
+) -> F64:
     """Gaussian noise (count, columns) of unit deviation between two frequencies, falling as 1/f."""
     whole = max(count, math.ceil(1 / band_Hz[0] / _STEP_S))  # a period of the slowest, at least
     f = np.fft.rfftfreq(whole, _STEP_S)
@@ -99,7 +97,7 @@ def carry(
     return Motion(times, moved, angles, held)
 
 
-def hold(plan: Plan, times_s: Array, rng: np.random.Generator) -> Motion:
+def hold(plan: Plan, times_s: F64, rng: np.random.Generator) -> Motion:
     """Holds the camera still at a plan's stands, in an order by chance, one at each time (N,)."""
     stands = rng.permutation(plan.stands)[: len(times_s)]
     position, yaw = plan.shape((stands + 0.5) / plan.stands)

@@ -14,14 +14,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, U8
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 
 # Beyond the lens's field on each side (tangent), for what turns into view during a frame.
 _MARGIN = 0.05
@@ -52,7 +49,7 @@ class Sensor:
     """Light lost in the picture's corners."""
 
 
-def row_offsets_s(camera: Camera) -> Array:
+def row_offsets_s(camera: Camera) -> F64:
     """When each row (H,) is exposed after the middle one: the readout spans first to last row."""
     v = np.arange(camera.height_px)
     return (v - (camera.height_px - 1) / 2) / (camera.height_px - 1) * camera.readout_s
@@ -74,7 +71,7 @@ def covering_pinhole(camera: Camera, supersampling: float) -> Pinhole:
     return Pinhole(width, height, focal)
 
 
-def _flat(camera: Camera, pixels: npt.ArrayLike) -> Array:
+def _flat(camera: Camera, pixels: npt.ArrayLike) -> F64:
     """Pixels (N, 2) on the plane z = 1 (N, 2), NaN beyond the rim."""
     rays = camera.rays(pixels)
     flat = rays[:, :2] / np.where(rays[:, 2] > 0, rays[:, 2], np.nan)[:, None]
@@ -82,7 +79,7 @@ def _flat(camera: Camera, pixels: npt.ArrayLike) -> Array:
     return flat
 
 
-def _rim(camera: Camera) -> Array:
+def _rim(camera: Camera) -> F64:
     """Pixels (M, 2) of the picture just within the rim, where it is in the picture at all."""
     turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
     pixels = camera.distort(0.9999 * _RIM * np.stack([np.cos(turn), np.sin(turn)], axis=1))
@@ -97,7 +94,7 @@ class FrameMaker:
     def __init__(
         self,
         renderer: SceneRenderer,
-        decoder: Floats,
+        decoder: F32,
         camera: Camera,
         pinhole: Pinhole,
         *,
@@ -128,7 +125,7 @@ class FrameMaker:
         coded += _CONTRAST * (coded * coded * (3 - 2 * coded) - coded)
         self._tone = np.rint(255 * coded).astype(np.uint8)
 
-    def radiance(self, motion: Motion, time_s: float, exposure_s: float) -> Floats:
+    def radiance(self, motion: Motion, time_s: float, exposure_s: float) -> F32:
         """Mean radiance (H, W, 3) that each pixel collects in the frame at `time_s`.
 
         `time_s` is the middle of the middle row's exposure.
@@ -163,7 +160,7 @@ class FrameMaker:
         flow = self.camera.fx_px * (1.3 * float(turn[0]) + float(speed[0]) / max(near_m, 0.3))
         return int(np.clip(math.ceil(flow * exposure_s / 0.9), 1, _MAX_SAMPLES))
 
-    def _warp(self, image: Floats, depth: Floats, kTr: Array, rows: slice) -> Floats:
+    def _warp(self, image: F32, depth: F32, kTr: F64, rows: slice) -> F32:
         """Rows of the output seen in one rendered picture, the pose of each row in its camera."""
         x, y = self._x[rows], self._y[rows]
         R, a = kTr[:, :3, :3].astype(np.float32), kTr[:, :3, 3].astype(np.float32)
@@ -183,8 +180,8 @@ class FrameMaker:
         )
 
     def expose(
-        self, radiance: Floats, exposure_s: float, gain: float, rng: np.random.Generator | None
-    ) -> Bytes:
+        self, radiance: F32, exposure_s: float, gain: float, rng: np.random.Generator | None
+    ) -> U8:
         """The 8-bit picture (H, W, 3) RGB: shot and read noise, saturation, gamma 1/2.2.
 
         Without `rng`, no noise.
@@ -208,7 +205,7 @@ class FrameMaker:
 class AutoExposure:
     """Follows the mean level with a lag: first longer exposures, then gain."""
 
-    def __init__(self, sensor: Sensor, first_radiance: Floats) -> None:
+    def __init__(self, sensor: Sensor, first_radiance: F32) -> None:
         self._sensor = sensor
         self.off_ev = 0.0
         """By how many doublings exposures are more than the light asks for."""
@@ -224,12 +221,12 @@ class AutoExposure:
         gain = min(max(product / exposure, s.gain_limits[0]), s.gain_limits[1])
         return exposure, gain
 
-    def update(self, radiance: Floats, dt_s: float) -> None:
+    def update(self, radiance: F32, dt_s: float) -> None:
         """Learns from the frame just taken, `dt_s` before the next."""
         error = self._error(radiance, math.exp(self._log_product))
         self._log_product += (1 - math.exp(-dt_s / self._sensor.lag_s)) * error
 
-    def _error(self, radiance: Floats, product: float) -> float:
+    def _error(self, radiance: F32, product: float) -> float:
         s = self._sensor
         level = radiance[::8, ::8] * np.float32(s.sensitivity * product)
         mean = float(np.mean((level / (1 + level)) ** np.float32(1 / 2.2)))

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.files import write_text
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import KnownPoint, SimulatorError
-
-Array = npt.NDArray[np.float64]
 
 _CLICK_NOISE_PX = 0.3
 _EDGE_PX = 20.0
@@ -40,9 +39,7 @@ class PointObservation:
     pixel: tuple[float, float]
 
 
-def project_rolling(
-    camera: Camera, motion: Motion, time_s: float, points_w: npt.ArrayLike
-) -> Array:
+def project_rolling(camera: Camera, motion: Motion, time_s: float, points_w: npt.ArrayLike) -> F64:
     """Distorted pixels (N, 2) of world points (N, 3) in the frame whose middle row is at `time_s`.
 
     Each point is seen by the row it falls on, found by iteration; NaN behind the camera.
@@ -62,8 +59,8 @@ def project_rolling(
 
 
 def _visible(
-    renderer: SceneRenderer, pinhole: Pinhole, wTc: Array, points: Sequence[KnownPoint]
-) -> npt.NDArray[np.bool_]:
+    renderer: SceneRenderer, pinhole: Pinhole, wTc: F64, points: Sequence[KnownPoint]
+) -> Bools:
     """Which points nothing hides, by depth at the pose of the middle row."""
     position = np.array([p.position_m for p in points])
     normal = np.array([p.normal for p in points])
@@ -90,7 +87,7 @@ def choose_observations(
     pinhole: Pinhole,
     camera: Camera,
     motion: Motion,
-    times_s: Array,
+    times_s: F64,
     points: Sequence[KnownPoint],
     rng: np.random.Generator,
     *,
@@ -103,7 +100,7 @@ def choose_observations(
     Raises `SimulatorError` when fewer than 4 points are seen often enough to register a map.
     """
     position = np.array([p.position_m for p in points])
-    seen: list[list[tuple[int, Array, Array]]] = [[] for _ in points]
+    seen: list[list[tuple[int, F64, F64]]] = [[] for _ in points]
     stride = max(1, len(times_s) // 150)
     half_flow_s = 0.005
     for frame in range(0, len(times_s), stride):
@@ -121,7 +118,7 @@ def choose_observations(
             continue
         for i in np.flatnonzero(candidates & _visible(renderer, pinhole, wTc, points)).tolist():
             seen[i].append((frame, pixels[i], wTc[:3, 3]))
-    chosen: dict[int, list[tuple[int, Array, Array]]] = {}
+    chosen: dict[int, list[tuple[int, F64, F64]]] = {}
     for i, observations in enumerate(seen):
         picked = _far_apart(observations, max_observations)
         if len(picked) >= 3 and _parallax_deg(picked, position[i]) >= _MIN_PARALLAX_DEG:
@@ -139,9 +136,7 @@ def choose_observations(
     return result
 
 
-def _far_apart(
-    observations: list[tuple[int, Array, Array]], count: int
-) -> list[tuple[int, Array, Array]]:
+def _far_apart(observations: list[tuple[int, F64, F64]], count: int) -> list[tuple[int, F64, F64]]:
     """The observations whose cameras stand farthest from each other, greedily."""
     if len(observations) <= 1:
         return observations
@@ -155,13 +150,13 @@ def _far_apart(
     return [observations[i] for i in picked]
 
 
-def _parallax_deg(observations: list[tuple[int, Array, Array]], point: Array) -> float:
+def _parallax_deg(observations: list[tuple[int, F64, F64]], point: F64) -> float:
     rays = np.array([s[2] - point for s in observations])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
 
 
-def _spread(candidates: list[int], position: Array, count: int) -> list[int]:
+def _spread(candidates: list[int], position: F64, count: int) -> list[int]:
     """Points that fill the space, farthest first; heights count double, halls being flat."""
     scaled = position[candidates] * [1, 1, 2]
     picked = [int(np.linalg.norm(scaled - scaled.mean(axis=0), axis=1).argmax())]

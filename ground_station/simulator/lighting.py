@@ -19,15 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from ground_station.arrays import F32, F64, I64, U8
 from ground_station.simulator import scenes
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.surfaces import Surface
-from ground_station.simulator.textures import MATERIALS, Image, TextureBank
-
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
+from ground_station.simulator.textures import MATERIALS, TextureBank
 
 _GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels
 _SKY_DIRECTIONS = 128
@@ -54,7 +51,7 @@ class Light:
     lamp_rgb: tuple[float, float, float] = (1.25, 1.0, 0.68)  # about 3000 K
 
     @property
-    def to_sun(self) -> Array:
+    def to_sun(self) -> F64:
         """The unit vector to the sun, world axes."""
         a, e = np.radians([self.sun_azimuth_deg, self.sun_elevation_deg])
         return np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
@@ -75,7 +72,7 @@ def light_named(name: str) -> Light:
     return LIGHTS[name]
 
 
-def looking(direction: Array, centre_m: npt.ArrayLike, distance_m: float) -> Array:
+def looking(direction: F64, centre_m: npt.ArrayLike, distance_m: float) -> F64:
     """A pose `wTc` that looks along -`direction` at `centre_m` from `distance_m` away."""
     z = -direction / np.linalg.norm(direction)
     helper = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
@@ -87,7 +84,7 @@ def looking(direction: Array, centre_m: npt.ArrayLike, distance_m: float) -> Arr
     return wTc
 
 
-def _hemisphere(count: int) -> Array:
+def _hemisphere(count: int) -> F64:
     """Directions evenly over the upper hemisphere: a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z, azimuth = k / count, np.pi * (1 + 5**0.5) * k
@@ -96,8 +93,8 @@ def _hemisphere(count: int) -> Array:
 
 
 def _seen_orthographic(
-    depth: Floats, wTc: Array, half_m: float, points: Floats, shift_m: tuple[float, float]
-) -> Floats:
+    depth: F32, wTc: F64, half_m: float, points: F32, shift_m: tuple[float, float]
+) -> F32:
     """1 where a point is the first along the parallel rays of a depth map, else 0."""
     n = depth.shape[0]
     local = (points - wTc[:3, 3].astype(np.float32)) @ wTc[:3, :3].astype(np.float32)
@@ -108,7 +105,7 @@ def _seen_orthographic(
     return np.asarray(local[:, 2] < first + 0.02 + slope, np.float32)
 
 
-def _look_up(depth: Floats, u: npt.NDArray[Any], v: npt.NDArray[Any]) -> Floats:
+def _look_up(depth: F32, u: npt.NDArray[Any], v: npt.NDArray[Any]) -> F32:
     columns = 4096  # cv2.remap takes pictures, not lists
     rows = -(-len(u) // columns)
     grid = np.full((2, rows * columns), -1, np.float32)
@@ -121,12 +118,12 @@ def _look_up(depth: Floats, u: npt.NDArray[Any], v: npt.NDArray[Any]) -> Floats:
     return np.asarray(out, np.float32).ravel()[: len(u)]
 
 
-def _indirect(scene: Scene, points: Floats, normals: Floats, area: Floats, flux: Floats) -> Floats:
+def _indirect(scene: Scene, points: F32, normals: F32, area: F32, flux: F32) -> F32:
     """Bounced irradiance (M, 3) from the flux that leaves each sample after its first bounce."""
     shape = tuple(int(np.ceil(s / _VOXEL_M)) + 4 for s in scene.size_m)
     limit = np.array(shape) - 1
 
-    def cells(offset_m: float) -> tuple[npt.NDArray[np.int64], ...]:
+    def cells(offset_m: float) -> tuple[I64, ...]:
         index = np.floor((points + offset_m * normals) / _VOXEL_M).astype(np.int64) + 2
         return tuple(np.clip(index, 0, limit).T)
 
@@ -158,7 +155,7 @@ def _indirect(scene: Scene, points: Floats, normals: Floats, area: Floats, flux:
     return np.asarray(0.65 * bounced * (target / level) + even, np.float32)
 
 
-def irradiance(scene: Scene, light: Light) -> list[Floats]:
+def irradiance(scene: Scene, light: Light) -> list[F32]:
     """Irradiance on each surface as a grid (rows, columns, 3); none (empty) outside."""
     inside = [s for s in scene.surfaces if not s.outside]
     grids, points, normals, area = [], [], [], []
@@ -197,8 +194,8 @@ def irradiance(scene: Scene, light: Light) -> list[Floats]:
 
 
 def _sun(
-    scene: Scene, light: Light, inside: Sequence[Surface], half_m: float, p: Floats, n: Floats
-) -> Floats:
+    scene: Scene, light: Light, inside: Sequence[Surface], half_m: float, p: F32, n: F32
+) -> F32:
     blank = [np.zeros((4, 4, 3), np.uint8)] * len(inside)
     size = (_SUN_MAP_PX, _SUN_MAP_PX)
     with SceneRenderer(inside, blank, size, samples=0, cull_backs=False) as fine:
@@ -215,7 +212,7 @@ def _sun(
     return (cosine * seen)[:, None] * rgb
 
 
-def _lamps(scene: Scene, light: Light, maps: SceneRenderer, p: Floats, n: Floats) -> Floats:
+def _lamps(scene: Scene, light: Light, maps: SceneRenderer, p: F32, n: F32) -> F32:
     result = np.zeros_like(p)
     pinhole = Pinhole(_MAP_PX, _MAP_PX, 0.5 * _MAP_PX / 2.2)  # 131° wide, straight down
     rgb = np.asarray(light.lamp_rgb, np.float32) * np.float32(light.lamp_level)
@@ -241,10 +238,10 @@ def _lamps(scene: Scene, light: Light, maps: SceneRenderer, p: Floats, n: Floats
 class LitTextures:
     """Radiance as 8-bit pictures, one a surface: radiance = `white` · (code / 255)²."""
 
-    textures: list[Bytes]
+    textures: list[U8]
     white: float
 
-    def decoder(self) -> Floats:
+    def decoder(self) -> F32:
         """The 256 radiances of the codes."""
         return ((np.arange(256) / 255.0) ** 2 * self.white).astype(np.float32)
 
@@ -281,7 +278,7 @@ def lit_textures(scene: Scene, light: Light) -> LitTextures:
     return LitTextures(textures, white)
 
 
-def surface_albedo(bank: TextureBank, scene: Scene, index: int) -> Image:
+def surface_albedo(bank: TextureBank, scene: Scene, index: int) -> F32:
     """The texture of one surface: the same for every light and flight."""
     s = scene.surfaces[index]
     columns, rows = s.size_texels

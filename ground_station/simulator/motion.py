@@ -10,9 +10,8 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
-
-Array = npt.NDArray[np.float64]
 
 # Camera axes (x right, y down, z forward) in body axes (x forward, y left, z up).
 _BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -27,7 +26,7 @@ class Mount:
     tilt_down_deg: float = 7.0
 
     @property
-    def bTc(self) -> Array:
+    def bTc(self) -> F64:
         """Camera to body coordinates, 4x4."""
         tilt = Rotation.from_euler("y", self.tilt_down_deg, degrees=True).as_matrix()
         return poses.pose(tilt @ _BODY_FROM_CAMERA, [self.forward_m, 0.0, self.up_m])
@@ -64,13 +63,13 @@ class Motion:
         self._rates = self._spline.derivative()
         self._bTc = mount.bTc
 
-    def wTc(self, times_s: npt.ArrayLike) -> Array:
+    def wTc(self, times_s: npt.ArrayLike) -> F64:
         """Poses (N, 4, 4) at times (N,), seconds."""
         states = self._spline(np.atleast_1d(np.asarray(times_s, dtype=np.float64)))
         R = Rotation.from_euler("ZYX", states[:, 3:]).as_matrix()
         return poses.pose(R, states[:, :3]) @ self._bTc
 
-    def speed(self, times_s: npt.ArrayLike) -> tuple[Array, Array]:
+    def speed(self, times_s: npt.ArrayLike) -> tuple[F64, F64]:
         """Speed of the body, m/s, and the size of its angular rates, rad/s, at times (N,)."""
         rates = self._rates(np.atleast_1d(np.asarray(times_s, dtype=np.float64)))
         return np.linalg.norm(rates[:, :3], axis=1), np.linalg.norm(rates[:, 3:], axis=1)

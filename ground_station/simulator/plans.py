@@ -16,12 +16,11 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.scene import Scene, SimulatorError
 
-Array = npt.NDArray[np.float64]
-
-Shape = Callable[[Array], tuple[Array, Array]]
+Shape = Callable[[F64], tuple[F64, F64]]
 """From a path parameter (N,) in turns to positions (N, 3), metres, and yaw (N,), radians."""
 
 
@@ -82,7 +81,7 @@ class Reference:
         self._phase_m = phase * self._lap_m
         self._speed, self._ramp_s = plan.speed_m_s, ramp_s
 
-    def at(self, times_s: npt.ArrayLike) -> tuple[Array, Array]:
+    def at(self, times_s: npt.ArrayLike) -> tuple[F64, F64]:
         """Positions (N, 3), metres, and yaw (N,), radians and unwrapped, at times (N,)."""
         t = np.asarray(times_s, dtype=np.float64)
         if self._ramp_s > 0:  # from rest: the integral of a smooth start
@@ -96,14 +95,14 @@ class Reference:
         return self._position(rest), self._yaw(rest) + laps * self._lap_yaw
 
 
-def _smooth(x: Array, a: float, b: float) -> Array:
+def _smooth(x: F64, a: float, b: float) -> F64:
     t = np.clip((x - a) / (b - a), 0, 1)
     return t * t * t * (10 - 15 * t + 6 * t * t)
 
 
 def _ellipse(
-    angle: Array, centre: tuple[float, float], rx: Array | float, ry: Array | float, z: Array
-) -> Array:
+    angle: F64, centre: tuple[float, float], rx: F64 | float, ry: F64 | float, z: F64
+) -> F64:
     return np.stack([centre[0] + rx * np.cos(angle), centre[1] + ry * np.sin(angle), z], axis=1)
 
 
@@ -112,7 +111,7 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
 
     Raises `SimulatorError` naming the plans there are, and for one that leaves the scene.
     """
-    plans: dict[str, Callable[[tuple[float, float], Array], Plan]] = {
+    plans: dict[str, Callable[[tuple[float, float], F64], Plan]] = {
         "mapping": _mapping,
         "loop": _loop,
         "small-circle": _small_circle,
@@ -133,10 +132,10 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
     return plan
 
 
-def _mapping(centre: tuple[float, float], shift: Array) -> Plan:
+def _mapping(centre: tuple[float, float], shift: F64) -> Plan:
     """A wide lap looking inwards, flown sideways, then a narrow one looking outwards."""
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         inner = _smooth(s, 0.9, 1.2) - _smooth(s, 1.75, 2.0)
         angle = 2 * np.pi * s
         rx, ry = 7.9 - 4.5 * inner, 3.7 - 1.4 * inner
@@ -149,10 +148,10 @@ def _mapping(centre: tuple[float, float], shift: Array) -> Plan:
     return Plan("mapping", shape, 2.0, 0.65, False, 100.0)
 
 
-def _loop(centre: tuple[float, float], shift: Array) -> Plan:
+def _loop(centre: tuple[float, float], shift: F64) -> Plan:
     """A large loop facing inwards."""
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         angle = 2 * np.pi * s
         z = 2.9 + 0.15 * shift[0] + 0.4 * np.sin(2 * angle + shift[1])
         rx, ry = 6.6 + 0.3 * shift[2], 3.0 + 0.2 * shift[3]
@@ -162,10 +161,10 @@ def _loop(centre: tuple[float, float], shift: Array) -> Plan:
     return Plan("loop", shape, 1.0, 0.65, False, 50.0)
 
 
-def _small_circle(centre: tuple[float, float], shift: Array) -> Plan:
+def _small_circle(centre: tuple[float, float], shift: F64) -> Plan:
     """A small circle facing forwards, a little outwards."""
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         angle = 2 * np.pi * s
         z = 2.8 + 0.15 * shift[0] + 0.25 * np.sin(angle + shift[1])
         r = 1.9 + 0.15 * shift[2]
@@ -175,10 +174,10 @@ def _small_circle(centre: tuple[float, float], shift: Array) -> Plan:
     return Plan("small-circle", shape, 1.0, 0.5, False, 40.0)
 
 
-def _fast(centre: tuple[float, float], shift: Array) -> Plan:
+def _fast(centre: tuple[float, float], shift: F64) -> Plan:
     """Run around the hall at 4 m/s, the camera in the hand: 4 m/s over 4.75 m is 48°/s."""
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         angle = 2 * np.pi * s
         z = np.full_like(angle, 1.65 + 0.03 * shift[0])
         yaw = angle + np.pi / 2 + 0.25 * np.sin(3 * angle + shift[1]) + 0.15
@@ -187,13 +186,13 @@ def _fast(centre: tuple[float, float], shift: Array) -> Plan:
     return Plan("fast", shape, 1.0, 4.0, True, 30.0)
 
 
-def _corridor(centre: tuple[float, float], shift: Array) -> Plan:
+def _corridor(centre: tuple[float, float], shift: F64) -> Plan:
     """There and back along a corridor, flown sideways, the camera on its north wall."""
     half, r = centre[0] - 3.0, 0.5
     straight, arc = 2 * half, np.pi * r
     lap = 2 * (straight + arc)
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         d = (np.asarray(s) % 1.0) * lap
         east, west = (d - straight) / r, (d - 2 * straight - arc) / r  # angles around the ends
         legs = [d < straight, east < np.pi, d < 2 * straight + arc]
@@ -212,11 +211,11 @@ def _corridor(centre: tuple[float, float], shift: Array) -> Plan:
     return Plan("corridor", shape, 1.0, 0.45, False, 105.0)
 
 
-def _stills(centre: tuple[float, float], shift: Array) -> Plan:
+def _stills(centre: tuple[float, float], shift: F64) -> Plan:
     """A grid of places, at each of them pictures all around; no way leads from one to the next."""
     count = PLACES[0] * PLACES[1] * HEADINGS
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         index = np.minimum((np.asarray(s) * count).astype(np.int64), count - 1)
         place, heading = np.divmod(index, HEADINGS)
         cell = np.stack(np.divmod(place, PLACES[1]), axis=1)
@@ -229,7 +228,7 @@ def _stills(centre: tuple[float, float], shift: Array) -> Plan:
                 camera=WIDE_CAMERA)  # fmt: skip
 
 
-def _headset(scene: Scene, centre: tuple[float, float], shift: Array) -> Plan:
+def _headset(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
     """30 m on foot through rooms: once around a short walk, or part of a long one, by chance."""
     if not scene.walks:
         raise SimulatorError(
@@ -250,7 +249,7 @@ def _headset(scene: Scene, centre: tuple[float, float], shift: Array) -> Plan:
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     turning = CubicSpline(np.linspace(0, 1, len(path)), heading)
 
-    def shape(s: Array) -> tuple[Array, Array]:
+    def shape(s: F64) -> tuple[F64, F64]:
         place = spline(np.asarray(s))
         z = np.full(len(place), _EYE_M + 0.06 * shift[2])
         return np.column_stack([place, z]), turning(np.asarray(s))

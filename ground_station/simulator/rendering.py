@@ -15,14 +15,10 @@ os.environ["MUJOCO_GL"] = "egl"  # headless; read when mujoco is first imported
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, U8
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.surfaces import Surface
-
-Array = npt.NDArray[np.float64]
-Bytes = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float32]
 
 _ATLAS_TEXELS = 2048
 _GUTTER_TEXELS = 8  # repeated border around each texture, so that mipmaps don't mix neighbours
@@ -70,7 +66,7 @@ def _pack(sizes: Sequence[tuple[int, int]]) -> tuple[list[_Slot], int]:
 
 
 def _model(
-    surfaces: Sequence[Surface], textures: Sequence[Bytes], buffer_px: tuple[int, int], samples: int
+    surfaces: Sequence[Surface], textures: Sequence[U8], buffer_px: tuple[int, int], samples: int
 ) -> Any:
     """The compiled MuJoCo model: one mesh and one texture atlas for each group of surfaces."""
     slots, count = _pack([(t.shape[1], t.shape[0]) for t in textures])
@@ -129,7 +125,7 @@ class SceneRenderer:
     def __init__(
         self,
         surfaces: Sequence[Surface],
-        textures: Sequence[Bytes],
+        textures: Sequence[U8],
         buffer_px: tuple[int, int],
         *,
         samples: int = 4,
@@ -161,7 +157,7 @@ class SceneRenderer:
         """Frees the graphics memory."""
         self._renderer.close()
 
-    def _aim(self, wTc: Array, half_height: float, half_width: float, ortho_depth_m: float) -> None:
+    def _aim(self, wTc: F64, half_height: float, half_width: float, ortho_depth_m: float) -> None:
         for camera in self._renderer.scene.camera:  # left and right eye: the same
             camera.pos[:] = wTc[:3, 3]
             camera.forward[:] = wTc[:3, 2]
@@ -172,17 +168,17 @@ class SceneRenderer:
             camera.frustum_near = _NEAR_M
             camera.frustum_far = ortho_depth_m or _FAR_M
 
-    def image_and_depth(self, wTc: Array, pinhole: Pinhole) -> tuple[Bytes, Floats]:
+    def image_and_depth(self, wTc: F64, pinhole: Pinhole) -> tuple[U8, F32]:
         """The picture (H, W, 3) RGB and z-depth (H, W) in metres; infinity where nothing is."""
         self._aim_pinhole(wTc, pinhole)
         return self._renderer.render(), self._depth()
 
-    def depth(self, wTc: Array, pinhole: Pinhole) -> Floats:
+    def depth(self, wTc: F64, pinhole: Pinhole) -> F32:
         """Only the z-depth (H, W), metres."""
         self._aim_pinhole(wTc, pinhole)
         return self._depth()
 
-    def _aim_pinhole(self, wTc: Array, pinhole: Pinhole) -> None:
+    def _aim_pinhole(self, wTc: F64, pinhole: Pinhole) -> None:
         if (pinhole.width_px, pinhole.height_px) != (self._width, self._height):
             raise SimulatorError(
                 f"a picture of {pinhole.width_px}x{pinhole.height_px} from a buffer of"
@@ -192,13 +188,13 @@ class SceneRenderer:
         half_width = 0.5 * pinhole.width_px / pinhole.focal_px * _NEAR_M
         self._aim(wTc, half_height, half_width, 0.0)
 
-    def _depth(self) -> Floats:
+    def _depth(self) -> F32:
         self._renderer.enable_depth_rendering()
         z = self._renderer.render()
         self._renderer.disable_depth_rendering()
         return np.where(z >= 0.99 * _FAR_M, np.float32(np.inf), z)
 
-    def orthographic_depth(self, wTc: Array, half_size_m: float) -> Floats:
+    def orthographic_depth(self, wTc: F64, half_size_m: float) -> F32:
         """Distance (H, W) along parallel rays, metres: what a directional light sees."""
         self._aim(wTc, half_size_m, half_size_m * self._width / self._height, _FAR_M)
         return self._depth()

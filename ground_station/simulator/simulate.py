@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, I64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
@@ -147,7 +148,7 @@ class Flight:
     rate_hz: float
     camera: Camera
     carried: Camera
-    times_s: npt.NDArray[np.float64]
+    times_s: F64
     noise: np.random.Generator
     clicks: np.random.Generator
 
@@ -187,7 +188,7 @@ def prepare_flight(settings: SimulationSettings) -> Flight:
     return Flight(scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks)
 
 
-def time_ns_of(times_s: npt.ArrayLike) -> npt.NDArray[np.int64]:
+def time_ns_of(times_s: npt.ArrayLike) -> I64:
     """Capture times of frames from the motion's clock, integer nanoseconds."""
     return np.rint((np.asarray(times_s) + FIRST_FRAME_S) * 1e9).astype(np.int64)
 
@@ -284,7 +285,7 @@ def _record(
     changes = unsteady(settings.exposure_steps, settings.light_steps, settings.flicker)
     rows_s = row_offsets_s(camera)
 
-    def seen(t: float, exposure_s: float) -> npt.NDArray[np.float32]:
+    def seen(t: float, exposure_s: float) -> F32:
         radiance = maker.radiance(motion, t, exposure_s)
         if not changes.lit_evenly:
             light = changes.row_light(t + rows_s, exposure_s)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F64
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 
@@ -26,9 +26,9 @@ class Surface:
     (lit by the open sky, casting no shadow into it).
     """
 
-    origin_m: Array
-    u_m: Array
-    v_m: Array
+    origin_m: F64
+    u_m: F64
+    v_m: F64
     material: str
     texels_per_m: float
     options: dict[str, Any] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class Surface:
         return float(np.linalg.norm(self.u_m)), float(np.linalg.norm(self.v_m))
 
     @property
-    def normal(self) -> Array:
+    def normal(self) -> F64:
         """The unit vector out of the front."""
         n = np.cross(self.u_m, self.v_m)
         return n / np.linalg.norm(n)
@@ -51,12 +51,12 @@ class Surface:
         width, height = (max(4, round(s * self.texels_per_m)) for s in self.size_m)
         return width, height
 
-    def corners(self) -> Array:
+    def corners(self) -> F64:
         """(4, 3): origin, +u, +u+v, +v."""
         o, u, v = self.origin_m, self.u_m, self.v_m
         return np.stack([o, o + u, o + u + v, o + v])
 
-    def points(self, columns: int, rows: int) -> Array:
+    def points(self, columns: int, rows: int) -> F64:
         """Centres of a grid over the surface (rows, columns, 3), first row at the end of v."""
         s = (np.arange(columns) + 0.5) / columns
         t = 1 - (np.arange(rows) + 0.5) / rows
@@ -107,7 +107,7 @@ class SceneBuilder:
         """Adds the named faces of an axis-aligned box, each with a texture of its own."""
         lo, hi = np.asarray(low_m, dtype=np.float64), np.asarray(high_m, dtype=np.float64)
         dx, dy, dz = np.diag(hi - lo)
-        table: dict[str, tuple[npt.ArrayLike, Array, Array]] = {
+        table: dict[str, tuple[npt.ArrayLike, F64, F64]] = {
             "-y": (lo, dx, dz),
             "+y": ([hi[0], hi[1], lo[2]], -dx, dz),
             "-x": ([lo[0], hi[1], lo[2]], -dy, dz),

@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.float32]
+from ground_station.arrays import F32
+
 Rng = np.random.Generator
 
 _FIELD_SIZE = 1024
 
 
-def power_law_field(size: int, exponent: float, rng: Rng) -> Image:
+def power_law_field(size: int, exponent: float, rng: Rng) -> F32:
     """A periodic field (size, size) of amplitude f^-exponent, zero mean and unit deviation."""
     spectrum = np.fft.rfft2(rng.standard_normal((size, size)).astype(np.float32))
     f = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]) * size
@@ -31,7 +32,7 @@ def power_law_field(size: int, exponent: float, rng: Rng) -> Image:
     return np.asarray(result / result.std())
 
 
-def dead_leaves(size: int, low_px: float, high_px: float, rng: Rng) -> Image:
+def dead_leaves(size: int, low_px: float, high_px: float, rng: Rng) -> F32:
     """Opaque discs, radii of a power law (exponent -3), over each other: (size, size), 0 to 1."""
     canvas = np.full((size, size), 0.5, np.float32)
     # Enough area to cover the canvas about three times.
@@ -62,13 +63,13 @@ class TextureBank:
         self.leaves = dead_leaves(_FIELD_SIZE, 3, 90, rng)
         self.chips = dead_leaves(_FIELD_SIZE, 1.2, 9, rng)
 
-    def window(self, field: Image, rows: int, columns: int, rng: Rng, zoom: float = 1.0) -> Image:
+    def window(self, field: F32, rows: int, columns: int, rng: Rng, zoom: float = 1.0) -> F32:
         """A random window of a field, mirrored at its borders, magnified by `zoom` in x and y."""
         return self.stretched(field, rows, columns, rng, zoom, zoom)
 
     def stretched(
-        self, field: Image, rows: int, columns: int, rng: Rng, zoom_x: float, zoom_y: float
-    ) -> Image:
+        self, field: F32, rows: int, columns: int, rng: Rng, zoom_x: float, zoom_y: float
+    ) -> F32:
         """As `window`, with a zoom along each axis: grain and brushed metal."""
         h, w = max(2, round(rows / zoom_y)), max(2, round(columns / zoom_x))
         y = (int(rng.integers(_FIELD_SIZE)) + np.arange(h)) % _FIELD_SIZE
@@ -81,11 +82,11 @@ class TextureBank:
         return np.ascontiguousarray(cut, dtype=np.float32)
 
 
-def _paint(shade: Image, rgb: tuple[float, float, float]) -> Image:
+def _paint(shade: F32, rgb: tuple[float, float, float]) -> F32:
     return np.clip(shade, 0.03, 2.5)[..., None] * np.asarray(rgb, np.float32)
 
 
-def _grime(bank: TextureBank, rows: int, columns: int, rng: Rng, amount: float) -> Image:
+def _grime(bank: TextureBank, rows: int, columns: int, rng: Rng, amount: float) -> F32:
     """A factor near 1: clouds of dirt, and a few stains and scratches that no other surface has."""
     shade = 1 + amount * 0.5 * bank.window(bank.coarse[0], rows, columns, rng)
     shade += amount * 0.45 * bank.window(bank.middle[0], rows, columns, rng)
@@ -115,7 +116,7 @@ def _grime(bank: TextureBank, rows: int, columns: int, rng: Rng, amount: float) 
     return shade
 
 
-def _joints(shade: Image, step_px: tuple[float, float], width_px: int, depth: float) -> None:
+def _joints(shade: F32, step_px: tuple[float, float], width_px: int, depth: float) -> None:
     """Darkens joint lines of a grid that starts at the top-left corner, in place."""
     rows, columns = shade.shape
     for k in range(int(columns / step_px[0]) + 1):
@@ -126,14 +127,14 @@ def _joints(shade: Image, step_px: tuple[float, float], width_px: int, depth: fl
         shade[max(0, y - width_px // 2) : y + (width_px + 1) // 2, :] *= depth
 
 
-def plaster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def plaster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Painted plaster: faint 1/f shading, trowel marks, dirt."""
     shade = _grime(b, rows, columns, rng, o.get("dirt", 0.16))
     shade += 0.05 * b.window(b.fine, rows, columns, rng)
     return _paint(shade, o.get("rgb", (0.62, 0.58, 0.50)))
 
 
-def concrete(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def concrete(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Cast concrete: clouds, pores, streaks of water, form ties on a regular grid."""
     shade = _grime(b, rows, columns, rng, 0.24)
     shade += 0.10 * b.stretched(b.middle[1], rows, columns, rng, 0.5, 4.0)
@@ -152,7 +153,7 @@ def concrete(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **
     return image
 
 
-def terrazzo(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def terrazzo(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Terrazzo slabs: chips of stone in cement, joints, slabs of slightly different shades."""
     step = o.get("slab_m", 1.0) * scale
     shade = _grime(b, rows, columns, rng, 0.16)
@@ -170,7 +171,7 @@ def terrazzo(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **
     return image
 
 
-def wood(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def wood(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Planks along x (or y with `upright`): stretched grain, one shade a plank, dark joints."""
     upright = o.get("upright", False)
     h, w = (columns, rows) if upright else (rows, columns)
@@ -188,7 +189,7 @@ def wood(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: A
     return _paint(shade, o.get("rgb", (0.36, 0.22, 0.12)))
 
 
-def brick(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def brick(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Running bond: 250 x 71 mm with 10 mm mortar, every brick burnt differently."""
     height, width, joint = 0.081 * scale, 0.26 * scale, max(1, round(0.012 * scale))
     image = _paint(np.full((rows, columns), 1.0, np.float32), (0.42, 0.40, 0.36))
@@ -204,7 +205,7 @@ def brick(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: 
     return np.asarray(image * np.clip(shade, 0.05, 2)[..., None], np.float32)
 
 
-def fabric(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def fabric(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Upholstery: folds and a woven pattern of soft blotches."""
     shade = _grime(b, rows, columns, rng, 0.22) * (
         0.7 + 0.6 * b.window(b.leaves, rows, columns, rng)
@@ -212,21 +213,21 @@ def fabric(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     return _paint(shade, o.get("rgb", (0.12, 0.20, 0.34)))
 
 
-def metal(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def metal(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Brushed and worn metal."""
     shade = _grime(b, rows, columns, rng, 0.18)
     shade += 0.10 * b.stretched(b.middle[0], rows, columns, rng, 10.0, 0.8)
     return _paint(shade, o.get("rgb", (0.30, 0.31, 0.33)))
 
 
-def foliage(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def foliage(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Leaves over leaves, light and dark."""
     leaf = b.window(b.leaves, rows, columns, rng, o.get("zoom", 0.6))
     shade = (0.25 + 1.5 * leaf * leaf) * _grime(b, rows, columns, rng, 0.35)
     return _paint(shade, o.get("rgb", (0.09, 0.17, 0.05)))
 
 
-def sky(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def sky(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Clouds before a blue that pales towards the horizon (the bottom)."""
     cloud = 1 / (1 + np.exp(-2.0 * (b.window(b.coarse[1], rows, columns, rng, 1.5) - 0.2)))
     pale = np.linspace(0, 1, rows, dtype=np.float32)[:, None, None]
@@ -235,7 +236,7 @@ def sky(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: An
     return np.asarray(blue * (1 - cloud[..., None]) + white * cloud[..., None], np.float32)
 
 
-def frame(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def frame(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """A door leaf: frame, panels, handle, and a number plate."""
     image = wood(b, rows, columns, scale, rng, upright=True, rgb=o.get("rgb", (0.30, 0.17, 0.09)))
     border = round(0.14 * scale)
@@ -256,7 +257,7 @@ def frame(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: 
 
 
 def _write(
-    image: Image, text: str, left_bottom: tuple[int, int], width_px: int, rgb: tuple[float, ...]
+    image: F32, text: str, left_bottom: tuple[int, int], width_px: int, rgb: tuple[float, ...]
 ) -> None:
     font, thickness = cv2.FONT_HERSHEY_DUPLEX, 2
     (w, _), _ = cv2.getTextSize(text, font, 1.0, thickness)
@@ -265,7 +266,7 @@ def _write(
     cv2.putText(image, text, left_bottom, font, size, rgb, thick, cv2.LINE_AA)
 
 
-def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> Image:
+def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """A printed sign, unlike any other: headline, a picture of shapes, lines of text.
 
     Another `edition` is another picture in the same place.
@@ -309,7 +310,7 @@ def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     return (image * shade[..., None]).astype(np.float32)
 
 
-Material = Callable[..., Image]
+Material = Callable[..., F32]
 MATERIALS: dict[str, Material] = {
     "plaster": plaster,
     "concrete": concrete,

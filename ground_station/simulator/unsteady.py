@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.simulator.scene import SimulatorError
-
-Array = npt.NDArray[np.float64]
 
 FLICKER_HZ = 100.0
 """Lamps on mains of 50 Hz are brightest at both of a period's peaks."""
@@ -33,7 +32,7 @@ class Steps:
     value: tuple[float, ...] = ()
     before: float = 0.0
 
-    def at(self, times_s: npt.ArrayLike) -> Array:
+    def at(self, times_s: npt.ArrayLike) -> F64:
         """The values at times of any shape."""
         values = np.array([self.before, *self.value])
         return values[np.searchsorted(self.time_s, times_s, side="right")]
@@ -59,7 +58,7 @@ class Unsteady:
         """Whether no row is ever lit otherwise than the scene says."""
         return not self.light.time_s and self.flicker == 0
 
-    def row_light(self, times_s: npt.ArrayLike, exposure_s: float) -> Array:
+    def row_light(self, times_s: npt.ArrayLike, exposure_s: float) -> F64:
         """The mean light (H,) during the exposures of H rows, each about its time, seconds.
 
         An exposure of whole periods of the flicker has no bands.

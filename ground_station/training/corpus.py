@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ground_station import files
+from ground_station.arrays import F32, U8
 from ground_station.feature_models import images
 from ground_station.progress import Progress
 from ground_station.training import rooms
@@ -91,7 +92,7 @@ def shard_path(folder: Path, kind: str, number: int) -> Path:
     return folder / f"{kind}-{number:04d}.safetensors"
 
 
-def _places(settings: CorpusSettings, kind: str, number: int) -> Iterator[npt.NDArray[np.uint8]]:
+def _places(settings: CorpusSettings, kind: str, number: int) -> Iterator[U8]:
     size = (settings.rows, settings.columns)
     if kind == "rooms":
         yield from rooms.views_of_room(
@@ -179,9 +180,9 @@ def make(folder: Path, settings: CorpusSettings, teacher: str, jobs: int) -> Non
 class Place:
     """One place: `views` (V, H, W) uint8 in V lights and its labels, as in `teacher.Labels`."""
 
-    views: npt.NDArray[np.uint8]
-    points_px: npt.NDArray[np.float32]
-    scores: npt.NDArray[np.float32]
+    views: U8
+    points_px: F32
+    scores: F32
     descriptors: npt.NDArray[np.float16]
 
 

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import F32
 from ground_station.feature_models import scale
 from ground_station.feature_models.graph import Graph, fold_batch_norm
 from ground_station.features.model_info import ModelInfo
@@ -23,8 +21,7 @@ NMS_PX = 3
 THRESHOLD = 0.005
 SUBPIXEL_PX = 2
 
-Array = npt.NDArray[np.float32]
-Weights = Mapping[str, Array]
+Weights = Mapping[str, F32]
 
 
 def info(shape: Shape, source: str) -> ModelInfo:
@@ -42,21 +39,21 @@ def info(shape: Shape, source: str) -> ModelInfo:
     )
 
 
-def folded(shape: Shape, weights: Weights) -> dict[str, Array]:
+def folded(shape: Shape, weights: Weights) -> dict[str, F32]:
     """`LAYER.weight` (out, in, k, k) and `LAYER.bias` (out,) of all layers, in their order.
 
     Batch normalisations are folded into the convolutions before them: of SuperPoint's size this is
     Magic Leap's layout. Raises `TrainingError` as `export`.
     """
-    result: dict[str, Array] = {}
+    result: dict[str, F32] = {}
     for layer in layers(shape):
         weight, bias = _folded(layer, weights)
         result |= {f"{layer.name}.weight": weight, f"{layer.name}.bias": bias}
     return result
 
 
-def _folded(layer: Conv, weights: Weights) -> tuple[Array, Array]:
-    def take(name: str, *shape: int) -> Array:
+def _folded(layer: Conv, weights: Weights) -> tuple[F32, F32]:
+    def take(name: str, *shape: int) -> F32:
         if name not in weights:
             raise TrainingError(f"the weights lack '{name}'")
         array = weights[name]

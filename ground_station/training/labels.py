@@ -7,11 +7,9 @@ weight is shared among the four pixels around it, so that its fraction of a pixe
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32
 from ground_station.training.topology import CELL_PX, LOGITS
-
-F32 = npt.NDArray[np.float32]
 
 
 def confidence(scores: F32, low: float, high: float) -> F32:

@@ -13,14 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64, U8, Bools
 from ground_station.feature_models.degrade import degrade
 from ground_station.training.corpus import Corpus, Place
 from ground_station.training.labels import confidence, soft_cells
 from ground_station.training.topology import CELL_PX
 from ground_station.training.warps import WarpLimits, apply, inside, pair_of_views
 
-F32 = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 Rng = np.random.Generator
 
 _CHANCE_SCORES = (0.05, 0.35)
@@ -40,16 +39,16 @@ class Pair:
     no descriptor; `second_from_first` (3, 3) float64.
     """
 
-    images: Bytes
+    images: U8
     labels: npt.NDArray[np.float16]
-    known: npt.NDArray[np.bool_]
+    known: Bools
     points_px: F32
-    used: npt.NDArray[np.bool_]
+    used: Bools
     teacher: npt.NDArray[np.float16]
-    second_from_first: npt.NDArray[np.float64]
+    second_from_first: F64
 
 
-def view_of(picture: Bytes, matrix: npt.NDArray[np.float64], size: tuple[int, int]) -> Bytes:
+def view_of(picture: U8, matrix: F64, size: tuple[int, int]) -> U8:
     """A view of (rows, columns) through `matrix`, from its pixels to the picture's."""
     scale = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
     if scale > 1.1:  # smaller than the picture: what a view's pixel collects
@@ -64,9 +63,7 @@ def view_of(picture: Bytes, matrix: npt.NDArray[np.float64], size: tuple[int, in
     )  # fmt: skip
 
 
-def _known_cells(
-    matrix: npt.NDArray[np.float64], picture: tuple[int, ...], size: tuple[int, int]
-) -> npt.NDArray[np.bool_]:
+def _known_cells(matrix: F64, picture: tuple[int, ...], size: tuple[int, int]) -> Bools:
     """Cells (h, w) of a view whose four corners lie well inside the picture."""
     y, x = np.meshgrid(
         np.arange(0, size[0] + 1, CELL_PX) - 0.5, np.arange(0, size[1] + 1, CELL_PX) - 0.5,
@@ -77,7 +74,7 @@ def _known_cells(
     return np.asarray(good[:-1, :-1] & good[1:, :-1] & good[:-1, 1:] & good[1:, 1:])
 
 
-def _thinned(points_px: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def _thinned(points_px: F64) -> Bools:
     """Which points (N,), strongest first, have no stronger one nearer than `_APART_PX`."""
     keep = np.ones(len(points_px), bool)
     for a, b in sorted(cKDTree(points_px).query_pairs(_APART_PX)):

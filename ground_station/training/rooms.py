@@ -11,8 +11,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.geometry.camera import Camera
 from ground_station.simulator.imaging import AutoExposure, FrameMaker
 from ground_station.simulator.lighting import LIGHTS, Light, LitTextures, lit_textures, looking
@@ -20,8 +20,6 @@ from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Lamp, Scene
 from ground_station.simulator.surfaces import SceneBuilder
 
-Array = npt.NDArray[np.float64]
-Bytes = npt.NDArray[np.uint8]
 Rng = np.random.Generator
 
 _WALL = ("plaster", "plaster", "brick", "concrete", "wood")
@@ -82,7 +80,7 @@ class _Room:
                 origin = np.array([x + ux * (start + wide), y + uy * (start + wide), 0.0])
                 self._bay(origin, np.array([-ux, -uy, 0.0]), wide, glazed)
 
-    def _bay(self, origin: Array, u: Array, wide: float, glazed: bool) -> None:
+    def _bay(self, origin: F64, u: F64, wide: float, glazed: bool) -> None:
         height = self.size[2]
         rgb, up = self._rgb(), np.array([0.0, 0.0, 1.0])
         inward = np.cross(u, up)
@@ -217,7 +215,7 @@ def _moved(base: Light, lamp_level: float, rng: Rng) -> Light:
 
 def views_of_room(
     seed: int, number: int, places: int, lights: int, size: tuple[int, int]
-) -> Iterator[Bytes]:
+) -> Iterator[U8]:
     """For each place in a room its pictures (lights, rows, columns), equal but for the light.
 
     Raises `SimulatorError` where this machine cannot render.
@@ -233,8 +231,8 @@ def views_of_room(
         width_px=columns, height_px=rows, fx_px=focal, fy_px=focal,
         cx_px=(columns - 1) / 2, cy_px=(rows - 1) / 2,
     )  # fmt: skip
-    chosen: list[Array] = []
-    stacks: list[list[Bytes]] = []
+    chosen: list[F64] = []
+    stacks: list[list[U8]] = []
     for k, textures in enumerate(lit):
         # One light at a time: the textures fill the graphics memory.
         pictures = _pictures(scene, textures, camera, poses if k == 0 else chosen, places, k == 0)
@@ -247,7 +245,7 @@ def views_of_room(
         yield np.stack(stack)
 
 
-def _pose(rng: Rng, scene: Scene) -> Array:
+def _pose(rng: Rng, scene: Scene) -> F64:
     """Somewhere in the room, looking about level, a little rolled."""
     margin = np.array([0.6, 0.6, 0.5])
     position = rng.uniform(margin, np.asarray(scene.size_m) - margin)
@@ -266,10 +264,10 @@ def _pictures(
     scene: Scene,
     lit: LitTextures,
     camera: Camera,
-    poses: list[Array],
+    poses: list[F64],
     most: int,
     choosy: bool,
-) -> Iterator[tuple[Array, Bytes]]:
+) -> Iterator[tuple[F64, U8]]:
     """Poses and their pictures; `choosy`: only of those that show something, at most `most`."""
     scale = _OVER
     large = Pinhole(

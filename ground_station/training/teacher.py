@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.features import catalogue, detection, model, sampling
 from ground_station.features.inference import Network
 from ground_station.features.model_info import Model
@@ -22,8 +23,6 @@ from ground_station.training.errors import TrainingError
 from ground_station.training.score_graph import scores_only
 from ground_station.training.warps import WarpLimits, around
 
-Bytes = npt.NDArray[np.uint8]
-F32 = npt.NDArray[np.float32]
 Rng = np.random.Generator
 
 _NMS_PX = 3
@@ -59,7 +58,7 @@ class Teacher:
         self._whole = Network(teacher, threads=threads)
         self._detector = Network(scores_only(teacher), threads=threads)
 
-    def label(self, views: Bytes, warps: int, most: int, rng: Rng) -> Labels:
+    def label(self, views: U8, warps: int, most: int, rng: Rng) -> Labels:
         """Labels of a place from its pictures (V, H, W), sides multiples of 32, in V lights.
 
         Each picture is looked at as it is, and `warps` times one of them turned. Descriptors are

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.feature_models.homographic import LIMIT_PX, correct_matches
 from ground_station.features.extractor import Extractor, Features
 from ground_station.training.pairs import Pair
-
-F64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
+from ground_station.arrays import F64
+
 Rng = np.random.Generator
 Size = tuple[int, int]
 
@@ -32,7 +33,7 @@ class WarpLimits:
     """Of a rolling shutter: the columns by which a row runs ahead of the one below it."""
 
 
-def apply(matrix: npt.NDArray[np.floating], points_px: npt.NDArray[np.floating]) -> Array:
+def apply(matrix: npt.NDArray[np.floating], points_px: npt.NDArray[np.floating]) -> F64:
     """Points (N, 2) through a homography: (N, 2). Points on or behind the horizon become NaN."""
     homogeneous = points_px @ matrix[:, :2].T + matrix[:, 2]
     depth = np.where(homogeneous[:, 2:] > 1e-9, homogeneous[:, 2:], np.nan)
@@ -58,7 +59,7 @@ def of_plane(
     tilt_deg: float,
     tilt_axis_deg: float,
     shear: float = 0.0,
-) -> Array:
+) -> F64:
     """From a view's pixels to the picture's, which hangs before the camera as a plane.
 
     The view's middle sees `centre_px`, `scale` pixels of the picture a pixel of the view there; the
@@ -89,7 +90,7 @@ def of_plane(
 
 def pair_of_views(
     rng: Rng, picture: Size, view: Size, limits: WarpLimits, strength: float = 1.0
-) -> tuple[Array, Array]:
+) -> tuple[F64, F64]:
     """Two views of one part of a picture, each from its own pixels to the picture's."""
     margin = [0.25 * side for side in picture]
     centre = np.array(
@@ -116,7 +117,7 @@ def pair_of_views(
     return views[0], views[1]
 
 
-def around(rng: Rng, size: Size, limits: WarpLimits) -> Array:
+def around(rng: Rng, size: Size, limits: WarpLimits) -> F64:
     """From a view of the same size to the whole picture: what homographic adaptation turns by."""
     rows, columns = size
     x = (columns - 1) / 2 + rng.uniform(-0.12, 0.12) * columns

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from board_views import BoardCamera, Waypoints
 
+from ground_station.arrays import F64
 from ground_station.recording.encoding import H264Encoder
 from pi_firmware.wire.recording import RecordingWriter
 
@@ -15,7 +15,7 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def write_board_flight(
-    path: Path, taker: BoardCamera, motion: Waypoints, times_s: npt.NDArray[np.float64],
+    path: Path, taker: BoardCamera, motion: Waypoints, times_s: F64,
     exposure_s: float, rng: np.random.Generator, *, crf: float = 18.0,
 ) -> Path:  # fmt: skip
     """Takes a picture at each time and records it; the recording carries no camera."""

@@ -12,14 +12,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, U8
 from ground_station.calibration.board import Board
 from ground_station.geometry.camera import Camera
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
 
 _TEXELS = 48
 """Of a square's side: a multiple of a marker's bits, so that all bits are alike."""
@@ -56,14 +53,14 @@ class Waypoints:
     """A board carried from pose to pose: it rests, then moves with the least jerk (Flash and
     Hogan 1985). `poses` (K, 6) are rotation vectors and translations of the board in the camera."""
 
-    def __init__(self, poses: Array, rest_s: float = 0.2, move_s: float = 0.7) -> None:
+    def __init__(self, poses: F64, rest_s: float = 0.2, move_s: float = 0.7) -> None:
         self.poses, self.rest_s, self.move_s = poses, rest_s, move_s
 
     @property
     def duration_s(self) -> float:
         return len(self.poses) * self.rest_s + (len(self.poses) - 1) * self.move_s
 
-    def at(self, time_s: Array) -> Array:
+    def at(self, time_s: F64) -> F64:
         """Poses (N, 6) at N times."""
         t = np.clip(np.asarray(time_s, np.float64), 0, self.duration_s - 1e-9)
         k = np.minimum((t // (self.rest_s + self.move_s)).astype(int), len(self.poses) - 1)
@@ -76,7 +73,7 @@ class Waypoints:
 def pose_of(
     camera: Camera, board: Board, centre_px: tuple[float, float], distance_m: float,
     tilt_deg: tuple[float, float] = (0.0, 0.0), roll_deg: float = 0.0,
-) -> Array:  # fmt: skip
+) -> F64:  # fmt: skip
     """The pose (6,) that puts the board's middle there; tilts are about the picture's axes."""
     tilt = Rotation.from_rotvec(np.radians([tilt_deg[0], tilt_deg[1], 0.0]))
     turn = tilt * Rotation.from_euler("z", roll_deg, degrees=True)
@@ -140,7 +137,7 @@ class BoardCamera:
     def take(
         self, motion: Waypoints, time_s: float, exposure_s: float = 0.0,
         rng: np.random.Generator | None = None,
-    ) -> Image:  # fmt: skip
+    ) -> U8:  # fmt: skip
         """A picture (H, W); without `rng` it has no noise.
 
         Of four samples of each pixel, each lies in another quarter of it and of the exposure.
@@ -172,7 +169,7 @@ class BoardCamera:
         return np.clip(np.rint(total), 0, 255).astype(np.uint8)
 
 
-def project_rolling(camera: Camera, points_m: Array, motion: Waypoints, time_s: float) -> Array:
+def project_rolling(camera: Camera, points_m: F64, motion: Waypoints, time_s: float) -> F64:
     """Where N board points are seen (N, 2), each at its own row's time; outside or behind NaN."""
     px = np.full((len(points_m), 2), np.nan)
     row_s = np.zeros(len(points_m))

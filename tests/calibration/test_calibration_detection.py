@@ -6,8 +6,9 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import pytest
-from board_views import BoardCamera, Image, Pictured, Waypoints, pose_of, scaled
+from board_views import BoardCamera, Pictured, Waypoints, pose_of, scaled
 
+from ground_station.arrays import U8
 from ground_station.calibration.board import Board
 from ground_station.calibration.detection import BoardFinder, BoardObservation, other_board
 from ground_station.calibration.errors import CalibrationError
@@ -29,11 +30,11 @@ def still(centre: tuple[float, float] = (0.5, 0.5), distance_m: float = 0.32, **
     return Waypoints(np.array([pose, pose]))
 
 
-def taken(motion: Waypoints, **how: object) -> Image:
+def taken(motion: Waypoints, **how: object) -> U8:
     return BoardCamera(CAMERA, BOARD).take(motion, 0.1, rng=np.random.default_rng(1), **how)
 
 
-def found(image: Image) -> BoardObservation | None:
+def found(image: U8) -> BoardObservation | None:
     return FINDER.find(Frame(0, "picture", 0, image))
 
 
@@ -82,7 +83,7 @@ def test_a_wrong_corner_is_thrown_out(monkeypatch: pytest.MonkeyPatch) -> None:
     corners[4, 0] += [20, -15]
 
     class Wrong:
-        def detectBoard(self, _: Image) -> tuple:
+        def detectBoard(self, _: U8) -> tuple:
             return corners, ids, *rest
 
     monkeypatch.setattr(finder, "_detector", Wrong())
@@ -136,7 +137,7 @@ def test_ctrl_c_keeps_what_was_seen() -> None:
     assert seen.interrupted and seen.frames == len(seen.observations) == 2
 
 
-def refusal(*images: Image, finder: BoardFinder = FINDER) -> str:
+def refusal(*images: U8, finder: BoardFinder = FINDER) -> str:
     assert all(finder.find(Frame(0, "", 0, image)) is None for image in images)
     gathered = Gathered(len(images), (480, 360), [], list(images))
     with pytest.raises(CalibrationError) as refused:

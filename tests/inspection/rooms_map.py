@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.inspection.visibility import View
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
-
-F64 = npt.NDArray[np.float64]
 
 SIDE_M = 6.0
 SIGMA_M = 0.004
@@ -49,9 +48,7 @@ def two_rooms(per_wall: int = 300, registered: bool = True) -> Map:
     return made_of(position, wTc, seen, registered)
 
 
-def made_of(
-    position: F64, wTc: F64, seen: list[npt.NDArray[np.intp]], registered: bool = True
-) -> Map:
+def made_of(position: F64, wTc: F64, seen: list[Indices], registered: bool = True) -> Map:
     """A map of landmarks (M, 3) that keyframes (K, 4, 4) saw, M of which nobody saw are kept."""
     landmark = np.concatenate(seen).astype(np.int32)
     image = np.repeat(np.arange(len(wTc)), [len(s) for s in seen])

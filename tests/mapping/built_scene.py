@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from ground_station.arrays import F64, I64, U8
 from ground_station.features import extractors
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -29,9 +30,9 @@ class Scene:
     """Points (N, 3), metres, poses (K, 4, 4), and the features of each image."""
 
     camera: Camera
-    points: npt.NDArray[np.float64]
-    wTc: npt.NDArray[np.float64]
-    seen: list[npt.NDArray[np.int64]]
+    points: F64
+    wTc: F64
+    seen: list[I64]
     features: list[Features]
 
     def frames(self) -> Iterator[Frame]:
@@ -53,11 +54,11 @@ class SceneExtractor:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         return self._scene.features[int(image[0, 0])]
 
 
-def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> F64:
     """wTc of a camera at `position` that looks at `target`, z up in the world."""
     forward = np.asarray(target, float) - position
     forward /= np.linalg.norm(forward)

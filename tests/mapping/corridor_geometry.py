@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
@@ -36,7 +37,7 @@ class Corridor:
     """
 
     camera: Camera
-    wTc: npt.NDArray[np.float64]
+    wTc: F64
     images: Images
     pairs: dict[tuple[int, int], TwoView]
     misled: set[tuple[int, int]]

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.replay.cases import frames
@@ -23,10 +23,9 @@ CLOCK_NS = 1_700_000_000_000_000_000
 """The ground's clock when the camera's says `START_NS`."""
 UNIT = b"\0\0\0\1\x65"
 """How each access unit of such a recording begins."""
-Array = npt.NDArray[np.float64]
 
 
-def true_pose(k: int) -> Array:
+def true_pose(k: int) -> F64:
     """Of frame k: along x at 3 cm a frame, turning by 1° a frame."""
     angle = np.radians(k)
     c, s = np.cos(angle), np.sin(angle)

@@ -8,16 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.simulate import SimulationSettings, simulate
 from ground_station.simulator.surfaces import SceneBuilder, Surface
-
-Array = npt.NDArray[np.float64]
 
 TEXELS_PER_M = 100
 DOT_M = 0.10
@@ -28,9 +26,9 @@ class Room:
     """Dark surfaces with bright square dots: their centres and half-edges in world metres."""
 
     renderer: SceneRenderer
-    centres: Array
-    half_edges: Array  # (N, 2, 3)
-    decoder: npt.NDArray[np.float32]
+    centres: F64
+    half_edges: F64  # (N, 2, 3)
+    decoder: F32
     supersampling: float
 
     def maker(self, camera: Camera, renders: int) -> FrameMaker:
@@ -38,9 +36,7 @@ class Room:
         return FrameMaker(self.renderer, self.decoder, camera, pinhole, renders=renders)
 
 
-def _dotted(
-    surface: Surface, rng: np.random.Generator
-) -> tuple[npt.NDArray[np.uint8], Array, Array]:
+def _dotted(surface: Surface, rng: np.random.Generator) -> tuple[U8, F64, F64]:
     columns, rows = surface.size_texels
     texture = np.full((rows, columns, 3), 40, np.uint8)
     n = round(DOT_M * TEXELS_PER_M)

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.imaging import AutoExposure, Sensor, row_offsets_s
@@ -16,12 +16,10 @@ from ground_station.simulator.known_points import project_rolling
 from ground_station.simulator.motion import Motion, Mount
 from tests.simulator.conftest import Room, open_room
 
-Array = npt.NDArray[np.float64]
-
 GLOBAL = replace(THESIS_CAMERA, readout_s=0.0)
 
 
-def moving(velocity_m_s: Array, rates_rad_s: Array, start: Array | None = None) -> Motion:
+def moving(velocity_m_s: F64, rates_rad_s: F64, start: F64 | None = None) -> Motion:
     """Straight and evenly turning about time 0."""
     t = np.linspace(-0.5, 0.5, 101)
     position = (np.array([0.6, -0.1, 1.6]) if start is None else start) + t[:, None] * velocity_m_s
@@ -35,7 +33,7 @@ FAST = moving(np.array([2.5, 1.5, -0.5]), np.array([0.8, 0.3, -0.4]))
 
 def measured_and_expected(
     room: Room, camera: Camera, motion: Motion, exposure_s: float, renders: int
-) -> tuple[Array, Array]:
+) -> tuple[F64, F64]:
     """Centroids of the dots in a frame, and of their true projections, pixels."""
     image = room.maker(camera, renders).radiance(motion, 0.0, exposure_s)[..., 1]
     grid = np.linspace(-0.95, 0.95, 9)
@@ -67,7 +65,7 @@ def measured_and_expected(
     return np.array(measured), np.array(expected)
 
 
-def projected_area_centroid(pixels: Array, n: int) -> Array:
+def projected_area_centroid(pixels: F64, n: int) -> F64:
     """The centroid of a projected square from an n x n grid of its points."""
     p = pixels.reshape(n, n, 2)
     d1, d2 = p[1:, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, 1:]

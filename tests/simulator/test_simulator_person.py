@@ -7,9 +7,9 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.recording.flight import camera_of
@@ -24,7 +24,6 @@ from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
 from tests.simulator.conftest import quick_settings
 from tests.simulator.test_simulator_scenes import nearest_surface_m
 
-Array = npt.NDArray[np.float64]
 SEEDS = range(6)
 
 
@@ -34,11 +33,11 @@ def flight_of(plan: str, seed: int, **changes: object) -> Flight:
     return prepare_flight(SimulationSettings(out=Path("f.mcap"), **(values | changes)))  # type: ignore[arg-type]
 
 
-def true_poses(flight: Flight) -> Array:
+def true_poses(flight: Flight) -> F64:
     return flight.motion.wTc(flight.times_s)
 
 
-def turns_deg(wTc: Array) -> Array:
+def turns_deg(wTc: F64) -> F64:
     pairs = itertools.pairwise(wTc[:, :3, :3])
     return np.degrees([float(poses.rotation_angle(a.T @ b)) for a, b in pairs])
 

@@ -18,12 +18,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64, U8, Bools
 from ground_station.errors import InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.recording.folder import read_grey
-
-F64 = npt.NDArray[np.float64]
 
 NEAR_PX = 3.0
 """A key point is found again, and a match is correct, up to this distance."""
@@ -40,8 +39,8 @@ class Pair:
     """Two grey pictures (H, W) uint8 and the homography (3, 3) from the first's pixels."""
 
     name: str
-    first: npt.NDArray[np.uint8]
-    second: npt.NDArray[np.uint8]
+    first: U8
+    second: U8
     homography: F64
 
 
@@ -137,7 +136,7 @@ def project(H: F64, points_px: npt.ArrayLike) -> F64:
         return np.asarray(x[:, :2] / x[:, 2:])
 
 
-def _inside(points_px: F64, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+def _inside(points_px: F64, shape: tuple[int, ...]) -> Bools:
     return np.asarray(((points_px >= 0) & (points_px <= (shape[1] - 1, shape[0] - 1))).all(axis=1))
 
 
@@ -149,7 +148,7 @@ def _near(points: F64, others: F64) -> int:
     return int(np.sum(distance <= NEAR_PX))
 
 
-def _corners_px(p: npt.NDArray[np.float32], q: npt.NDArray[np.float32], pair: Pair) -> float:
+def _corners_px(p: F32, q: F32, pair: Pair) -> float:
     if len(p) < 4:
         return float("inf")
     try:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import U8
 from ground_station.bench.steps import medians_ms
 from ground_station.features.extractor import Extractor
 
@@ -15,7 +15,7 @@ BESIDE = "rootsift"
 
 
 def measure(
-    extractors: dict[str, Extractor], image: npt.NDArray[np.uint8], repetitions: int
+    extractors: dict[str, Extractor], image: U8, repetitions: int
 ) -> dict[str, dict[str, Any]]:
     """By name: the median time of `image`, ms, and its ratio to RootSIFT's where that is there.
 
@@ -33,7 +33,7 @@ def measure(
     }
 
 
-def picture(seed: int) -> npt.NDArray[np.uint8]:
+def picture(seed: int) -> U8:
     """A picture (480, 640) with texture at all scales, for when there is no real one."""
     import cv2
 

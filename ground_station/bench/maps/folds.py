@@ -7,14 +7,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.errors import GeometryError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.mapping.sfm import robust_similarity
-
-F64 = npt.NDArray[np.float64]
 
 MISPLACED_DEPTH, MISPLACED_DEG = 0.05, 5.0
 """An image is misplaced when it is off by more than this share of the median depth of what the

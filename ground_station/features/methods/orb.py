@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, U8
 from ground_station.features.extractor import Features, check_image
 
 _SCALE, _LEVELS = 1.2, 8
@@ -35,7 +36,7 @@ class Orb:
         self.sha256 = hashlib.sha256(b"orb/1 opencv-orb 256 bits 1.2 8 levels").hexdigest()
         self._orb = cv2.ORB.create(nfeatures=max_features, scaleFactor=_SCALE, nlevels=_LEVELS)
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""
         check_image(image)
         keypoints, bits = self._orb.detectAndCompute(image, None)
@@ -54,7 +55,7 @@ class Orb:
 
 def _centred(
     corners_px: npt.NDArray[Any], keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...]
-) -> npt.NDArray[np.float64]:
+) -> F64:
     """OpenCV's positions (N, 2) with the centre of the first pixel at (0, 0).
 
     It multiplies a level's pixel by the level's scale, which holds for the pixels' corners and
@@ -66,7 +67,7 @@ def _centred(
     return (corners_px / scale + 0.5) * true_scale - 0.5
 
 
-def unit_of_bits(bits: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+def unit_of_bits(bits: U8) -> F32:
     """Binary descriptors (N, B / 8) as unit vectors (N, B) of the two values ±1/√B."""
     signs = np.unpackbits(bits, axis=1).astype(np.float32) * 2 - 1
     return np.asarray(signs / np.sqrt(np.float32(signs.shape[1])), np.float32)

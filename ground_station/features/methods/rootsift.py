@@ -6,8 +6,8 @@ import hashlib
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, U8
 from ground_station.features.extractor import Features, check_image
 
 _CONTRAST_THRESHOLD = 0.006
@@ -40,7 +40,7 @@ class RootSift:
             enable_precise_upscale=True,
         )
 
-    def extract(self, image: npt.NDArray[np.uint8]) -> Features:
+    def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""
         check_image(image)
         keypoints, descriptors = self._sift.detectAndCompute(image, None)
@@ -55,7 +55,7 @@ class RootSift:
         return Features(positions[order], scores[order], hellinger(histograms[order]))
 
 
-def hellinger(sift: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def hellinger(sift: F32) -> F32:
     """SIFT histograms (N, 128) to RootSIFT (N, 128), unit L2 norm (section 3 of the paper)."""
     total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-12)
     return np.asarray(np.sqrt(sift / total), np.float32)

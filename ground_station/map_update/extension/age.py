@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry.lens import Lens
 from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import LandmarkIndex
 from ground_station.map.store import Map
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _CONES = ProjectionSettings(viewing_cone=True, cone_margin_deg=5.0, max_distance_ratio=1.2)
 """Places from which a keyframe saw a landmark, or nearly: from elsewhere something may hide it."""

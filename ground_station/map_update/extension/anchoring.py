@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Indices
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.matching import Matcher, describe
@@ -15,9 +15,6 @@ from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
 from ground_station.map_update.extension.frames import Frames
 from ground_station.map_update.extension.localizing import Flight
-
-F64 = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 _RADIUS_PX = 8.0
 """A landmark is looked for so near to where a localized frame's pose projects it."""

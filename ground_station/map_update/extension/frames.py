@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
@@ -22,9 +22,6 @@ from ground_station.mapping.refinement.chosen import choose_frames
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _SAME_RAY_PX = 0.1
 """A feature that another camera's lens sees and the map's cannot express is left out."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, I64
 from ground_station.map import landmarks, store
 from ground_station.map.descriptors import joined
 from ground_station.map.model import Model
@@ -16,9 +16,6 @@ from ground_station.map.modes import with_modes
 from ground_station.map_update.extension.frames import Frames
 from ground_station.map_update.extension.looks import Looks
 from ground_station.mapping.sfm.models import without_points
-
-F32 = npt.NDArray[np.float32]
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

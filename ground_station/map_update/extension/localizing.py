@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import I64
 from ground_station.errors import InputError, MapError
 from ground_station.geometry.camera import Camera
 from ground_station.localization.estimate import PoseEstimate
@@ -20,8 +20,6 @@ from ground_station.map.store import Map
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameRange, FrameSource
 from ground_station.recording.open import open_input
-
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

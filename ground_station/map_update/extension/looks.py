@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, I64
 from ground_station.map.store import Map
 from ground_station.map_update.extension.merging import distance_to_landmarks, mean_descriptors
 from ground_station.mapping.settings import MappingSettings
-
-F32 = npt.NDArray[np.float32]
-I64 = npt.NDArray[np.int64]
 
 _MOST_SPREAD = 0.6
 """RMS distance of a mode's observations from their mean, beyond which they are not one look."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F32, F64, I64
 from ground_station.geometry.lens import Lens
 from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
@@ -19,10 +19,6 @@ from ground_station.map.modes import described
 from ground_station.map.store import Map
 from ground_station.map_update.extension.frames import Frames
 from ground_station.map_update.extension.structure import Structure
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _SHARE = 0.7
 """Of a point's observations that must be where a landmark projects, for it to be that landmark."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools, Indices
 from ground_station.localization.relocalization import pose_from_matches
 from ground_station.localization.settings import RecoverySettings
 from ground_station.map import landmarks
@@ -25,10 +25,6 @@ from ground_station.map_update.extension.witnesses import Witnesses
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.growing import adjust_among_fixed
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 LOOSE_PX = 4.0
 """An observation may be so far off before anything was adjusted."""
@@ -63,7 +59,7 @@ class Structure:
         self._anchoring, self._settings, self._recovery = anchoring, settings, recovery
         self._threads, self._witnesses = threads, Witnesses(map_)
         self.wTc, self.twist = frames.wTc.copy(), frames.twist.copy()
-        self.posed: Flags = np.asarray(np.isfinite(self.wTc).all(axis=(1, 2)))
+        self.posed: Bools = np.asarray(np.isfinite(self.wTc).all(axis=(1, 2)))
         self.position = np.full((tracks.count, 3), np.nan)
         self.landmark = np.full(tracks.count, -1, np.int64)
         camera = map_.info.camera
@@ -75,7 +71,7 @@ class Structure:
 
     # What is seen of the map itself
 
-    def anchor(self, k: int, features: npt.NDArray[np.intp], shown: npt.NDArray[np.intp]) -> None:
+    def anchor(self, k: int, features: Indices, shown: Indices) -> None:
         """Takes features (N,) of a posed frame that are landmarks (N,)."""
         features, shown = features.astype(np.int64), shown.astype(np.int64)
         self._anchors.append((np.full(len(features), k, np.int64), features, shown))
@@ -298,7 +294,7 @@ class Structure:
             self.twist[rows[lost[rows]]] = np.nan_to_num(twist[lost[rows]])
 
 
-def weak_points(model: Model, new: Flags, settings: MappingSettings) -> Flags:
+def weak_points(model: Model, new: Bools, settings: MappingSettings) -> Bools:
     """Which points (M,) of a model no image sees, or are new and too little is known of them."""
     few = np.bincount(model.point, minlength=len(model.point_id))
     weak = (few < settings.extend.min_track) | (

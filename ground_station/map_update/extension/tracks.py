@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from ground_station.arrays import I32, I64, Indices
 from ground_station.map.store import MapInfo
 from ground_station.map_update.extension.frames import Frames
 from ground_station.mapping.construction.matching import mutual_matches, verify
@@ -18,8 +18,6 @@ from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 
-I32 = npt.NDArray[np.int32]
-I64 = npt.NDArray[np.int64]
 Pair = tuple[int, int]
 
 _SHARED = 30
@@ -40,7 +38,7 @@ class Tracks:
 
 
 def pairs_to_match(
-    frames: Frames, seen: Sequence[npt.NDArray[np.intp]], landmarks: int, settings: MappingSettings
+    frames: Frames, seen: Sequence[Indices], landmarks: int, settings: MappingSettings
 ) -> list[Pair]:
     """Frames (i, j), i < j, to compare: those that follow each other, and that share landmarks.
 

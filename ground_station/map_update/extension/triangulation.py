@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.map import landmarks
 from ground_station.map.model import Model
 from ground_station.mapping.sfm.models import without_observations
-
-F64 = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 _LEAST_CONDITION = 1e-6
 """Rays whose normal equations are worse conditioned are parallel."""
@@ -41,7 +38,7 @@ def nearest_to_rays(model: Model) -> F64:
     return position
 
 
-def triangulate(model: Model, gate_px: float, min_angle_deg: float) -> tuple[Model, Flags]:
+def triangulate(model: Model, gate_px: float, min_angle_deg: float) -> tuple[Model, Bools]:
     """The model with positions from its observations, and which points (M,) are well determined.
 
     Twice, the second time without the observations that miss the first positions by more than
@@ -56,6 +53,6 @@ def triangulate(model: Model, gate_px: float, min_angle_deg: float) -> tuple[Mod
     return result, np.asarray(good & np.isfinite(result.position).all(axis=1))
 
 
-def _agreeing(model: Model, gate_px: float) -> Flags:
+def _agreeing(model: Model, gate_px: float) -> Bools:
     residual = np.linalg.norm(landmarks.residuals_px(model), axis=1)
     return np.asarray(residual <= gate_px)  # NaN is not

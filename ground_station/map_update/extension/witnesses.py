@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import Bools
 from ground_station.map.model import Model
 from ground_station.map.store import Map
 from ground_station.mapping.sfm.models import without_points
-
-Flags = npt.NDArray[np.bool_]
 
 
 class Witnesses:
@@ -26,7 +24,7 @@ class Witnesses:
         self._pixel = np.full((len(map_.landmarks), 2), np.nan)
         self._pixel[landmark] = camera.undistort_to_pinhole(kf.pixel_px[row])
 
-    def beside(self, model: Model) -> tuple[Model, Flags]:
+    def beside(self, model: Model) -> tuple[Model, Bools]:
         """The model with keyframes that saw what it has one observation of, and which images are
         those.
 

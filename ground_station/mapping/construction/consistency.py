@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
+from ground_station.arrays import F64, I64, Bools
 
 _SLACK_DEPTHS = 0.05
 """A step that is always plausible, in depths of the scene: a hovering camera has no usual speed."""
@@ -14,9 +12,7 @@ _GAP_STEPS = 20.0
 """A pause so many usual steps long says nothing about where the camera went meanwhile."""
 
 
-def plausible_frames(
-    time_ns: I64, position: F64, depth: float, max_jump: float
-) -> npt.NDArray[np.bool_]:
+def plausible_frames(time_ns: I64, position: F64, depth: float, max_jump: float) -> Bools:
     """Which frames belong to the largest set in which every step is plausible, (K,).
 
     `time_ns` (K,) in the order of the input, `position` (K, 3) and `depth`, the median distance of
@@ -42,7 +38,7 @@ def plausible_frames(
     return keep
 
 
-def _longest_chain(time_s: F64, position: F64, speed: float, slack: float) -> npt.NDArray[np.bool_]:
+def _longest_chain(time_s: F64, position: F64, speed: float, slack: float) -> Bools:
     """The most frames, in order, with every step at most speed · Δt + slack; by dynamic program."""
     n = len(time_s)
     length, before = np.ones(n, dtype=int), np.full(n, -1)

@@ -15,9 +15,8 @@ from importlib.metadata import version
 from typing import Any, Protocol
 
 import cv2
-import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, U8
 from ground_station.features.extractor import Extractor
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.settings import MappingSettings
@@ -33,12 +32,12 @@ class KeyPoints(Protocol):
         ...
 
     @property
-    def time_ns(self) -> npt.NDArray[np.int64]:
+    def time_ns(self) -> I64:
         """(n,)."""
         ...
 
     @property
-    def pinhole_px(self) -> Sequence[npt.NDArray[np.float64]]:
+    def pinhole_px(self) -> Sequence[F64]:
         """(N, 2) of each."""
         ...
 
@@ -67,7 +66,7 @@ def extraction(extractor: Extractor, settings: MappingSettings) -> bytes:
     return _line(document)
 
 
-def features_key(image: npt.NDArray[np.uint8], how: bytes) -> bytes:
+def features_key(image: U8, how: bytes) -> bytes:
     """The hash, 32 bytes, of the features of an image (H, W) that come of `extraction`."""
     size = b"x".join(str(length).encode() for length in image.shape)
     return hashlib.sha256(_FEATURES + how + size + b"\n" + image.tobytes()).digest()

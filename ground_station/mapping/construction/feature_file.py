@@ -15,11 +15,10 @@ from typing import Any, TypeVar, overload
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F32, F64
 from ground_station.features.extractor import Features
 
 Out = TypeVar("Out")
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
 Side = tuple[F32, F64]
 """What a comparison needs of an image: descriptors (N, D) and undistorted pixels (N, 2)."""
 

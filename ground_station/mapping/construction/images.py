@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, U8
 from ground_station.errors import InputError, MapError
 from ground_station.features import extractors
 from ground_station.features.extractor import Extractor, Features
@@ -23,9 +23,6 @@ from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _LOCAL = threading.local()
 
@@ -81,7 +78,7 @@ def extract(
             kept.put(k, features)
         progress.step()
 
-    def missing() -> Iterator[tuple[MappingSettings, npt.NDArray[np.uint8]]]:
+    def missing() -> Iterator[tuple[MappingSettings, U8]]:
         for frame in frames:
             _check_size(frame, camera)
             names.append(frame.name)
@@ -118,7 +115,7 @@ def extract(
     )
 
 
-def extract_features(settings: MappingSettings, image: npt.NDArray[np.uint8]) -> Features:
+def extract_features(settings: MappingSettings, image: U8) -> Features:
     """The features of a grey image (H, W), by an extractor that each thread has for itself."""
     if getattr(_LOCAL, "settings", None) != settings:
         _LOCAL.extractor, _LOCAL.settings = extractor_of(settings), settings

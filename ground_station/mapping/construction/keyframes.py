@@ -11,18 +11,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.resizing import misfit
 from ground_station.mapping.construction.motion import Figures, Motion
 from ground_station.mapping.settings import KeyframeSettings
 from ground_station.recording.frames import Frame
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _NEAR = 0.25
 """A frame is near a due moment within this share of the way to the next."""
@@ -148,7 +144,7 @@ def _spaced(figures: Figures, sharp: F64, spacing: float, min_sharpness: float) 
     return rows, int((~np.array(good)[keep]).sum())
 
 
-def _needed(figures: Figures, rows: I64, good: Bool) -> Bool:
+def _needed(figures: Figures, rows: I64, good: Bools) -> Bools:
     """Which of the chosen rows (K,) stay: the sharp ones, and of the others those that link."""
     if not good.any():
         return np.ones(len(rows), dtype=bool)  # a whole input without a sharp frame

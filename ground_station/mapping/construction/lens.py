@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
@@ -29,8 +29,6 @@ from ground_station.mapping.construction.lens_adjustment import (
 from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.noise import matched_neighbours
 from ground_station.mapping.settings import MappingSettings
-
-F64 = npt.NDArray[np.float64]
 
 _MODEL = "opencv5"
 ROUNDS = 5

@@ -11,17 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array, vstack
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
 from ground_station.mapping.sfm.models import without_images, without_points
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 PARAMETERS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 """The order of a lens as a vector."""

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, I32
 from ground_station.mapping.sfm.two_view import TwoView
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I32 = npt.NDArray[np.int32]
 
 _MIN_SAMPLE = 8
 """Fewer matches than this support any essential matrix."""

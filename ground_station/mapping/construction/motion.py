@@ -13,16 +13,10 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, I64, U8, Bools
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.settings import KeyframeSettings
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
-Image = npt.NDArray[np.uint8]
 
 _WIDTH_PX = 320
 _TILES = 3, 4
@@ -74,7 +68,7 @@ class Figures:
     motion: F64
     sharpness: F64
     segment: I64
-    followed: Bool
+    followed: Bools
 
     def __len__(self) -> int:
         return len(self.index)
@@ -96,7 +90,7 @@ class _Row:
 class _Small:
     """A frame's small picture and its row."""
 
-    image: Image
+    image: U8
     row: _Row
 
 
@@ -117,7 +111,7 @@ class Motion:
         self._start = self._guess = _NOTHING
         self._bearings = np.empty((0, 3))
 
-    def add(self, index: int, time_ns: int, image: Image) -> None:
+    def add(self, index: int, time_ns: int, image: U8) -> None:
         """The next frame, a grey picture (H, W) of the camera's size."""
         small = shrink(image)
         row = _Row(index, time_ns, sharpness(small), self._top, self._segment)
@@ -207,7 +201,7 @@ class Motion:
         lost = 0.0 if blurred else 1 - count / len(ok)
         return float(max(parallax / s.parallax_deg, turn / s.turn_deg, lost / s.lost))
 
-    def _to_bearings(self, small_px: F32, image: Image) -> F64:
+    def _to_bearings(self, small_px: F32, image: U8) -> F64:
         """Unit vectors (N, 3) of pixels of a small picture (N, 2)."""
         height, width = image.shape
         scale = np.array([self._camera.width_px / width, self._camera.height_px / height])
@@ -215,7 +209,7 @@ class Motion:
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def shrink(image: Image) -> Image:
+def shrink(image: U8) -> U8:
     """A grey picture (H, W), at most 320 px wide."""
     height, width = image.shape
     if width <= _WIDTH_PX:
@@ -224,7 +218,7 @@ def shrink(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def sharpness(image: Image) -> float:
+def sharpness(image: U8) -> float:
     """The RMS gradient of a grey picture (H, W) over the deviation of its grey levels.
 
     Free of brightness and exposure, but not of what is seen: it compares frames of one scene.
@@ -238,7 +232,7 @@ def sharpness(image: Image) -> float:
     return float(np.sqrt(float(x @ x + y @ y) / (len(x) * variance)))
 
 
-def corners(image: Image) -> F32:
+def corners(image: U8) -> F32:
     """Corners (N, 2) that can be followed, from all over the picture (Shi, Tomasi, CVPR 1994)."""
     height, width = image.shape
     rows, columns = (
@@ -261,10 +255,10 @@ def corners(image: Image) -> F32:
     return np.asarray(at[variance[row, column] >= _LEAST_CONTRAST**2])
 
 
-def follow(before: Image, after: Image, start: F32, guess: F32) -> tuple[F32, Bool]:
+def follow(before: U8, after: U8, start: F32, guess: F32) -> tuple[F32, Bools]:
     """Where a picture's pixels (N, 2) are in another, from a guess, and which were found (N,)."""
 
-    def flow(one: Image, other: Image, points: F32, near: F32, levels: int) -> tuple[F32, Bool]:
+    def flow(one: U8, other: U8, points: F32, near: F32, levels: int) -> tuple[F32, Bools]:
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             one,
             other,

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.special import gammaln
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.epipolar import sampson_px
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import mutual_matches
-
-F64 = npt.NDArray[np.float64]
 
 _PAIRS, _GAPS = 48, (1, 2, 4)
 """Compared pairs of images at most, and how far apart they stand."""

@@ -7,14 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 from scipy.sparse import csr_array
 
+from ground_station.arrays import F32, I64
 from ground_station.mapping.settings import MatchSettings
 
-F32 = npt.NDArray[np.float32]
-I64 = npt.NDArray[np.int64]
 Pair = tuple[int, int]
 
 _WORDS = 64

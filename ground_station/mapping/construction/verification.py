@@ -8,9 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
@@ -24,8 +22,6 @@ from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
 Pair = tuple[int, int]
 
 
@@ -147,7 +143,7 @@ class _Comparison:
         sides: Sequence[Any],
         camera: Camera,
         settings: MappingSettings,
-        sequence: npt.NDArray[np.int64],
+        sequence: I64,
         cache: Cache | None,
         workers: Workers,
     ) -> None:

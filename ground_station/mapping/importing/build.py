@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ground_station.errors import InputError, MapError
 from ground_station.geometry.camera import Camera
@@ -28,7 +27,6 @@ from ground_station.mapping.sfm.foreign import ForeignModel
 from ground_station.mapping.sfm.triangulation import adjust_points, triangulate
 from ground_station.recording.frames import Frame
 
-F64 = npt.NDArray[np.float64]
 _NAMED = 5
 
 

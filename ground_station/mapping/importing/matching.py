@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.epipolar import essential, sampson_px
@@ -18,8 +19,6 @@ from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
-
-F64 = npt.NDArray[np.float64]
 
 _ROWS = 256
 

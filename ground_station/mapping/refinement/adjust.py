@@ -19,8 +19,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map import landmarks
@@ -28,9 +28,6 @@ from ground_station.map.store import Map
 from ground_station.mapping.refinement import graph as graphs
 from ground_station.mapping.refinement.graph import Graph
 from ground_station.mapping.settings import MappingSettings
-
-F64 = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 _DATUM_ROUNDS = 20
 """Of the datum's reweighting."""
@@ -88,7 +85,7 @@ def _gate_px(graph: Graph, max_error_px: float) -> F64:
     return np.asarray(gate[graph.group_of_observations()])
 
 
-def _observations(graph: Graph) -> npt.NDArray[np.int64]:
+def _observations(graph: Graph) -> I64:
     return np.bincount(graph.model.image, minlength=len(graph.group))
 
 
@@ -102,7 +99,7 @@ def _weighted(graph: Graph, correlation: float) -> Graph:
     return replace(graph, sigma_px=np.where(np.isfinite(sigma), sigma, 1.0))
 
 
-def _weak(graph: Graph, settings: MappingSettings) -> Flags:
+def _weak(graph: Graph, settings: MappingSettings) -> Bools:
     """Points (M,) that the build would not have kept."""
     model, sfm = graph.model, settings.sfm
     few = np.bincount(model.point, minlength=len(model.position)) < sfm.min_track

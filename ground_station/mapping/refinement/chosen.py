@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.geometry import poses
 from ground_station.map.observations import FlightObservations
 from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import RefineSettings
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _SAME_RAY_PX = 0.1
 """An observation that another camera's lens sees and the map's cannot express is left out."""
@@ -54,7 +51,7 @@ class _Observed:
     landmark: I64
     points_c: F64
     pixel_px: F64
-    usable: npt.NDArray[np.bool_]
+    usable: Bools
 
 
 def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings) -> Chosen:

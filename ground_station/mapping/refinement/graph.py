@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, landmarks
 from ground_station.map.model import Model
@@ -15,10 +15,6 @@ from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.refinement.chosen import Chosen
 from ground_station.mapping.sfm import adjustment, models
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 _ROUND_STEPS, _MOST_ROUNDS = 10, 10
 """Steps of the adjustment between two signs of life, and how often."""
@@ -109,17 +105,17 @@ def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
     return pixel, int(np.isfinite(twist).all(axis=1).sum())
 
 
-def drop(graph: Graph, bad: Flags) -> Graph:
+def drop(graph: Graph, bad: Bools) -> Graph:
     """The graph without some observations (O,)."""
     return replace(graph, model=models.without_observations(graph.model, bad))
 
 
-def drop_points(graph: Graph, bad: Flags) -> Graph:
+def drop_points(graph: Graph, bad: Bools) -> Graph:
     """The graph without some points (M,) and their observations."""
     return replace(graph, model=models.without_points(graph.model, bad))
 
 
-def drop_images(graph: Graph, bad: Flags) -> Graph:
+def drop_images(graph: Graph, bad: Bools) -> Graph:
     """The graph without some images (K,) and their observations."""
     model = models.without_images(graph.model, bad)
     return replace(graph, group=graph.group[~bad], time_ns=graph.time_ns[~bad], model=model)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F32, F64, Bools
 from ground_station.errors import MapError
 from ground_station.map import colmap, landmarks, store
 from ground_station.map.descriptors import Descriptors
@@ -24,8 +24,6 @@ from ground_station.mapping.refinement.chosen import Chosen, choose_frames, thin
 from ground_station.mapping.refinement.graph import Graph
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
-
-F64 = npt.NDArray[np.float64]
 
 _MOST_WORSE = 1.02
 """A larger deviation of the observations without the readout's shift says that there was none."""
@@ -270,9 +268,7 @@ def _flight_report(flight: Chosen, start: Graph, graph: Graph, group: int) -> di
     }
 
 
-def _those(
-    descriptor: npt.NDArray[np.float32] | Descriptors, kept: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.float32] | Descriptors:
+def _those(descriptor: F32 | Descriptors, kept: Bools) -> F32 | Descriptors:
     """The descriptors of the landmarks that stay, as they lie: codes stay codes."""
     if isinstance(descriptor, Descriptors):
         return descriptor if kept.all() else descriptor.rows(np.flatnonzero(kept))

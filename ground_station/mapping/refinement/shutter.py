@@ -11,11 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 
 def row_times_s(v_px: npt.ArrayLike, camera: Camera) -> F64:

@@ -11,17 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.uncertainty import Uncertainty, jacobian
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 _ITERATIONS = 100
 _CONVERGED = 1e-10

@@ -13,18 +13,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import GeometryError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.pose_similarity import Offset, Positions
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 MOST_SCATTER = 0.1
 """Scatter of positions over the spread of their path, each along one axis."""

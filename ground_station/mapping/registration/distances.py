@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.store import Map
@@ -21,8 +21,6 @@ from ground_station.mapping.registration.observations import (
 )
 from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.rows import numbers, read_rows, word
-
-F64 = npt.NDArray[np.float64]
 
 COLUMNS = ("distance", "end", "image", "u_px", "v_px", "length_m")
 _SIGMA_M = 0.01

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.camera import Camera
@@ -31,9 +31,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
     robust_similarity,
 )
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 
 def by_observations(map_: Map, observations: PointObservations, seed: int) -> Registration:

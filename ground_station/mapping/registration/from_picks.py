@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.store import Landmarks
@@ -29,9 +29,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
 )
 from ground_station.mapping.registration.upright import upright_rotation
-
-F64 = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _PAIRS = 2000
 _CLICK_PX = 2.0

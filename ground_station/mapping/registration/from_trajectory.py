@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
@@ -30,10 +30,6 @@ from ground_station.mapping.registration.similarity import (
     check_spread,
     robust_similarity,
 )
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 _MAX_DIFF_NS = 10_000_000
 """A trajectory's pose counts for a keyframe within 10 ms, as in the evaluation."""

@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.registration.rows import numbers, read_rows, word
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 COLUMNS = ("point", "image", "u_px", "v_px", "x_m", "y_m", "z_m")
 _SAME_POINT_M = 1e-6

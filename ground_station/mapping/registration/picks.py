@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import tomli_w
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import GeometryError, MapError
 from ground_station.files import write_text
 from ground_station.geometry.alignment import align
@@ -19,9 +19,6 @@ from ground_station.mapping.registration.plan import PlanScale
 from ground_station.mapping.registration.similarity import MIN_POINTS, check_spread
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 FILE = "PICKS.toml"
 DRAFT = "PICKS.draft.toml"

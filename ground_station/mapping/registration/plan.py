@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.errors import MapError
-
-F64 = npt.NDArray[np.float64]
 
 _LEAST_M, _MOST_M = 1e-4, 10.0
 _LEAST_APART_PX = 5.0
@@ -63,7 +62,7 @@ class Plan:
     """`image` (H, W) uint8 of a floor plan; `scale` is None until somebody says it."""
 
     name: str
-    image: npt.NDArray[np.uint8]
+    image: U8
     scale: PlanScale | None
 
     @property

@@ -11,15 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.mapping.registration.similarity import GATE_DEVIATION, MIN_POINTS
-
-F64 = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _CANDIDATES = 2000
 _ITERATIONS = 100

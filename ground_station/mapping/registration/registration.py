@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.similarity import MIN_POINTS
-
-F64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

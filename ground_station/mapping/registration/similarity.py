@@ -5,13 +5,10 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment, align, similarities
-
-F64 = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 MIN_POINTS = 3
 MIN_WIDTH = 0.01

@@ -11,8 +11,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map
@@ -23,9 +23,6 @@ from ground_station.mapping.registration.observations import (
 from ground_station.recording.frames import Frame
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
-
-F64 = npt.NDArray[np.float64]
-U8 = npt.NDArray[np.uint8]
 
 FAMILIES = {
     "16h5": cv2.aruco.DICT_APRILTAG_16h5,

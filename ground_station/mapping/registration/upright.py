@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, I64
 from ground_station.map.store import Map
 from ground_station.mapping.registration.adjustment import Upright
-
-F64 = npt.NDArray[np.float64]
 
 SOURCES = ("levels", "cameras", "map")
 """Horizontal structure of the landmarks; the cameras' horizontal axes; the map's own z axis."""
@@ -200,9 +198,7 @@ def _crowding(heights: F64, width: float) -> float:
     return float(np.sum((half[:-1] + half[1:]).astype(np.float64) ** 2))
 
 
-def _level(
-    counts: npt.NDArray[np.int64], start: float, step: float, low: float, high: float
-) -> float:
+def _level(counts: I64, start: float, step: float, low: float, high: float) -> float:
     """The height with most landmarks between two heights, of a histogram smoothed by two steps."""
     smooth = np.convolve(counts, [0.5, 1.0, 0.5], mode="same")
     middle = start + (np.arange(len(counts)) + 0.5) * step

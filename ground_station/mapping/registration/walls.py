@@ -16,10 +16,10 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from ground_station.arrays import F64, U8, Bools
 from ground_station.errors import MapError
 from ground_station.mapping.registration.plan import Plan
 
-F64 = npt.NDArray[np.float64]
 C128 = npt.NDArray[np.complex128]
 
 _OCCUPIED = 0.35 * 255
@@ -60,7 +60,7 @@ class WallFit:
     residual_m: float
     start_residual_m: float
     on_walls: float
-    on: npt.NDArray[np.bool_]
+    on: Bools
     offset_px: C128
     ambiguous: str
 
@@ -68,7 +68,7 @@ class WallFit:
 class _Field:
     """Signed distances, pixels, to the edges of what a plan draws, negative inside, and slopes."""
 
-    def __init__(self, image: npt.NDArray[np.uint8], cameras: C128) -> None:
+    def __init__(self, image: U8, cameras: C128) -> None:
         occupied = (image < _OCCUPIED).astype(np.uint8)
         if not occupied.any() or occupied.all():
             raise MapError("the plan draws nothing in black: there are no walls to fit to")
@@ -216,7 +216,7 @@ def _jacobian(field: _Field, w: C128, unit: C128) -> F64:
 def _ambiguous(
     field: _Field,
     z: C128,
-    on: npt.NDArray[np.bool_],
+    on: Bools,
     found: list[tuple[complex, complex]],
     residual_px: float,
     metres: float,

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.colmap import pycolmap
 from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
-
-F64 = npt.NDArray[np.float64]
 
 
 def write_database(

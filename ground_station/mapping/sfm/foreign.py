@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
@@ -23,8 +24,6 @@ from ground_station.map.colmap_files import NO_POINT, CameraEntry, ImageEntry
 from ground_station.mapping.sfm import colmap_text
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
-
-F64 = npt.NDArray[np.float64]
 
 _ORDER = {
     "SIMPLE_PINHOLE": "f cx cy",

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from ground_station.arrays import F64, Bools
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.model import Model
 from ground_station.mapping.sfm import adjustment
 
-F64 = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-
 
 def adjust_among_fixed(
     model: Model,
-    fixed_points: Flags,
-    fixed_images: Flags,
+    fixed_points: Bools,
+    fixed_images: Bools,
     camera: Camera,
     *,
     loss_px: float,

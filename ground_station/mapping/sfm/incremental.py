@@ -18,13 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from ground_station.arrays import F64
 from ground_station.map import colmap
 from ground_station.mapping.sfm.snapshots import Snapshots
-
-F64 = npt.NDArray[np.float64]
 
 _BATCH = 10
 """A batch has at least so many new images: to begin one takes a pass over all key points."""

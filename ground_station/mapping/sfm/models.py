@@ -5,21 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import Bools
 from ground_station.map.model import Model
 
-Flags = npt.NDArray[np.bool_]
 
-
-def without_observations(model: Model, bad: Flags) -> Model:
+def without_observations(model: Model, bad: Bools) -> Model:
     """The model without some observations (O,)."""
     keep = ~bad
     rows = {name: getattr(model, name)[keep] for name in ("image", "feature", "point", "pixel_px")}
     return replace(model, **rows)
 
 
-def without_points(model: Model, bad: Flags) -> Model:
+def without_points(model: Model, bad: Bools) -> Model:
     """The model without some points (M,) and their observations."""
     model, kept = without_observations(model, bad[model.point]), ~bad
     new = np.cumsum(kept) - 1
@@ -31,7 +29,7 @@ def without_points(model: Model, bad: Flags) -> Model:
     )
 
 
-def without_images(model: Model, bad: Flags) -> Model:
+def without_images(model: Model, bad: Bools) -> Model:
     """The model without some images (K,) and their observations."""
     model, kept = without_observations(model, bad[model.image]), ~bad
     new = np.cumsum(kept) - 1

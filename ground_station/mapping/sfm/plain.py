@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
-
-F64 = npt.NDArray[np.float64]
 
 MAX_FEATURES = 2000
 """Of an image: about what a build of ours takes, too."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.colmap import pycolmap
-
-F64 = npt.NDArray[np.float64]
 
 
 def similarity(source: F64, target: F64, error: float, seed: int) -> Alignment | None:

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.map import colmap
 from ground_station.map.colmap import pycolmap
 from ground_station.mapping.sfm import adjustment
-
-F64 = npt.NDArray[np.float64]
-
 
 _ITERATIONS = 100
 """At most, of an adjustment of the points alone."""

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
-F64 = npt.NDArray[np.float64]
-I32 = npt.NDArray[np.int32]
+from ground_station.arrays import F64, I32
 
 
 @dataclass(frozen=True)

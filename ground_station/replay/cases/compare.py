@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import InputError
 from ground_station.evaluation.figures import AT_LEAST
 from ground_station.geometry import poses
@@ -22,8 +22,6 @@ from ground_station.replay.cases.judge import BOUNDS
 from ground_station.replay.cases.measure import Errors, Figure
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -90,9 +88,9 @@ class Comparison:
     a: Outcome
     b: Outcome
     pairs: same.Pairs
-    time_ns: npt.NDArray[np.int64]
-    position_m: Array
-    rotation_deg: Array
+    time_ns: I64
+    position_m: F64
+    rotation_deg: F64
     first: same.Difference
     errors_a: Errors | None
     errors_b: Errors | None
@@ -189,7 +187,7 @@ def _figures(outcome: Outcome, truth: Trajectory | None) -> dict[str, Figure]:
     return measure.figures(outcome, None if truth is None else Reference(truth, "the truth"))
 
 
-def _apart(a: Outcome, b: Outcome, both: same.Pairs) -> tuple[Array, Array]:
+def _apart(a: Outcome, b: Outcome, both: same.Pairs) -> tuple[F64, F64]:
     """How far the poses of each pair are apart: metres (M,) and degrees (M,)."""
     apart_m = np.linalg.norm(a.frames.position_m[both.a] - b.frames.position_m[both.b], axis=1)
     apart_deg = np.full(len(both.a), np.nan)
@@ -230,7 +228,7 @@ def _measured(a: dict[str, Figure], b: dict[str, Figure], allowed: Allowed) -> l
 
 
 def _differences(
-    position: Array, rotation: Array, allowed: Allowed, *, truth_known: bool
+    position: F64, rotation: F64, allowed: Allowed, *, truth_known: bool
 ) -> list[Line]:
     """The poses of both runs against each other; judged where no truth says which is right."""
     found = []

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools, Indices
 from ground_station.errors import InputError
 from ground_station.files import write_text
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from pi_firmware.wire.text import printable
-
-Array = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 UNKNOWN = -1
 """A time that is not known, as of a capture by a clock that never answered."""
@@ -45,45 +43,45 @@ class Frames:
     memory: equal digests, equal bits.
     """
 
-    sequence: Times
-    time_ns: Times
-    captured_ns: Times
-    arrival_ns: Times
-    done_ns: Times
+    sequence: I64
+    time_ns: I64
+    captured_ns: I64
+    arrival_ns: I64
+    done_ns: I64
     state: tuple[str, ...]
     reason: tuple[str, ...]
-    relocalized: npt.NDArray[np.bool_]
-    position_m: Array
-    quaternion_xyzw: Array
+    relocalized: Bools
+    position_m: F64
+    quaternion_xyzw: F64
     digest: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.sequence)
 
     @property
-    def localized(self) -> npt.NDArray[np.bool_]:
+    def localized(self) -> Bools:
         """(N,), which have a pose, finite or not."""
         return np.array([digest != "" for digest in self.digest], dtype=bool)
 
     @property
-    def finite(self) -> npt.NDArray[np.bool_]:
+    def finite(self) -> Bools:
         """(N,), which have a pose that can be one: finite, on this Earth, of a unit quaternion."""
         with np.errstate(over="ignore", invalid="ignore"):  # a comparison with NaN is False
             near = (np.abs(self.position_m) <= _FARTHEST_M).all(axis=1)
             unit = np.abs(np.linalg.norm(self.quaternion_xyzw, axis=1) - 1.0) <= 1e-3
         return np.asarray(self.localized & near & unit)
 
-    def called(self, state: str) -> npt.NDArray[np.bool_]:
+    def called(self, state: str) -> Bools:
         """(N,), which have this state."""
         return np.array([name == state for name in self.state], dtype=bool)
 
     @property
-    def latency_ms(self) -> Array:
+    def latency_ms(self) -> F64:
         """(N,), capture to pose; NaN where the time of capture is not known."""
         took = (self.done_ns - self.captured_ns) / 1e6
         return np.where(self.captured_ns == UNKNOWN, np.nan, took)
 
-    def ordered(self) -> npt.NDArray[np.intp]:
+    def ordered(self) -> Indices:
         """The indices of the finite poses by capture time."""
         found = np.flatnonzero(self.finite)
         return found[np.argsort(self.time_ns[found], kind="stable")]
@@ -106,7 +104,7 @@ class FrameRow:
     state: str
     reason: str = ""
     relocalized: bool = False
-    wTc: Array | None = None
+    wTc: F64 | None = None
 
 
 def table(rows: Sequence[FrameRow]) -> Frames:

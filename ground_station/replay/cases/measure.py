@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Indices
 from ground_station.evaluation import ate
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.replay.cases.frames import UNKNOWN
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -32,9 +30,9 @@ class Errors:
     `frame` (P,) are indices into the outcome's frames; `position_m` and `rotation_deg` are (P,).
     """
 
-    frame: npt.NDArray[np.intp]
-    position_m: Array
-    rotation_deg: Array
+    frame: Indices
+    position_m: F64
+    rotation_deg: F64
 
     def __len__(self) -> int:
         return len(self.frame)

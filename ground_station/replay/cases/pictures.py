@@ -10,18 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from ground_station.arrays import F64
 from ground_station.evaluation import plots
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import LIGHT, Theme, sheet, themed
-
-Array = npt.NDArray[np.float64]
 
 WIDTH_IN = 6.6
 """Narrow, so that what is written in a picture can be read on a narrow screen."""
@@ -40,8 +38,8 @@ class Series:
     """Values over time of one run: `time_s` and `values`, (N,) each; `style` 0 is A's, 1 is B's."""
 
     label: str
-    time_s: Array
-    values: Array
+    time_s: F64
+    values: F64
     style: int = 0
 
 
@@ -50,17 +48,17 @@ class Strip:
     """The states of a run over time: `time_s` (N,), `states` N names."""
 
     label: str
-    time_s: Array
+    time_s: F64
     states: Sequence[str]
 
 
 def path(
-    points_m: Array,
-    off_m: Array,
+    points_m: F64,
+    off_m: F64,
     *,
     under: Sequence[tuple[str, Trajectory]] = (),
-    lost_m: Array | None = None,
-    first_m: Array | None = None,
+    lost_m: F64 | None = None,
+    first_m: F64 | None = None,
     floorplan: FloorPlan | None = None,
     label: str = "off, cm",
     theme: Theme = LIGHT,
@@ -102,7 +100,7 @@ def path(
     return figure
 
 
-def _zoom(axes: Axes, paths_m: Sequence[Array]) -> None:
+def _zoom(axes: Axes, paths_m: Sequence[F64]) -> None:
     """To the paths with some of the plan around them: in a large hall a short one is a speck."""
     every = np.vstack([path[:, :2] for path in paths_m])
     every = every[np.isfinite(every).all(axis=1)]
@@ -150,7 +148,7 @@ def over_time(
 
 
 def distributions(
-    panels: Sequence[tuple[str, Sequence[tuple[str, Array]]]], theme: Theme = LIGHT
+    panels: Sequence[tuple[str, Sequence[tuple[str, F64]]]], theme: Theme = LIGHT
 ) -> Figure:
     """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
     figure = sheet((WIDTH_IN, 2.9), theme)

@@ -6,11 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import Bools, Indices
 from ground_station.replay.cases.frames import Frames
-
-Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ def _keys(frames: Frames) -> list[tuple[int, int]]:
     return keys
 
 
-def differing(a: Frames, b: Frames, both: Pairs) -> npt.NDArray[np.bool_]:
+def differing(a: Frames, b: Frames, both: Pairs) -> Bools:
     """(M,), which pairs differ in a bit of the pose, or in the state."""
     return np.array(
         [

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage
-
-Array = npt.NDArray[np.float64]
 
 MAP = "map"
 OPTICAL_IN_CAMERA = poses.pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
@@ -26,8 +25,8 @@ _LEAST_M = 1e-3
 class Solved:
     """A pose as it goes out: `wTc` (4, 4) of the body axes; `covariance` (6, 6) in ROS's order."""
 
-    wTc: Array
-    covariance: Array | None
+    wTc: F64
+    covariance: F64 | None
 
     @property
     def position_m(self) -> list[float]:
@@ -68,12 +67,12 @@ def optical_frame(payload_id: str) -> str:
     return f"{payload_id}/camera_optical"
 
 
-def body_pose(wTo: npt.ArrayLike) -> Array:
+def body_pose(wTo: npt.ArrayLike) -> F64:
     """The pose (4, 4) of a camera's body axes from that of its optical axes (4, 4)."""
     return np.asarray(wTo) @ poses.inverse(OPTICAL_IN_CAMERA)
 
 
-def ros_covariance(wTc: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
+def ros_covariance(wTc: npt.ArrayLike, covariance: npt.ArrayLike) -> F64:
     """A covariance (6, 6) in the order and axes of `geometry_msgs/PoseWithCovariance`.
 
     In: of the right tangent ξ = (ω, v) of wTc (4, 4), wTc·exp(ξ), rad and metres, camera axes. Out:
@@ -90,7 +89,7 @@ def ros_covariance(wTc: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
     return np.asarray((turned + turned.T) / 2)
 
 
-def ellipsoid(covariance: npt.ArrayLike) -> tuple[Array, Array]:
+def ellipsoid(covariance: npt.ArrayLike) -> tuple[F64, F64]:
     """The 95 % ellipsoid of a position's covariance (3, 3), m².
 
     Returns its diameters (3,), metres, and the quaternion x, y, z, w (4,) of its axes.

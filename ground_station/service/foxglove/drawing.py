@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from foxglove.messages import (
     ArrowPrimitive,
     CameraCalibration,
@@ -35,6 +34,7 @@ from foxglove.messages import (
     Vector3,
 )
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.estimate import State
@@ -225,12 +225,12 @@ def _pose(pose: Solved) -> Pose:
     return Pose(position=_vector(pose.position_m), orientation=_quaternion(pose.quaternion_xyzw))
 
 
-def _vector(values: Sequence[float] | npt.NDArray[np.float64]) -> Vector3:
+def _vector(values: Sequence[float] | F64) -> Vector3:
     x, y, z = (float(value) for value in values)
     return Vector3(x=x, y=y, z=z)
 
 
-def _quaternion(values: Sequence[float] | npt.NDArray[np.float64]) -> Quaternion:
+def _quaternion(values: Sequence[float] | F64) -> Quaternion:
     x, y, z, w = (float(value) for value in values)
     return Quaternion(x=x, y=y, z=z, w=w)
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from foxglove import Context
 from foxglove.channels import (
     CameraCalibrationChannel,
@@ -18,6 +16,7 @@ from foxglove.channels import (
     SceneUpdateChannel,
 )
 
+from ground_station.arrays import U8
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage, PayloadMessage
@@ -169,7 +168,7 @@ class Payload:
     def _line(self, time_ns: int) -> Any:
         return drawing.trail(*self._trail.document(), time_ns)
 
-    def _encoded(self, image: npt.NDArray[np.uint8], time_ns: int) -> Any:
+    def _encoded(self, image: U8, time_ns: int) -> Any:
         import cv2
 
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._quality]

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Indices
 from ground_station.geometry.poses import from_quaternion, to_quaternion
 from ground_station.localization.estimate import Counts, Observations, PoseEstimate, State
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage
-
-Array = npt.NDArray[np.float64]
 
 MOST_POINTS = 300
 STEEPEST_DEG = 85.0
@@ -27,7 +25,7 @@ class Accounts:
     skipped: int = 0
 
 
-def position_covariance(wTc: Array, covariance: Array) -> Array:
+def position_covariance(wTc: F64, covariance: F64) -> F64:
     """The position's covariance (3, 3) in world axes, m².
 
     `covariance` (6, 6) is of the right tangent of wTc (4, 4), rotation first: wTc·exp(ξ) moves the
@@ -38,7 +36,7 @@ def position_covariance(wTc: Array, covariance: Array) -> Array:
     return np.asarray((turned + turned.T) / 2)
 
 
-def world_velocity(wTc: Array, twist: Array | None) -> Array | None:
+def world_velocity(wTc: F64, twist: F64 | None) -> F64 | None:
     """The camera's velocity (3,) in world axes, m/s, from a twist (6,) in its own axes.
 
     None for a twist of exactly zero, which stands for one that is not estimated (yet).
@@ -48,7 +46,7 @@ def world_velocity(wTc: Array, twist: Array | None) -> Array | None:
     return np.asarray(wTc[:3, :3] @ twist[3:])
 
 
-def heading_deg(wTc: Array) -> float | None:
+def heading_deg(wTc: F64) -> float | None:
     """Where the camera looks on the floor, degrees from the map's x axis towards y, -180 to 180.
 
     It is the camera's z axis without its vertical part; None where the view is within 5° of the
@@ -61,7 +59,7 @@ def heading_deg(wTc: Array) -> float | None:
     return float(np.rad2deg(np.arctan2(y, x)))
 
 
-def shown(observations: Observations, most: int = MOST_POINTS) -> npt.NDArray[np.intp]:
+def shown(observations: Observations, most: int = MOST_POINTS) -> Indices:
     """Which observations are told: the inliers, at most `most`, evenly chosen in their order."""
     inliers = np.flatnonzero(observations.inlier)
     if len(inliers) > most:

@@ -14,9 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from ground_station.arrays import U8
 from ground_station.errors import GroundStationError, MapError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
@@ -121,9 +119,7 @@ class Localizing:
             localizer.set_initial_pose(self._start.at(note.time_ns), note.time_ns)
             self._start = None
 
-    def _localize(
-        self, localizer: Localizer, note: FrameMessage, image: npt.NDArray[np.uint8]
-    ) -> None:
+    def _localize(self, localizer: Localizer, note: FrameMessage, image: U8) -> None:
         estimate, reason = None, ""
         try:
             estimate = localizer.process(note.time_ns, image, note.sequence, note.exposure_s)

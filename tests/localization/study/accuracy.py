@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from study.feeding import Flight, Run, close, feed, make_localizer
 from study.metrics import (
     consistency,
@@ -23,6 +22,7 @@ from study.metrics import (
 from study.plain import PlainLocalizer
 from study.row import Line, Row, Study, seeds, start_from_truth, thesis, ungated
 
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.estimate import State
 from ground_station.map.store import Map
@@ -114,9 +114,7 @@ def demo(study: Study) -> Row:
     return Row(lines, {"default": ours, "plain": beside})
 
 
-def fly_plainly(
-    map_: Map, camera: Camera, frames: Sequence[Frame]
-) -> tuple[npt.NDArray[np.float64], list[float]]:
+def fly_plainly(map_: Map, camera: Camera, frames: Sequence[Frame]) -> tuple[F64, list[float]]:
     """Poses (N, 4, 4) by the plain loop, NaN where it finds none, and each frame's milliseconds."""
     plain = PlainLocalizer(map_, camera)
     found, took = [], []

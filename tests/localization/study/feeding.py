@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from study.metrics import pose_errors
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import PoseEstimate, State
@@ -26,8 +26,6 @@ from ground_station.recording.frames import Frame
 from ground_station.recording.open import open_input
 from pi_firmware.wire.recording import RecordingReader
 
-Array = npt.NDArray[np.float64]
-
 
 @dataclass
 class Flight:
@@ -39,7 +37,7 @@ class Flight:
     truth: Trajectory | None
     about: str
 
-    def true_wTc(self, frames: Sequence[Frame]) -> Array:
+    def true_wTc(self, frames: Sequence[Frame]) -> F64:
         """The true poses (N, 4, 4) of some of its frames."""
         assert self.truth is not None, f"{self.name} has no truth"
         return np.array([self.truth.at(f.time_ns) for f in frames]).reshape(-1, 4, 4)
@@ -81,25 +79,25 @@ class Run:
     dropped: int = 0
 
     @property
-    def time_ns(self) -> npt.NDArray[np.int64]:
+    def time_ns(self) -> I64:
         return np.array([f.time_ns for f in self.frames], np.int64)
 
-    def says(self, state: State) -> npt.NDArray[np.bool_]:
+    def says(self, state: State) -> Bools:
         """Which frames (N,) are in a state."""
         return np.array([e.state is state for e in self.estimates], bool)
 
     @property
-    def localized(self) -> npt.NDArray[np.bool_]:
+    def localized(self) -> Bools:
         return np.array([e.localized for e in self.estimates], bool)
 
     @property
-    def wTc(self) -> Array:
+    def wTc(self) -> F64:
         """Poses (N, 4, 4); NaN where a frame has none."""
         none = np.full((4, 4), np.nan)
         found = [none if e.wTc is None else e.wTc for e in self.estimates]
         return np.array(found, np.float64).reshape(-1, 4, 4)
 
-    def errors(self, true_wTc: Array) -> tuple[Array, Array]:
+    def errors(self, true_wTc: F64) -> tuple[F64, F64]:
         """Distances (N,), metres, and angles (N,), degrees; NaN where a frame has no pose."""
         return pose_errors(self.wTc, true_wTc)
 

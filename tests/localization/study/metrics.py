@@ -10,16 +10,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 NEAR_M, NEAR_DEG = 0.25, 2.0
 """A pose that a blimp can be steered by, this near to the truth."""
 
 
-def pose_errors(estimated: npt.ArrayLike, true: npt.ArrayLike) -> tuple[Array, Array]:
+def pose_errors(estimated: npt.ArrayLike, true: npt.ArrayLike) -> tuple[F64, F64]:
     """Distances (N,), metres, and angles (N,), degrees, between poses (N, 4, 4), unaligned.
 
     NaN where an estimate is NaN.
@@ -110,7 +108,7 @@ def percentile_of(values: Sequence[float], percent: float) -> float:
     return float(ordered[min(max(rank, 0), len(ordered) - 1)])
 
 
-def tangent_errors(estimated: npt.ArrayLike, true: npt.ArrayLike) -> Array:
+def tangent_errors(estimated: npt.ArrayLike, true: npt.ArrayLike) -> F64:
     """ξ (N, 6) of each pose, true = estimated·exp(ξ), rotation before translation."""
     a = np.asarray(estimated, np.float64).reshape(-1, 4, 4)
     b = np.asarray(true, np.float64).reshape(-1, 4, 4)
@@ -118,7 +116,7 @@ def tangent_errors(estimated: npt.ArrayLike, true: npt.ArrayLike) -> Array:
     return np.asarray(xi, np.float64).reshape(-1, 6)
 
 
-def nees(xi: npt.ArrayLike, covariance: npt.ArrayLike) -> Array:
+def nees(xi: npt.ArrayLike, covariance: npt.ArrayLike) -> F64:
     """ξᵀ·C⁻¹·ξ (N,) of errors (N, D) and covariances (N, D, D); infinite where C is no covariance.
 
     Bar-Shalom, Li and Kirubarajan, Estimation with Applications (2001), 5.4: its mean is D and it

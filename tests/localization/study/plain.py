@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, U8
 from ground_station.features.methods.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map
-
-Array = npt.NDArray[np.float64]
 
 _MAX_RATIO = 0.8
 _THRESHOLD_PX = 3.0
@@ -28,7 +26,7 @@ class PlainLocalizer:
         self._camera = camera
         self._extractor = RootSift(max_features)
 
-    def locate(self, image: npt.NDArray[np.uint8]) -> Array | None:
+    def locate(self, image: U8) -> F64 | None:
         """wTc (4, 4) of a grey frame (H, W), or None with fewer than 12 inliers.
 
         Ratio test of 0.8 and mutual nearest neighbours over all landmarks, P3P in locally optimised

@@ -13,15 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 
+from ground_station.arrays import I64, Bools
 from ground_station.mapping.construction.pairs import Pair
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 OVERLAP = 0.1
 """Of the largest part's images, how many a part takes from each part beside it."""
@@ -107,7 +104,7 @@ def _pieces(weight: csr_array, most: int) -> list[I64]:
     return sorted(done, key=lambda piece: int(piece[0]))
 
 
-def _halved(weight: csr_array, most: int) -> npt.NDArray[np.bool_]:
+def _halved(weight: csr_array, most: int) -> Bools:
     """Which images (n,) are on one side of the best cut of a connected graph."""
     n = weight.shape[0]
     degree = np.asarray(weight.sum(axis=1), np.float64)

@@ -13,16 +13,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.mapping.construction.parts.solving import Solved
 from ground_station.mapping.construction.placing import merging
 from ground_station.mapping.construction.placing.placed import Placed
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _FEWEST = 3
 """Common images; with fewer, two parts are not joined."""

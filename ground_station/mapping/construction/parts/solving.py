@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station import progress
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
@@ -22,9 +23,6 @@ from ground_station.mapping.construction.structure import reconstruct
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _ARRAYS = ("index", "wTc", "position", "image", "feature", "point", "pinhole", "notes")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.model import Model
@@ -16,9 +16,6 @@ from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.solving import Solved
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _SAME_DEPTHS = 0.1
 """Two parts' landmarks of one key point are one where they stand so near each other, in distances

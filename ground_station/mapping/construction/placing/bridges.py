@@ -7,13 +7,11 @@ are too few, a bundle adjustment moves one set against the other for next to not
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+from ground_station.arrays import I32, Bools
 from ground_station.mapping.construction.placing.placed import Placed
-
-I32 = npt.NDArray[np.int32]
 
 _FEWEST = 30
 """Landmarks that place one set in another; as many as join two models."""
@@ -62,11 +60,11 @@ def _carries(one: csr_array, other: csr_array) -> bool:
     return max(_stand_among(one, second), _stand_among(other, first)) >= 2
 
 
-def _stand_among(images: csr_array, triangulated: npt.NDArray[np.bool_]) -> int:
+def _stand_among(images: csr_array, triangulated: Bools) -> int:
     """How many images see as many of the landmarks as place one."""
     return int(np.count_nonzero(images @ triangulated.astype(float) >= _FEWEST))
 
 
-def _components(edges: npt.NDArray[np.int32], nodes: int) -> I32:
+def _components(edges: I32, nodes: int) -> I32:
     graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(nodes, nodes))
     return np.asarray(connected_components(graph, directed=False)[1])

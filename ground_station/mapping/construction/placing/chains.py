@@ -16,16 +16,13 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ground_station.arrays import F64, I32, I64, Bools
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 REACH = 12
 """Frames; a link spans at most so many steps."""
@@ -45,7 +42,7 @@ _FEWEST = 8
 """Fewer images have no order that one could tell."""
 
 
-def in_order(sequence: I64, pairs: Mapping[Pair, TwoView]) -> npt.NDArray[np.bool_]:
+def in_order(sequence: I64, pairs: Mapping[Pair, TwoView]) -> Bools:
     """Which images are in an order that means something, (n,): a whole sequence is or is not.
 
     In a video an image has nearly as many matches with the next as with any, and so with each. In
@@ -108,7 +105,7 @@ def _in_front(view: TwoView, first_px: F64, second_px: F64, camera_matrix: F64) 
 def links(
     features: Sequence[int],
     sequence: I64,
-    ordered: npt.NDArray[np.bool_],
+    ordered: Bools,
     pairs: Mapping[Pair, TwoView],
 ) -> set[Pair]:
     """The pairs that are links of a chain; `features` is the number of key points of each image.
@@ -146,7 +143,7 @@ def links(
     return found
 
 
-def _clean(track: npt.NDArray[np.int32], owner: I64, images: int) -> npt.NDArray[np.bool_]:
+def _clean(track: I32, owner: I64, images: int) -> Bools:
     """Which tracks, by number, have key points of more than one image, and one of each at most."""
     size = np.bincount(track)
     key, count = np.unique(track.astype(np.int64) * images + owner, return_counts=True)
@@ -155,7 +152,7 @@ def _clean(track: npt.NDArray[np.int32], owner: I64, images: int) -> npt.NDArray
     return clean
 
 
-def components(edges: Sequence[I64], nodes: int) -> npt.NDArray[np.int32]:
+def components(edges: Sequence[I64], nodes: int) -> I32:
     """The connected component (nodes,) of each node of a graph; `edges` (E, 2) each."""
     ends = np.concatenate([*edges, np.empty((0, 2), np.int64)])
     graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(nodes, nodes))

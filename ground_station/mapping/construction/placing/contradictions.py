@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.mapping.construction.pairs import Pair
@@ -24,8 +24,6 @@ from ground_station.mapping.construction.placing.lookalikes import HOLDS, SPEAKS
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
 
 _STRONG = 30
 """Matches of a pair whose rotation is looked at."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry import poses
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.lookalikes import BREAKS, SPEAKS
@@ -23,9 +23,6 @@ from ground_station.mapping.construction.placing.loops import SLACK_DEPTHS
 from ground_station.mapping.construction.placing.merging import SECOND
 from ground_station.mapping.construction.placing.placed import IN_PLACE_PX, Placed
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _DRAWS = 1000
 """Of four each: where three in ten are right, three of ten thousand searches miss the pose."""

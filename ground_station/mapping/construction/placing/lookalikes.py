@@ -13,14 +13,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
 
 SPEAKS = 15
 """Fewer landmarks in common say nothing about two images."""

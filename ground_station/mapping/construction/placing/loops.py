@@ -17,14 +17,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64, Bools
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _DRIFT = 0.05
 """Drift over the way: visual odometry of a calibrated camera has about a hundredth."""
@@ -86,7 +83,7 @@ def _way(model: Placed, sequence: I64) -> F64:
     return way
 
 
-def _agreeing(way: F64, sequence: I64, by: F64, slack: float) -> npt.NDArray[np.bool_]:
+def _agreeing(way: F64, sequence: I64, by: F64, slack: float) -> Bools:
     """Which hypotheses agree with their nearest neighbour among those believed, (H,).
 
     `way` and `sequence` (H, 2) of the two images, `by` (H, 3). In the beginning the chain is

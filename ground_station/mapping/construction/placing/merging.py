@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, Bools
 from ground_station.errors import GeometryError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map import colmap
@@ -21,10 +21,6 @@ from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.sfm import robust_similarity
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 _WITHIN_DEPTHS = 0.05
 """A landmark of both models is the same place so exactly, in distances at which they are seen."""
@@ -106,7 +102,7 @@ def _common(target: Placed, source: Placed, pairs: Mapping[Pair, TwoView]) -> tu
     return source.position[both[:, 0]], target.position[both[:, 1]], links
 
 
-def _similarity(x: F64, y: F64, within: float, seed: int) -> tuple[Alignment | None, Mask]:
+def _similarity(x: F64, y: F64, within: float, seed: int) -> tuple[Alignment | None, Bools]:
     """The similarity that most agree with, adjusted to them, and which do (N,)."""
     nothing = np.zeros(len(x), dtype=bool)
     if len(x) < _FEWEST:

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.geometry import poses
 from ground_station.map.model import Model
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.sfm.two_view import TwoView
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 IN_PLACE_PX = 8.0
 """A landmark seen so near to where it should be is in its place; neighbours fit within 1 px."""

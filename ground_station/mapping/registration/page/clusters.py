@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.mapping.registration.picks import MOST_LANDMARKS
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _STEPS = 20
 _ANCHORS = 30

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from ground_station.arrays import F64, I64
 from ground_station.mapping.registration.picks import Pick
 from ground_station.mapping.registration.walls import WallFit
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _PLACES = 12
 """Places of the walls that an accepted fit is kept as: enough that one more changes little."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.map.store import Map
 from ground_station.map.uncertainty import describe
@@ -27,9 +27,6 @@ from ground_station.mapping.registration.registration import Registration
 from ground_station.mapping.registration.walls import WallFit, fit_walls
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.text import printable
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 _SHOWN = 60_000
 _MOST_TILT_DEG = 45.0
