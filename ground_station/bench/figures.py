@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ground_station.bench import callgrind as callgrind
-from ground_station.bench.flight import RATE_HZ, Flight, FlightError, Ground, fly, picture
+from ground_station.bench.flight import RATE_HZ, BenchFlight, FlightError, Ground, fly, picture
 
 KEPT = Path(__file__).with_name("kept.toml")
 """Instructions a frame that were measured when the payload was last found good."""
@@ -186,7 +186,7 @@ def _profile(frames: int, pattern: str, telemetry: bool, settings: Sequence[str]
         return _Profile(groups, seconds, sent, ground.messages)
 
 
-def _first_arrival_ns(ground: Ground, flight: Flight) -> int:
+def _first_arrival_ns(ground: Ground, flight: BenchFlight) -> int:
     until_ns = flight.begin_ns + int(_START_LIMIT_S * 1e9)
     while not ground.arrivals:
         if flight.process.poll() is not None:

@@ -108,7 +108,7 @@ class Ground:
 
 
 @dataclass
-class Flight:
+class BenchFlight:
     """A running or ended program; `ready_ns` is when it had built everything, monotonic."""
 
     process: subprocess.Popen[str]
@@ -158,7 +158,7 @@ def fly(
     before: Sequence[str] = (),
     python: Sequence[str] = (),
     environment: Mapping[str, str] = MappingProxyType({}),
-) -> Iterator[Flight]:
+) -> Iterator[BenchFlight]:
     """Starts the program with `KEY=VALUE` settings and kills it at the block's end if need be.
 
     `before` is what runs it, as valgrind; `python` are options of the interpreter.
@@ -176,7 +176,7 @@ def fly(
             # Hashes are drawn at each start otherwise, and with them the cost of every dictionary.
             env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder, **environment},
         )
-        flight = Flight(process, begin_ns)
+        flight = BenchFlight(process, begin_ns)
         for target in (flight._read_said, flight._read_errors):
             thread = threading.Thread(target=target, daemon=True)
             thread.start()

@@ -24,7 +24,7 @@ Table = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Flight:
+class FlightDeclaration:
     """A flight: simulated, or where `folder` is given, real pictures with their trajectory."""
 
     scene: str = config.key("atrium", "of the simulator")
@@ -80,7 +80,7 @@ class MapSpec:
     images: int = config.key(137, "frames, evenly taken; 0: all", unit="frames", low=0, high=5000)
     features: str = config.key("rootsift", "name of the extractor or of a model")
     seed: int = config.key(101, "of the mapping flight", low=0, high=2**31 - 1)
-    flight: Flight = config.table(Flight)
+    flight: FlightDeclaration = config.table(FlightDeclaration)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Case:
     name: str
     title: str
     map: MapSpec
-    flight: Flight
+    flight: FlightDeclaration
     alter: Alteration
     localizer: Table
     presets: tuple[str, ...]
@@ -170,7 +170,7 @@ class _Row:
     level: str = config.key("", "what the cases vary")
     presets: list[str] = config.key(list(PRESETS), "which of the localizer's", choices=None)
     map: MapSpec = config.table(MapSpec)
-    flight: Flight = config.table(Flight)
+    flight: FlightDeclaration = config.table(FlightDeclaration)
     alter: Alteration = config.table(Alteration)
     thesis: Figures = config.table(Figures)
 

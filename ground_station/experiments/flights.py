@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ground_station.experiments.declaration import Flight
+from ground_station.experiments.declaration import FlightDeclaration
 from ground_station.simulator.simulate import SimulationSettings, simulate
 
 
-def file_name(flight: Flight, seed: int) -> str:
+def file_name(flight: FlightDeclaration, seed: int) -> str:
     """What a simulated flight's recording is called: all that it depends on but the program."""
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
@@ -18,7 +18,7 @@ def file_name(flight: Flight, seed: int) -> str:
     )
 
 
-def fly(flight: Flight, seed: int, path: Path) -> None:
+def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
     """Simulates a flight into a recording, written whole or not at all."""
     settings = SimulationSettings(
         out=path,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground_station.errors import InputError
-from ground_station.experiments.declaration import Flight
+from ground_station.experiments.declaration import FlightDeclaration
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.recording.flight import FlightRecording, trajectory_of
@@ -32,7 +32,7 @@ class Flown:
                 yield sample.data
 
 
-def flown(flight: Flight, recording: Path | None, data: Path) -> Flown:
+def flown(flight: FlightDeclaration, recording: Path | None, data: Path) -> Flown:
     """A flight's frames; raises `InputError` naming what is missing.
 
     `recording` is the simulated one's; a folder of real pictures lies below `data`.

@@ -14,7 +14,7 @@ from ground_station.experiments.declaration import (
     Alteration,
     Case,
     Declaration,
-    Flight,
+    FlightDeclaration,
     MapSpec,
     changed,
 )
@@ -31,7 +31,7 @@ class FlightJob:
 
     key: str
     name: str
-    flight: Flight
+    flight: FlightDeclaration
     seed: int
 
 
@@ -53,7 +53,7 @@ class RunJob:
     key: str
     name: str
     map_key: str
-    flight: Flight
+    flight: FlightDeclaration
     recording: str | None
     seed: int
     alter: Alteration
@@ -149,7 +149,7 @@ def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> Map
     return job
 
 
-def _flight(plan: Plan, flight: Flight, seed: int) -> FlightJob:
+def _flight(plan: Plan, flight: FlightDeclaration, seed: int) -> FlightJob:
     name = file_name(flight, seed)
     depends = {"flight": asdict(flight), "seed": seed, "code": code_sha256("flight")}
     key = _key("flight", depends)
@@ -183,7 +183,7 @@ def _check_features(case: Case) -> None:
 
 
 @functools.cache
-def _real(flight: Flight, data: Path) -> str:
+def _real(flight: FlightDeclaration, data: Path) -> str:
     """A hash of real pictures by name and size, of their camera and trajectory by content."""
     folder = data / flight.folder
     if not folder.is_dir():

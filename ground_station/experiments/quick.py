@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ground_station.experiments.declaration import Case, Declaration, Flight, MapSpec
+from ground_station.experiments.declaration import Case, Declaration, FlightDeclaration, MapSpec
 from ground_station.recording.frames import FrameRange
 from ground_station.recording.open import parse_range
 
@@ -30,7 +30,7 @@ def _case(case: Case) -> Case:
     return replace(case, flight=_first_seconds(case.flight), map=_thinned(case.map))
 
 
-def _first_seconds(flight: Flight) -> Flight:
+def _first_seconds(flight: FlightDeclaration) -> FlightDeclaration:
     """Its first seconds; of real pictures as many as that is."""
     if flight.simulated:
         return replace(flight, duration_s=min(flight.duration_s, FLIGHT_S))

@@ -136,7 +136,7 @@ class SimulationResult:
 
 
 @dataclass(frozen=True)
-class Flight:
+class SimulatedFlight:
     """A plan in motion and the times of its frames, seconds on the motion's clock.
 
     `camera` takes the frames, `carried` is the one that the recording names.
@@ -153,7 +153,7 @@ class Flight:
     clicks: np.random.Generator
 
 
-def prepare_flight(settings: SimulationSettings) -> Flight:
+def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
     """Scene, plan and motion from the settings and their seed; raises `SimulatorError`."""
     scene = scenes.build(settings.scene, settings.texels_per_m)
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(4)]
@@ -185,7 +185,7 @@ def prepare_flight(settings: SimulationSettings) -> Flight:
     camera = settings.camera or plan.camera
     wrong = 1 + settings.lens_error
     carried = replace(camera, fx_px=camera.fx_px * wrong, fy_px=camera.fy_px * wrong)
-    return Flight(scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks)
+    return SimulatedFlight(scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks)
 
 
 def time_ns_of(times_s: npt.ArrayLike) -> I64:
@@ -273,7 +273,10 @@ def _sensor(settings: SimulationSettings) -> Sensor:
 
 
 def _record(
-    settings: SimulationSettings, flight: Flight, maker: FrameMaker, progress: Progress | None
+    settings: SimulationSettings,
+    flight: SimulatedFlight,
+    maker: FrameMaker,
+    progress: Progress | None,
 ) -> tuple[int, bool]:
     """Takes and writes all frames; returns their number and whether it was interrupted."""
     camera, motion, times = flight.camera, flight.motion, flight.times_s
@@ -326,7 +329,7 @@ def _record(
 
 
 def _write_head(
-    writer: RecordingWriter, settings: SimulationSettings, flight: Flight, first_ns: int
+    writer: RecordingWriter, settings: SimulationSettings, flight: SimulatedFlight, first_ns: int
 ) -> None:
     camera = flight.carried
     writer.write_metadata("camera", {k: str(v) for k, v in camera.as_dict().items()})

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ground_station.experiments import declaration, plan
-from ground_station.experiments.declaration import Flight
+from ground_station.experiments.declaration import FlightDeclaration
 from ground_station.experiments.plan import MapJob, RunJob
 from ground_station.experiments.quick import FLIGHT_S, IMAGES, shortened
 from ground_station.mapping.settings import MappingSettings
@@ -38,7 +38,9 @@ def test_quick_has_one_seed_short_flights_and_maps_of_which_nothing_is_flown_in_
     large = [
         replace(
             case,
-            map=replace(case.map, images=513, flight=Flight(duration_s=50.0, rate_hz=12.0)),
+            map=replace(
+                case.map, images=513, flight=FlightDeclaration(duration_s=50.0, rate_hz=12.0)
+            ),
         )
         for case in experiment.cases
     ]
@@ -60,7 +62,9 @@ def test_quick_takes_the_first_seconds_of_real_pictures(declared, tmp_path):
     (tmp_path / "c.toml").touch()
     case = declared.experiments[0].cases[0]
     for given, taken in (("500:1000", "500:650:1"), ("500:600:2", "500:600:2"), ("", "0:150:1")):
-        real = Flight(folder="hall", truth="t.txt", camera="c.toml", range=given, rate_hz=30.0)
+        real = FlightDeclaration(
+            folder="hall", truth="t.txt", camera="c.toml", range=given, rate_hz=30.0
+        )
         one = replace(case, flight=real, map=replace(case.map, flight=real, images=0))
         only = replace(declared, experiments=[replace(declared.experiments[0], cases=[one])])
         made = plan.make(shortened(only), MappingSettings(), tmp_path)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ground_station.errors import InputError
-from ground_station.experiments.declaration import Alteration, Flight, MapSpec
+from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
 from ground_station.experiments.plan import FlightJob, MapJob, Plan, RunJob
 from ground_station.experiments.schedule import carry_out
 from ground_station.experiments.store import Store
@@ -21,13 +21,15 @@ from ground_station.mapping.settings import MappingSettings
 def a_plan(runs=3):
     """A flight, a map of it, runs in that."""
     jobs = {
-        "f": FlightJob("f", "f.mcap", Flight(), 1),
+        "f": FlightJob("f", "f.mcap", FlightDeclaration(), 1),
         "m": MapJob("m", "map", MapSpec(), MappingSettings(), "f.mcap"),
     }
     needs = {"f": (), "m": ("f",)}
     for k in range(runs):
         key = f"r{k}"
-        jobs[key] = RunJob(key, key, "m", Flight(), "f.mcap", k, Alteration(), LocalizerSettings())
+        jobs[key] = RunJob(
+            key, key, "m", FlightDeclaration(), "f.mcap", k, Alteration(), LocalizerSettings()
+        )
         needs[key] = ("m", "f")
     return Plan(jobs, needs, {})
 

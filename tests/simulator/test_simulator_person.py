@@ -18,7 +18,12 @@ from ground_station.simulator.hall import PANEL_M, ROW_M
 from ground_station.simulator.imaging import covering_pinhole
 from ground_station.simulator.lighting import surface_albedo
 from ground_station.simulator.plans import HEADSET_CAMERA, WIDE_CAMERA
-from ground_station.simulator.simulate import Flight, SimulationSettings, prepare_flight, simulate
+from ground_station.simulator.simulate import (
+    SimulatedFlight,
+    SimulationSettings,
+    prepare_flight,
+    simulate,
+)
 from ground_station.simulator.textures import TextureBank
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
 from tests.simulator.conftest import quick_settings
@@ -27,13 +32,13 @@ from tests.simulator.test_simulator_scenes import nearest_surface_m
 SEEDS = range(6)
 
 
-def flight_of(plan: str, seed: int, **changes: object) -> Flight:
+def flight_of(plan: str, seed: int, **changes: object) -> SimulatedFlight:
     scene = {"stills": "hall", "headset": "rooms"}[plan]
     values: dict[str, object] = {"scene": scene, "plan": plan, "seed": seed, "texels_per_m": 10.0}
     return prepare_flight(SimulationSettings(out=Path("f.mcap"), **(values | changes)))  # type: ignore[arg-type]
 
 
-def true_poses(flight: Flight) -> F64:
+def true_poses(flight: SimulatedFlight) -> F64:
     return flight.motion.wTc(flight.times_s)
 
 

@@ -14,7 +14,7 @@ from ground_station.localization.matching import Matcher, describe
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
 from ground_station.map_update.extension.frames import Frames
-from ground_station.map_update.extension.localizing import Flight
+from ground_station.map_update.extension.localizing import LocatedFlight
 
 _RADIUS_PX = 8.0
 """A landmark is looked for so near to where a localized frame's pose projects it."""
@@ -25,7 +25,11 @@ class Anchoring:
     """The localizer's own matching, of all of a frame's features."""
 
     def __init__(
-        self, map_: Map, flights: Sequence[Flight], frames: Frames, settings: LocalizerSettings
+        self,
+        map_: Map,
+        flights: Sequence[LocatedFlight],
+        frames: Frames,
+        settings: LocalizerSettings,
     ) -> None:
         settings = replace(settings, pose=replace(settings.pose, max_observations=_ALL))
         self._matchers = [

@@ -25,7 +25,7 @@ from ground_station.map_update.extension.age import never_seen
 from ground_station.map_update.extension.anchoring import Anchoring
 from ground_station.map_update.extension.frames import Frames, Picked, describe, pick, thinned
 from ground_station.map_update.extension.joining import Grown, join
-from ground_station.map_update.extension.localizing import Flight, localize
+from ground_station.map_update.extension.localizing import LocatedFlight, localize
 from ground_station.map_update.extension.looks import new_looks
 from ground_station.map_update.extension.merging import merge, observation_descriptors
 from ground_station.map_update.extension.structure import LOOSE_PX, Structure, weak_points
@@ -117,7 +117,7 @@ def extend_map(
 
 def _structure(
     map_: store.Map,
-    flights: Sequence[Flight],
+    flights: Sequence[LocatedFlight],
     frames: Frames,
     settings: MappingSettings,
     localizer: LocalizerSettings,
@@ -187,7 +187,7 @@ def _check_map(map_: store.Map) -> None:
         raise MapError(f"{map_.folder}: two of its landmarks have the same id")
 
 
-def _check_names(flights: Sequence[Flight], map_: store.Map) -> None:
+def _check_names(flights: Sequence[LocatedFlight], map_: store.Map) -> None:
     names = [flight.name for flight in flights]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -198,7 +198,7 @@ def _check_names(flights: Sequence[Flight], map_: store.Map) -> None:
             raise MapError(f"{flight.path}: the flight '{flight.name}' is in the map already")
 
 
-def _check_tied(flights: Sequence[Flight], picked: Sequence[Picked]) -> None:
+def _check_tied(flights: Sequence[LocatedFlight], picked: Sequence[Picked]) -> None:
     for flight, one in zip(flights, picked, strict=True):
         if not np.isfinite(one.wTc).all(axis=(1, 2)).any():
             why = ", ".join(f"{reason}: {count}" for reason, count in one.left.items())
@@ -209,7 +209,7 @@ def _check_tied(flights: Sequence[Flight], picked: Sequence[Picked]) -> None:
 
 
 def _flight_report(
-    number: int, flight: Flight, one: Picked, grown: Grown, frames: Frames
+    number: int, flight: LocatedFlight, one: Picked, grown: Grown, frames: Frames
 ) -> dict[str, Any]:
     joined_ = grown.model.image_id - 1
     mine = frames.flight[joined_] == number

@@ -13,7 +13,7 @@ from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map, check_features
-from ground_station.map_update.extension.localizing import Flight
+from ground_station.map_update.extension.localizing import LocatedFlight
 from ground_station.mapping.construction.images import extract_features, extractor_of
 from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.mapping.construction.workers import Threads
@@ -65,7 +65,7 @@ class Picked:
     left: dict[str, int]
 
 
-def pick(flight: Flight, map_: Map, settings: MappingSettings) -> Picked:
+def pick(flight: LocatedFlight, map_: Map, settings: MappingSettings) -> Picked:
     """Tracked frames whose view has changed, and of stretches without any one every so often.
 
     The latter show what the map does not know, or not in this light; neighbours that are localized
@@ -102,7 +102,7 @@ def thinned(picked: Sequence[Picked], most: int) -> list[Picked]:
 
 
 def describe(
-    flights: Sequence[Flight],
+    flights: Sequence[LocatedFlight],
     picked: Sequence[Picked],
     map_: Map,
     settings: MappingSettings,
@@ -150,7 +150,7 @@ def describe(
     )
 
 
-def _twists(flight: Flight, one: Picked, settings: MappingSettings, straight: bool) -> F64:
+def _twists(flight: LocatedFlight, one: Picked, settings: MappingSettings, straight: bool) -> F64:
     """Twists (K, 6) of the picked frames, from all the frames that were tracked around them."""
     result = np.zeros((len(one.time_ns), 6))
     if not straight or flight.camera.readout_s == 0:
@@ -164,7 +164,7 @@ def _twists(flight: Flight, one: Picked, settings: MappingSettings, straight: bo
 
 
 def _described(
-    flight: Flight, one: Picked, map_: Map, settings: MappingSettings, threads: int
+    flight: LocatedFlight, one: Picked, map_: Map, settings: MappingSettings, threads: int
 ) -> Iterator[tuple[Frame, Features]]:
     wanted = set(one.time_ns.tolist())
     of_map = dataclasses.replace(settings, features=map_.info.features)

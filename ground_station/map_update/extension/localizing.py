@@ -23,7 +23,7 @@ from ground_station.recording.open import open_input
 
 
 @dataclass(frozen=True)
-class Flight:
+class LocatedFlight:
     """An input and what a localizer made of it.
 
     `source` gives the frames once more; `time_ns` (N,), of all of them, increasing; `seen`, those
@@ -53,7 +53,7 @@ def localize(
     camera: Camera | None = None,
     rate_hz: float = 30.0,
     frame_range: FrameRange | None = None,
-) -> Flight:
+) -> LocatedFlight:
     """Localizes every frame of a recording, video or folder.
 
     `camera` instead of the input's own, which else is the map's where it has none. A recording that
@@ -90,7 +90,9 @@ def localize(
     # What falls back in time was refused by the localizer as well.
     later = times > np.concatenate([[times[0] - 1], np.maximum.accumulate(times)[:-1]])
     localized = sum(estimate.localized for estimate in estimates)
-    return Flight(path, source, camera, times[later], seen, localized, extractor.distance_scale)
+    return LocatedFlight(
+        path, source, camera, times[later], seen, localized, extractor.distance_scale
+    )
 
 
 def _check_size(path: Path, size: tuple[int, int], map_: Map) -> None:
