@@ -54,7 +54,7 @@ test: setup  ## Run the tests of every room
 	@sh tests/tools.sh
 	@failed=0; export PATH="$(CURDIR)/out/sshd/usr/sbin:$$PATH"; \
 	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
-	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 2 --dist loadfile tests || failed=1; \
+	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 3 --dist loadfile tests || failed=1; \
 	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
 	exit $$failed
 

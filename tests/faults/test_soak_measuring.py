@@ -21,8 +21,6 @@ from soaking.table import Row
 
 from ground_station.errors import GroundStationError
 
-pytestmark = pytest.mark.alone
-
 # By its path: the service's soak has the same name.
 _SPEC = importlib.util.spec_from_file_location("flight_soak", Path(__file__).with_name("soak.py"))
 assert _SPEC is not None and _SPEC.loader is not None

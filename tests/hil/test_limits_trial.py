@@ -27,8 +27,6 @@ from ground_station.replay.firmware import FirmwareError
 from ground_station.replay.live import LiveFrame
 from pi_firmware.wire.errors import StreamError
 
-pytestmark = pytest.mark.alone
-
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
 S = 10**9
 ROUND = Round(5 * S, 32 * S)

@@ -18,8 +18,6 @@ from ground_station.replay import flight_report
 from ground_station.replay.cases.outcome import read_outcome
 from ground_station.replay.replay import ReplayResult, replay, settings_for
 
-pytestmark = pytest.mark.alone
-
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 BLIMP = Path(sys.executable).with_name("blimp")
 

@@ -23,8 +23,6 @@ from ground_station.recording.flight import camera_of
 from ground_station.replay.cases.case import Link, load_case
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader, RecordingWriter
 
-pytestmark = pytest.mark.alone
-
 SUITE = Path(__file__).with_name("suite.py")
 CASES = SUITE.with_name("cases")
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"

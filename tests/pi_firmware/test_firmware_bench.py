@@ -10,8 +10,6 @@ import pytest
 from ground_station import cli
 from ground_station.bench import callgrind, figures, flight
 
-pytestmark = pytest.mark.alone
-
 # Two objects, C's library and code made at run time; names are written once. The lines behind
 # `calls=` are the callees' and no cost of the object's own.
 PROFILE = """\

@@ -38,8 +38,6 @@ from ground_station.service.localizing import maps
 from ground_station.service.localizing.process import RESTART, Localizing
 from ground_station.service.pictures import SLOTS
 
-pytestmark = pytest.mark.alone
-
 FLIGHT = SAMPLE / "flight.mcap"
 TRUTH = trajectory_of(FLIGHT)
 

@@ -14,8 +14,6 @@ from service_account import Flight, account_rows
 from soaking.measures import Window
 from soaking.table import Row
 
-pytestmark = pytest.mark.alone
-
 # By its path: the firmware's soak has the same name.
 _SPEC = importlib.util.spec_from_file_location("service_soak", TESTS / "service" / "soak.py")
 assert _SPEC is not None and _SPEC.loader is not None
