@@ -82,9 +82,8 @@ def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> Bools:
     """Which access units of an H.264 stream can be decoded when packets are lost one by one (n,).
 
     A unit goes in packets of `PACKET_BYTES`; one that misses a packet is useless, and so is all
-    after it up to the next IDR, because each picture is predicted from the one before. There is no
-    retransmission and no error correction, as in the product; but the product asks for an IDR at
-    each loss, which a recording cannot give, so a live link loses less.
+    after it up to the next IDR, because each picture is predicted from the one before. A live link
+    sends lost packets again and asks for an IDR, which a recording cannot: it loses far less.
     """
     rng = np.random.default_rng(seed)
     whole = False
