@@ -28,6 +28,8 @@ from pi_firmware.wire.errors import StreamError
 _POLL_S = 0.1
 _DRAIN_S = 2.0
 """After the payload's end-of-stream, what is still on its way comes within this."""
+_LOCALIZED_S = 60.0
+"""And what has come is localized or counted within this, on however busy a machine."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,8 @@ def run(
             told = result.payload.frames
             taken = len(estimates) + result.dropped
             here = told["received"] >= told.get("sent", 0)  # without its counts: all that came
-            if (here and taken >= told["received"]) or idle_s > _DRAIN_S:
+            all_told = taken >= told["received"]
+            if (here and all_told) or idle_s > (_DRAIN_S if all_told else _LOCALIZED_S):
                 break
         elif not payload.running() and idle_s > _DRAIN_S:
             break

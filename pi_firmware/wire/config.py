@@ -175,6 +175,7 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
             raise ConfigError(f"{what} must be a list, not {shown(value)}")
         (item,) = typing.get_args(kind) or (Any,)
         return [_check(v, item, meta, f"{what}[{i}]") for i, v in enumerate(value)]
+    kind = origin or kind  # a dict is one, whatever it holds
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         try:
             value = float(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -354,10 +355,11 @@ def test_while_its_map_is_loaded_it_says_so(
         thread = threading.Thread(target=localizing.run, args=(stop,))
         thread.start()
         try:
+            ask = functools.partial(told.bus.query, NAME, {"do": "map", "name": "atrium"})
+            # Answered, it also hears of frames: it subscribes first.
+            until(lambda: ask()["reason"] == "the map 'atrium' is being loaded; try again then")
             said = localized(told, flight[0])
             assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
-            answer = told.bus.query(NAME, {"do": "map", "name": "atrium"})
-            assert answer["reason"] == "the map 'atrium' is being loaded; try again then"
             release.set()
             until(lambda: told.event("map-loaded") is not None, "the map")
             assert error_m(localized(told, flight[1])) < 0.1
