@@ -46,6 +46,10 @@ _UVC_TIMES = "/sys/module/uvcvideo/parameters/hwtimestamps"
 _LIGHT_K = {"incandescent": 2800, "fluorescent": 4200, "daylight": 5500, "cloudy": 6500}
 """Usual colour temperatures of the lights, as photographers' tables have them."""
 
+# The Pi's encoder takes a list of colorimetries and no other; those of most USB cameras differ from
+# this one in nothing that a picture's bytes would tell.
+_COLOURS = ",colorimetry=(string)bt601"
+
 Ioctl = Callable[[int, int, bytearray], object]
 
 
@@ -162,8 +166,8 @@ class V4l2Source(LiveSource):
         sized = caps(camera, "{I420,NV12,YUY2,UYVY}")
         super().__init__(
             camera,
-            f"v4l2src name=source ! {sized} ! videoconvert n-threads=1 "
-            "! video/x-raw,format=(string){I420,NV12}",
+            f"v4l2src name=source ! {sized},interlace-mode=(string)progressive "
+            "! videoconvert n-threads=1 ! video/x-raw,format=(string){I420,NV12}" + _COLOURS,
             mark=mark,
             readout_s=rows_s,
         )
