@@ -21,7 +21,10 @@ from ground_station.service.web.app import STATIC, static_files
 SHARED = Path(presentation.__file__).parent / "web"
 
 LIMIT_MS = 20_000
-SIZES = {"desk": (1440, 900), "landscape": (1024, 768), "portrait": (768, 1024)}
+SIZES = {
+    "desk": (1440, 900), "landscape": (1024, 768), "tablet": (820, 1180), "phone": (390, 844),
+    "phone on its side": (844, 390),
+}  # fmt: skip
 # It reports a refused connection itself, whoever waits for it; it advises on reading canvases back,
 # which the tests do and the page does not; and on its own way of drawing without a GPU.
 OF_THE_BROWSER = ("ERR_CONNECTION", "willReadFrequently", "GL Driver Message")
@@ -440,9 +443,44 @@ def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: 
             ".fates td:first-child, .act span, .state-word, .alarm, .banner",
         )
         assert over == []
+        # State, charge and commands are in sight wherever one has scrolled to.
+        out_of_sight = shown.page.evaluate(
+            """() => {
+              document.querySelector(".events").scrollIntoView();
+              const seen = (node) => {
+                const box = node.getBoundingClientRect();
+                return box.height && box.top >= 0 && box.bottom <= innerHeight;
+              };
+              return [".payload[aria-checked=true] use", ".act", "#bar-battery b, #battery b"]
+                .filter((name) => ![...document.querySelectorAll(name)].some(seen));
+            }"""
+        )
+        assert out_of_sight == []
     finally:
         del station.payloads[name]
         shown.page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
+
+
+def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
+    browser: Any, served: Served
+) -> None:
+    size = {"width": 640, "height": 480}
+    context = browser.new_context(color_scheme="light", viewport=size)
+    page = context.new_page()
+    ground = "getComputedStyle(document.body).backgroundColor"
+    page.goto(served.url)
+    light = page.evaluate(ground)
+    page.click('.video [data-do="swap"]')
+    page.click("#help-open")
+    page.click('[data-scheme="dark"]')
+    page.reload()
+    page.wait_for_selector('.video[data-place="main"]')
+    assert page.get_attribute(".plan", "data-place") == "side"
+    assert page.evaluate(ground) != light
+    page.click("#help-open")
+    page.click('[data-scheme=""]')
+    assert page.evaluate(ground) == light
+    context.close()
 
 
 def test_who_is_signed_out_is_asked_for_the_token(browser: Any) -> None:
@@ -506,8 +544,7 @@ def test_each_script_that_a_script_imports_is_served() -> None:
 
 
 def test_text_stands_out_from_its_ground() -> None:
-    text = (STATIC / "tokens.css").read_text()
-    light, dark = text.split("@media (prefers-color-scheme: dark)")
+    light, dark = ((STATIC / name).read_text() for name in ("tokens.css", "dark.css"))
     colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", light))
     pairs = [
         *[("ink", ground) for ground in ("ground", "surface", "raised", "degraded-fill")],

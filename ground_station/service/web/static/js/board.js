@@ -15,6 +15,8 @@ export class Board {
     this.store = store;
     this.cards = { battery: byId("battery"), radio: byId("radio"), board: byId("board") };
     this.battery = fields(this.cards.battery);
+    this.bar = byId("bar-battery");
+    this.inBar = fields(this.bar);
     this.radio = fields(this.cards.radio);
     this.board = fields(this.cards.board);
     this.series = { loss: new Series(), rate: new Series(), heat: new Series() };
@@ -64,6 +66,9 @@ export class Board {
     setText(f.volts, number(battery?.voltage, 2));
     setText(f.amperes, number(battery?.current, 2));
     setAttribute(f.meter, "value", String(battery?.percentage ?? 0));
+    for (const name of ["data-stale", "data-alarm"]) setAttribute(this.bar, name, this.cards.battery.getAttribute(name));
+    setAttribute(this.inBar.fill, "width", String(28 * Math.min(1, battery?.percentage ?? 0)));
+    setText(this.inBar.percent, percent(battery?.percentage));
   }
 
   /** @param {import("./types.js").PayloadNote|null|undefined} note @param {boolean} is_stale @param {boolean} old_health */

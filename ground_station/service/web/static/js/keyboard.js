@@ -2,6 +2,7 @@
 /** Single keys for what an operator does often, and the page that names them. */
 import { dialog } from "./dialogs.js";
 import { byId, icon, make, setAttribute, setText } from "./dom.js";
+import { recall, remember } from "./remembered.js";
 import { lookOf } from "./states.js";
 
 const STORED = "blimp.single-keys";
@@ -14,7 +15,7 @@ export class Keyboard {
     this.shortcuts = shortcuts;
     this.choose = choose;
     this.help = dialog("help-dialog");
-    this.is_on = stored() !== "off";
+    this.is_on = recall(STORED) !== "off";
     this.toggle = byId("keys-toggle");
     this.toggle.addEventListener("click", () => this.turn(!this.is_on));
     byId("help-open").addEventListener("click", () => this.help.showModal());
@@ -28,11 +29,7 @@ export class Keyboard {
     this.is_on = is_on;
     setText(this.toggle, is_on ? "on" : "off");
     setAttribute(this.toggle, "aria-pressed", String(is_on));
-    try {
-      localStorage.setItem(STORED, is_on ? "on" : "off");
-    } catch {
-      // A browser that keeps nothing asks again next time.
-    }
+    remember(STORED, is_on ? "on" : "off");
   }
 
   /** @param {KeyboardEvent} event */
@@ -71,13 +68,5 @@ export class Keyboard {
         return row;
       }),
     );
-  }
-}
-
-function stored() {
-  try {
-    return localStorage.getItem(STORED);
-  } catch {
-    return null;
   }
 }

@@ -11,6 +11,7 @@ import { byId, setText } from "./dom.js";
 import { Events } from "./events.js";
 import { Flight } from "./flight.js";
 import { Keyboard } from "./keyboard.js";
+import { Layout } from "./layout.js";
 import { Loop } from "./loop.js";
 import { Maps } from "./maps.js";
 import { Plan } from "./plan.js";
@@ -28,10 +29,12 @@ const SAMPLE_MS = 500;
 const loop = new Loop();
 const clock = new StationClock();
 const store = new Store(clock, (topic) => loop.mark(topic));
-const theme = new Theme(() => {
+const theme = new Theme(recoloured);
+
+function recoloured() {
   plan.recolour();
   scene.setMap(plan.map, plan.bitmap);
-});
+}
 
 /** @param {Record<string, any>} message */
 function send(message) {
@@ -54,6 +57,10 @@ const alarms = new Alarms(store, loop);
 const mapDialog = new MapDialog(store);
 const powerDialog = new PowerDialog(store);
 const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
+new Layout(() => {
+  theme.read();
+  recoloured();
+});
 new Flight(store, loop);
 new Events(store, loop);
 new Status(store, loop, choose);

@@ -16,7 +16,7 @@ export class Status {
     this.offline = byId("offline");
     this.offlineFields = fields(this.offline);
     this.list = byId("payloads");
-    /** @type {Map<string, {node: HTMLElement, icon: Element, name: Element}>} */
+    /** @type {Map<string, {node: HTMLElement, icon: Element, name: Element, word: Element}>} */
     this.choices = new Map();
     this.list.addEventListener("keydown", (event) => this.step(event));
     loop.add(["connection", "tick", "station"], () => this.drawConnection(), 200);
@@ -62,6 +62,7 @@ export class Status {
       setAttribute(choice.node, "aria-label", `${payload.id}, ${look.word}`);
       setAttribute(choice.node, "title", `${payload.id}: ${look.word}`);
       setIcon(choice.icon, look.icon);
+      setText(choice.word, look.word);
     }
     for (const [id, choice] of this.choices) {
       if (store.payloads.has(id)) continue;
@@ -74,12 +75,13 @@ export class Status {
   add(id) {
     const symbol = icon("none");
     const name = make("span", "", id);
-    const node = make("button", "payload", symbol, name);
+    const word = make("i", "", "");
+    const node = make("button", "payload", symbol, name, word);
     node.setAttribute("type", "button");
     node.setAttribute("role", "radio");
     node.addEventListener("click", () => this.choose(id));
     this.list.append(node);
-    const choice = { node, icon: symbol, name };
+    const choice = { node, icon: symbol, name, word };
     this.choices.set(id, choice);
     return choice;
   }
