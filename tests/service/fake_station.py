@@ -120,6 +120,7 @@ class FakeStation:
     events: list[dict[str, Any]] = field(default_factory=list)
     recording: bool = False
     recording_ns: int = 0
+    recordings: list[dict[str, Any]] = field(default_factory=list)
     demo: bool = True
     map: str = "atrium"
     floorplan: bool = True
@@ -375,6 +376,17 @@ def make_app(station: FakeStation) -> FastAPI:
     def landmarks(name: str) -> Response:
         data = sample_flight().landmarks_m.astype("<f4").tobytes()
         return Response(data, media_type="application/octet-stream")
+
+    @app.get("/api/recordings")
+    def recordings() -> list[dict[str, Any]]:
+        return station.recordings
+
+    @app.delete("/api/recordings/{name}")
+    async def delete(name: str) -> dict[str, Any]:
+        result = await answer("delete", name)
+        if result["done"]:
+            station.recordings = [one for one in station.recordings if one["file"] != name]
+        return result
 
     @app.post("/api/recording")
     async def record(request: Request) -> dict[str, Any]:

@@ -318,6 +318,31 @@ def test_a_recording_starts_and_stops(shown: Watched, station: FakeStation) -> N
     assert station.asked[1:] == [("recording", {"active": False})]
 
 
+def test_recordings_are_listed_and_deleted_by_a_second_press(
+    shown: Watched, station: FakeStation
+) -> None:
+    file = "flight-000007-20260131T142530Z.mcap"
+    kept = {"file": file, "size_MB": 61.2, "modified_ns": 1, "started_ns": 1, "duration_s": 754.2}
+    station.recordings = [
+        kept | {"file": "now.mcap", "active": True, "maps": [], "duration_s": None},
+        kept | {"active": False, "maps": ["atrium", "<b>hall</b>"]},
+    ]
+    shown.page.keyboard.press("g")
+    shown.until("document.querySelectorAll('.recordings li').length === 2")
+    assert "being written" in shown.text(".recordings li:nth-child(1)")
+    assert shown.page.locator(".recordings li:nth-child(1) button").count() == 0
+    row = ".recordings li:nth-child(2)"
+    assert "atrium, <b>hall</b> · 12:34 · 61 MB" in shown.text(row)
+    links = shown.page.locator(f"{row} a").evaluate_all("links => links.map((a) => a.pathname)")
+    assert links == [f"/api/recordings/{file}", f"/api/recordings/{file}/trajectory.txt"]
+    shown.page.click(f"{row} button")
+    assert station.asked == []
+    shown.page.click(f"{row} button")
+    shown.until("document.querySelectorAll('.recordings li').length === 1")
+    assert station.asked == [("delete", file)]
+    shown.page.keyboard.press("Escape")
+
+
 def test_a_refusal_says_why_and_work_shows_that_it_works(
     shown: Watched, station: FakeStation
 ) -> None:

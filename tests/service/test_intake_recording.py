@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -38,6 +39,7 @@ from ground_station.service.bus_messages import EstimateMessage, EventMessage
 from ground_station.service.intake import files as files_module
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
+from ground_station.service.web.recordings import Recordings
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire import annexb, keys, messages
 from pi_firmware.wire.errors import RecordingError
@@ -50,6 +52,7 @@ from pi_firmware.wire.recording import (
 )
 
 GROUND_NS = 1_800_000_000_000_000_000
+DATED = r"flight-000001-20\d{6}T\d{6}Z\.mcap"
 IMAGE = np.zeros((480, 640), np.uint8)
 
 
@@ -111,13 +114,15 @@ def test_a_recording_holds_all_that_was_said_on_the_grounds_clock(tmp_path: Path
     battery = messages.Battery(time_ns=5, voltage=3.9)
     for k in range(30):
         made.frame("blimp-1", frame(k), log_ns(k))
-        made.estimate("blimp-1", estimate(k))
+        made.estimate("blimp-1", estimate(k, map="hall" if k < 15 else "atrium"))
     made.estimate("blimp-1", estimate(30, position_m=None, quaternion_xyzw=None, state="LOST"))
     made.estimate("blimp-1", estimate(31, position_m=["far"]))
     made.message("blimp-1", keys.BATTERY, battery)
     made.note(bus_messages.EVENT, "-", EventMessage(1, "web", "info", "hello", "there"))
     made.close()
     (path,) = recorded(tmp_path / "out")
+    (told,) = Recordings(tmp_path / "out", lambda: "").list()
+    assert told["maps"] == ["atrium", "hall"] and told["file"] == path.name
     reader = RecordingReader(path)
     video = list(reader.messages({VIDEO_TOPIC}))
     assert [record.log_time for _, record in video] == [log_ns(k) for k in range(30)]
@@ -267,7 +272,7 @@ def test_sigkill_while_recording_costs_at_most_a_second(tmp_path: Path) -> None:
         stand.payload("blimp-1")
         eventually(lambda: len(stand.heard.of("blimp-1")) > 10)
         started = stand.ask(do="record-start")
-        assert started["done"] and started["file"] == "flight-000001.mcap"
+        assert started["done"] and re.fullmatch(DATED, started["file"])
         assert stand.ask(do="record-start")["file"] == started["file"]
         eventually(lambda: stand.heard.recording[-1].duration_s > 4)
         stand.process.kill()
@@ -290,7 +295,7 @@ def test_sigkill_while_recording_costs_at_most_a_second(tmp_path: Path) -> None:
         before = len(stand.heard.recording)
         stand.start()
         eventually(lambda: any(note.active for note in stand.heard.recording[before:]))
-        assert stand.heard.recording[-1].file == "flight-000002.mcap"
+        assert stand.heard.recording[-1].file.startswith("flight-000002-2")
 
 
 def test_sigterm_ends_the_recording_in_order(tmp_path: Path) -> None:
@@ -299,7 +304,7 @@ def test_sigterm_ends_the_recording_in_order(tmp_path: Path) -> None:
         eventually(lambda: stand.heard.recording and stand.heard.recording[-1].active)
         eventually(lambda: len(stand.heard.of("blimp-1")) > 60)
         note = stand.heard.recording[-1]
-        assert note.file == "flight-000001.mcap" and note.free_MB and note.problem == ""
+        assert re.fullmatch(DATED, note.file) and note.free_MB and note.problem == ""
         ended = payload.end().counts
         stand.settled("blimp-1", ended)
         asked_s = time.monotonic()

@@ -22,12 +22,14 @@ def shelf(tmp_path, served):
     return tmp_path / "recordings"
 
 
-def write_recording(path, seconds=2.0):
+def write_recording(path, seconds=2.0, maps=()):
     from mcap.writer import Writer
 
     with path.open("wb") as file:
         mcap = Writer(file)
         mcap.start()
+        for name in maps:
+            mcap.add_metadata(f"map {name}", {"name": name})
         channel = mcap.register_channel("x", "json", 0)
         for at_ns in (0, int(seconds * 1e9)):
             mcap.add_message(channel, at_ns, b"{}", at_ns)
@@ -41,7 +43,7 @@ def open_files(path):
 
 def test_recordings_are_listed_with_size_and_duration(served, shelf):
     client, bus, _ = served
-    write_recording(shelf / "a.mcap")
+    write_recording(shelf / "a.mcap", maps=("hall", "hall", "atrium"))
     write_recording(shelf / "b.mcap", 3.5)
     (shelf / "cut.mcap").write_bytes((shelf / "a.mcap").read_bytes()[:-30])
     (shelf / "not-one.txt").write_text("x")
@@ -52,7 +54,8 @@ def test_recordings_are_listed_with_size_and_duration(served, shelf):
     )
     listed = {item["file"]: item for item in client.get("/api/recordings").json()}
     assert set(listed) == {"a.mcap", "b.mcap", "cut.mcap"}
-    assert listed["a.mcap"]["duration_s"] == 2.0
+    assert listed["a.mcap"]["duration_s"] == 2.0 and listed["a.mcap"]["started_ns"] == 0
+    assert listed["a.mcap"]["maps"] == ["atrium", "hall"] and listed["cut.mcap"]["maps"] == []
     assert listed["b.mcap"]["active"] and listed["b.mcap"]["duration_s"] is None
     assert listed["cut.mcap"]["duration_s"] is None and not listed["cut.mcap"]["active"]
     assert listed["a.mcap"]["size_MB"] == round((shelf / "a.mcap").stat().st_size / 1e6, 3)
@@ -102,6 +105,25 @@ def test_no_path_leaves_the_folder(served, shelf, name, rest):
     (shelf / "link.mcap").symlink_to(secret)
     os.mkfifo(shelf / "pipe.mcap")
     assert served[0].get(f"/api/recordings/{name}{rest}").status_code in (404, 422)
+    before = sorted(shelf.parent.rglob("*"))
+    assert served[0].delete(f"/api/recordings/{name}{rest}").status_code in (404, 405, 422)
+    assert sorted(shelf.parent.rglob("*")) == before
+
+
+def test_a_recording_is_deleted_but_not_the_one_being_written(served, shelf):
+    client, bus, _ = served
+    for name in ("a.mcap", "b.mcap"):
+        write_recording(shelf / name)
+    bus.put(
+        bus_messages.RECORDING, bus_messages.STATION, station.recording(active=True, file="b.mcap")
+    )
+    refused = client.delete("/api/recordings/b.mcap")
+    assert refused.status_code == 409 and "stop the recording first" in refused.json()["detail"]
+    foreign = client.delete("/api/recordings/a.mcap", headers={"origin": "http://elsewhere"})
+    assert foreign.status_code == 403
+    assert client.delete("/api/recordings/a.mcap").json()["done"]
+    assert [path.name for path in shelf.iterdir()] == ["b.mcap"]
+    assert client.delete("/api/recordings/a.mcap").status_code == 404
 
 
 def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypatch):

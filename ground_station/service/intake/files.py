@@ -12,6 +12,7 @@ import contextlib
 import json
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 from ground_station.geometry.camera import Camera
@@ -26,6 +27,8 @@ from pi_firmware.wire.recording import CALIBRATION_TOPIC, ESTIMATE_TOPIC
 
 ESTIMATE_STATE_TOPIC = "/estimate/state"
 """JSON: the whole estimate but for the pixels of its points."""
+MAP_TABLE = "map "
+"""Behind this the names of metadata tables name the maps in which a recording was localized."""
 _OVERLAP_S = 2.0
 """How long a file waits for the last frames of a stream whose next IDR does not come."""
 _MOST_STREAMS = 64
@@ -81,8 +84,12 @@ class GroundRun(run.Run):
         self._streams: dict[str, _Stream] = {}
         self._turned_s = time.monotonic()
         self._due_s: float | None = None
+        self._maps: dict[str, str] = {}
         if camera is not None:
             self._head[CAMERA_TABLE] = {"readout_s": repr(camera.readout_s)}
+
+    def _stamp(self) -> str:
+        return datetime.now(UTC).strftime("-%Y%m%dT%H%M%SZ")
 
     def _put(self, item: object) -> None:
         self._end_left()
@@ -162,6 +169,8 @@ class GroundRun(run.Run):
     def _estimate(self, item: Estimated) -> None:
         stream = self._streams.get(item.payload_id)
         note = item.note
+        if note.map and note.map != self._maps.get(item.payload_id):
+            self._in_map(item.payload_id, note.map)
         if stream is None or note.time_ns not in run.TIMES_NS or item.log_ns not in run.TIMES_NS:
             return
         if note.position_m is not None and note.quaternion_xyzw is not None:
@@ -178,6 +187,15 @@ class GroundRun(run.Run):
         text = json.dumps(document, separators=(",", ":")).encode()
         topic = stream.prefix + ESTIMATE_STATE_TOPIC
         self._say(topic, "blimp.estimate", item.log_ns, text)
+
+    def _in_map(self, payload_id: str, name: str) -> None:
+        """Says, in this file and all that follow, in which map a payload is localized now."""
+        self._head.pop(MAP_TABLE + self._maps.get(payload_id, ""), None)
+        self._maps[payload_id] = name
+        for one in self._maps.values():
+            if MAP_TABLE + one not in self._head:
+                self._head[MAP_TABLE + one] = {"name": one}
+                self._current.writer.write_metadata(MAP_TABLE + one, {"name": one})
 
     def _say(self, topic: str, schema: str, log_ns: int, text: bytes) -> None:
         if log_ns in run.TIMES_NS:

@@ -21,6 +21,7 @@ from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.mcap_records import MAGIC
+from pi_firmware.wire.recorder.folder import number_of
 
 CUT = "recording-cut"
 MOST_IN_A_ROW = 5
@@ -111,9 +112,9 @@ def _cut(folder: Path) -> Iterator[tuple[Path, int]]:
     Up to one that has it, or is much older than the newest.
     """
     newest_ns: int | None = None
-    # Their numbers rise, and have more digits one day.
-    for path in sorted(folder.iterdir(), key=lambda p: (len(p.name), p.name), reverse=True):
-        if not path.match("flight-*.mcap") or path.is_symlink() or not path.is_file():
+    ours = [(number, path) for path in folder.iterdir() if (number := number_of(path.name))]
+    for _, path in sorted(ours, reverse=True):
+        if path.is_symlink() or not path.is_file():
             continue
         with path.open("rb") as file:
             status = os.fstat(file.fileno())

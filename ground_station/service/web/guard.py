@@ -54,7 +54,7 @@ class Guard:
                 raise
             await self._refuse(scope, refused, answer)
         finally:
-            known = method if method in (*_SAFE, "POST", "WS") else "other"
+            known = method if method in (*_SAFE, "POST", "DELETE", "WS") else "other"
             self._answers[known, answer.status_class] += 1
 
     def _check(self, scope: Scope, method: str) -> None:

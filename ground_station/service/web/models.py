@@ -210,5 +210,7 @@ class RecordingModel(BaseModel):
     file: str
     size_MB: float
     modified_ns: int
+    started_ns: int | None
     duration_s: float | None
+    maps: list[str]
     active: bool

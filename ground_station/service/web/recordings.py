@@ -1,4 +1,4 @@
-"""The ground's recordings: a list, downloads, and trajectories as TUM text."""
+"""The ground's recordings: a list, downloads, trajectories as TUM text, and their end."""
 
 from __future__ import annotations
 
@@ -8,21 +8,32 @@ import re
 import stat
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.exceptions import HTTPException
 
-from ground_station.service.web.models import FILE_PATTERN, FileName, RecordingModel
+from ground_station.errors import GroundStationError
+from ground_station.service.intake.files import MAP_TABLE
+from ground_station.service.web.models import FILE_PATTERN, AnswerModel, FileName, RecordingModel
 from ground_station.service.web.problems import Busy, NotFound, problems
 
 _FILES = 500
 _PIECE_BYTES = 256 * 1024
 _NAME = re.compile(FILE_PATTERN)
+_MAPS_SHOWN = 8
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+
+
+class _Told(NamedTuple):
+    """What a file's summary says; nothing where it has none, as after a cut."""
+
+    started_ns: int | None = None
+    duration_s: float | None = None
+    maps: Sequence[str] = ()
 
 
 class Recordings:
@@ -30,7 +41,7 @@ class Recordings:
 
     def __init__(self, folder: Path, active: Callable[[], str]) -> None:
         self._folder, self._active = folder, active
-        self._durations: OrderedDict[str, tuple[tuple[int, int], float | None]] = OrderedDict()
+        self._told: OrderedDict[str, tuple[tuple[int, int], _Told]] = OrderedDict()
         self._lock = threading.Lock()
         self._exporting = threading.BoundedSemaphore(1)
 
@@ -49,7 +60,7 @@ class Recordings:
                 "file": name,
                 "size_MB": round(status.st_size / 1e6, 3),
                 "modified_ns": status.st_mtime_ns,
-                "duration_s": None if name == active else self._duration_s(name, status),
+                **(_Told() if name == active else self._summary(name, status))._asdict(),
                 "active": name == active,
             }
             for status, name in found[:_FILES]
@@ -109,33 +120,46 @@ class Recordings:
         finally:
             self._exporting.release()
 
-    def _duration_s(self, name: str, status: os.stat_result) -> float | None:
-        """From the file's own summary; None where it has none, as after a cut."""
+    def delete(self, name: str) -> None:
+        """Deletes one that is not being written; raises a `BlimpError` with one line."""
+        self.size(name)
+        if name == self._active():
+            raise GroundStationError(f"{name} is being written; stop the recording first")
+        try:
+            (self._folder / name).unlink()
+        except OSError as error:
+            raise NotFound(f"{name}: {error.strerror or error}") from None
+
+    def _summary(self, name: str, status: os.stat_result) -> _Told:
         identity = (status.st_size, status.st_mtime_ns)
         with self._lock:
-            kept = self._durations.get(name)
+            kept = self._told.get(name)
             if kept is not None and kept[0] == identity:
                 return kept[1]
-        duration_s = _summed_up_s(self._folder / name)
+        told = _summed_up(self._folder / name)
         with self._lock:
-            self._durations[name] = (identity, duration_s)
-            while len(self._durations) > 2 * _FILES:
-                self._durations.popitem(last=False)
-        return duration_s
+            self._told[name] = (identity, told)
+            while len(self._told) > 2 * _FILES:
+                self._told.popitem(last=False)
+        return told
 
 
-def _summed_up_s(path: Path) -> float | None:
+def _summed_up(path: Path) -> _Told:
     from mcap.reader import SeekingReader
 
     try:
         with path.open("rb") as file:
             summary = SeekingReader(file, record_size_limit=64 << 20).get_summary()
     except Exception:  # a cut or foreign file: whatever its reader stumbles over
-        return None
+        return _Told()
     figures = summary.statistics if summary else None
-    if figures is None or not figures.message_count:
-        return None
-    return round(1e-9 * (figures.message_end_time - figures.message_start_time), 3)
+    if summary is None or figures is None or not figures.message_count:
+        return _Told()
+    started_ns = figures.message_start_time
+    tables = sorted({index.name for index in summary.metadata_indexes})
+    maps = [name.removeprefix(MAP_TABLE)[:128] for name in tables if name.startswith(MAP_TABLE)]
+    duration_s = round(1e-9 * (figures.message_end_time - started_ns), 3)
+    return _Told(started_ns, duration_s, maps[:_MAPS_SHOWN])
 
 
 def _portion(header: str | None, size: int) -> tuple[int, int] | None:
@@ -195,6 +219,12 @@ def router(recordings: Recordings) -> APIRouter:
             headers,
             media_type="application/octet-stream",
         )
+
+    @result.delete("/{file}", response_model=AnswerModel, responses=problems(404, 409))
+    def delete(file: FileName) -> Any:
+        """Deletes a recording for good."""
+        recordings.delete(file)
+        return {"done": True, "reason": "", "values": {}}
 
     @result.get(
         "/{file}/trajectory.txt",

@@ -10,13 +10,20 @@ from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recorder.limits import Limits
 
 MB = 1_000_000
-_NAME = re.compile(r"flight-([0-9]{6,9})\.mcap")
+_NAME = re.compile(r"flight-([0-9]{6,9})(?:-[0-9TZ]{16})?\.mcap")
 _HIGHEST = 999_999_999
+
+
+def number_of(name: str) -> int | None:
+    """The number in the name of one of our files; None for any other."""
+    match = _NAME.fullmatch(name)
+    return int(match[1]) if match else None
 
 
 class Folder:
     """Our files `flight-000001.mcap` and on, and nothing else that lies there.
 
+    Whose clock is set puts the time behind the number, as `flight-000001-20260131T142530Z.mcap`.
     Numbers rise from the highest present, whatever the clock believes. Ours is a regular file of
     such a name; a folder or a link of that name takes a number and is neither counted nor deleted.
     Methods raise `RecordingError` with one line.
@@ -31,7 +38,7 @@ class Folder:
         self._earlier: list[tuple[int, Path, int]] = []
         self._earlier_bytes = 0
 
-    def next_path(self) -> Path:
+    def next_path(self, stamp: str = "") -> Path:
         """Looks through the folder, made if missing; the path of the file to write next."""
         try:
             self.path.mkdir(exist_ok=True)
@@ -40,7 +47,7 @@ class Folder:
             raise self._fail(error) from None
         if highest >= _HIGHEST:
             raise RecordingError(f"recording.folder '{self.path}': no number above {highest}")
-        return self.path / f"flight-{highest + 1:06d}.mcap"
+        return self.path / f"flight-{highest + 1:06d}{stamp}.mcap"
 
     def make_room(self, file_bytes: int, more_bytes: int) -> None:
         """For a file being written that will have `file_bytes` after `more_bytes` more.
@@ -88,10 +95,9 @@ class Folder:
         self._earlier = []
         with os.scandir(self.path) as entries:
             for entry in entries:
-                match = _NAME.fullmatch(entry.name)
-                if match is None:
+                number = number_of(entry.name)
+                if number is None:
                     continue
-                number = int(match[1])
                 highest = max(highest, number)
                 try:
                     if entry.is_file(follow_symlinks=False):

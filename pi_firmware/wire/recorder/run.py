@@ -123,6 +123,10 @@ class Run(ABC):
     def _put(self, item: object) -> None:
         """Writes an item of the queue; a frame that cannot be written is one of `_left_out`."""
 
+    def _stamp(self) -> str:
+        """What a file's name says behind its number; nothing where the clock may be wrong."""
+        return ""
+
     def _before_end(self) -> None:  # noqa: B027  # what a file needs at its end, if anything
         """All of the queue is written; what else there is goes into the file now."""
 
@@ -205,7 +209,7 @@ class Run(ABC):
         self._end_file(file, "goes on in the next file")
 
     def _open_next(self) -> None:
-        path = self._folder.next_path()
+        path = self._folder.next_path(self._stamp())
         self._folder.make_room(HEAD_BYTES, HEAD_BYTES)
         self._first = self._first or path.name
         self._part += 1

@@ -20,7 +20,7 @@ def fuzz(data: bytes) -> None:
     picker = Picker(data)
     for number in range(1 + picker.number(1) % 3):
         content = mcap_file.build(picker.block())
-        (_FOLDER / f"flight-{number:04d}.mcap").write_bytes(content)
+        (_FOLDER / f"flight-{number:06d}.mcap").write_bytes(content)
     cut = newest_cut(_FOLDER)
     assert cut is None or 1 <= cut.in_a_row <= 3
 

@@ -3,10 +3,13 @@
 
 const LIMIT_MS = 8000;
 
-/** @param {string} path @param {unknown} [body] posts it as JSON @returns {Promise<Response>} */
-function ask(path, body) {
+/**
+ * @param {string} path @param {unknown} [body] goes as JSON @param {string} [method] with a body
+ * @returns {Promise<Response>}
+ */
+function ask(path, body, method = "POST") {
   const post = body === undefined ? {} : {
-    method: "POST",
+    method,
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(body),
   };
@@ -60,10 +63,10 @@ export async function getBytes(path) {
   return response.arrayBuffer();
 }
 
-/** @param {string} path @param {unknown} body @returns {Promise<import("./types.js").Answer>} */
-export async function post(path, body) {
+/** @param {string} path @param {unknown} body @param {string} [method] @returns {Promise<import("./types.js").Answer>} */
+export async function post(path, body, method) {
   try {
-    const response = await ask(path, body);
+    const response = await ask(path, body, method);
     if (!response.ok) return { done: false, reason: await reasonOf(response) };
     const answer = await response.json();
     return { ...answer, done: answer.done !== false, reason: String(answer.reason ?? "") };
@@ -79,4 +82,6 @@ export const relocalize = (/** @type {string} */ id) => post(`${payload(id)}/rel
 export const chooseMap = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/map`, { name });
 export const command = (/** @type {string} */ id, /** @type {string} */ name, /** @type {Record<string, number>} */ values = {}) =>
   post(`${payload(id)}/command`, { name, arguments: values });
+export const recordingPath = (/** @type {string} */ file) => `/api/recordings/${encodeURIComponent(file)}`;
+export const deleteRecording = (/** @type {string} */ file) => post(recordingPath(file), {}, "DELETE");
 export const mapPath = (/** @type {string} */ name) => `/api/maps/${encodeURIComponent(name)}`;

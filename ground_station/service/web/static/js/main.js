@@ -16,6 +16,7 @@ import { Loop } from "./loop.js";
 import { Maps } from "./maps.js";
 import { Plan } from "./plan.js";
 import { body } from "./protocol.js";
+import { RecordingsDialog } from "./recordings.js";
 import { Scene } from "./scene.js";
 import { Status } from "./status.js";
 import { Store } from "./store.js";
@@ -56,6 +57,7 @@ const timing = new Timing(store, loop, theme, video);
 const alarms = new Alarms(store, loop);
 const mapDialog = new MapDialog(store);
 const powerDialog = new PowerDialog(store);
+const recordings = new RecordingsDialog();
 const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
 new Layout(() => {
   theme.read();
@@ -130,6 +132,7 @@ new Keyboard(
     { key: "p", does: "Start or stop recording on the payload", act: () => actions.buttons["payload-record"].node.click() },
     { key: "l", does: "Relocalize", act: () => actions.buttons.relocalize.node.click() },
     { key: "m", does: "Choose a map", act: () => actions.buttons.map.node.click() },
+    { key: "g", does: "Recordings", act: () => recordings.open() },
     { key: "i", does: "Refresh the picture (key frame)", act: () => actions.buttons.idr.node.click() },
     { key: "a", does: "Acknowledge all alarms", act: () => alarms.acknowledgeAll() },
     { key: "s", does: "Alarm sound on or off", act: () => alarms.turnSound() },

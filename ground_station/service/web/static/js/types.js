@@ -102,6 +102,15 @@
  * @property {number} width_px of the camera's picture, which `points_px` are of
  * @property {number} height_px
  *
+ * @typedef {object} RecordingFile
+ * @property {string} file
+ * @property {number} size_MB
+ * @property {number} modified_ns
+ * @property {number|null} started_ns null where it was cut
+ * @property {number|null} duration_s
+ * @property {string[]} maps in which it was localized
+ * @property {boolean} active
+ *
  * @typedef {object} MapSummary
  * @property {string} name
  * @property {boolean} registered
