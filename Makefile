@@ -3,7 +3,7 @@
 BLIMP := .venv/bin/blimp
 
 .PHONY: help setup demo serve test check bench experiments budget hil soak soak-service limits faults fuzz \
-  soak-stream install-service uninstall-service image flash update hil-image lock sample virtual-camera
+  soak-stream install-service uninstall-service image flash update hil-image lock sample picture virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -102,6 +102,9 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 	@$(BLIMP) map build maps/atrium/mapping.mcap --settings maps/atrium/mapping.toml --out maps/atrium
 	@$(BLIMP) map register maps/atrium --pairs maps/atrium/PAIRS.csv
 	@$(BLIMP) map export maps/atrium --png maps/atrium/map.png
+
+picture: setup  ## Make README's picture of the dashboard anew, with the system's Chromium
+	@.venv/bin/python tests/service/dashboard_picture.py ground_station/service/dashboard.jpg
 
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
 	@sh tests/pi_firmware/virtual_camera/setup.sh

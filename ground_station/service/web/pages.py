@@ -14,12 +14,12 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from ground_station.service.web.access import COOKIE, SESSION_S, Access, Refused
 
 _CSS = """\
-:root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
+:root { color-scheme: light dark; background: Canvas; font: 16px/1.5 system-ui, sans-serif; }
 body { max-width: 60rem; margin: 0 auto; padding: 2rem 1rem 4rem; }
 form { max-width: 22rem; margin: 12vh auto 0; display: grid; gap: 0.75rem; }
 input, button { font: inherit; padding: 0.6rem 0.75rem; border-radius: 0.4rem; border: 1px solid #8888; }
 button { cursor: pointer; background: #0b62c4; color: #fff; border: 0; }
-p.problem { margin: 0; color: #c4320b; }
+p.problem { margin: 0; color: light-dark(#b33c00, #ff8a4d); }
 code, pre { font: 0.9em/1.45 ui-monospace, monospace; }
 pre { padding: 0.75rem; overflow-x: auto; border: 1px solid #8884; border-radius: 0.4rem; }
 section { border-top: 1px solid #8884; padding-top: 0.5rem; margin-top: 1.5rem; }
@@ -36,7 +36,7 @@ def _page(title: str, body: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<title>{html.escape(title)}</title><link rel="icon" href="data:,">'
         '<link rel="stylesheet" href="/page.css"></head>'
-        f"<body>{body}</body></html>"
+        f"<body><main>{body}</main></body></html>"
     )
 
 
@@ -136,7 +136,7 @@ def _docs_page(schema: Mapping[str, Any]) -> str:
     parts.append("<section><h2>Types</h2>")
     for name, model in schema.get("components", {}).get("schemas", {}).items():
         text = html.escape(json.dumps(model, indent=1))
-        parts.append(f'<h3 id="{html.escape(name)}">{html.escape(name)}</h3><pre>{text}</pre>')
+        parts.append(f'<h3 id="{html.escape(name)}">{html.escape(name)}</h3><pre tabindex="0">{text}</pre>')
     return _page(info["title"], "".join(parts) + "</section>")
 
 
@@ -148,7 +148,7 @@ def _operation(path: str, method: str, operation: Mapping[str, Any]) -> Iterator
     )
     if body := operation.get("requestBody"):
         yield f"<p>Takes {_types(body)}</p>"
-    yield "<table><tr><th>Status</th><th>Answer</th><th></th></tr>"
+    yield "<table><tr><th>Status</th><th>Answer</th><th>Meaning</th></tr>"
     for status, answer in operation.get("responses", {}).items():
         text = html.escape(str(answer.get("description", "")))
         cells = (html.escape(str(status)), _types(answer), text)
