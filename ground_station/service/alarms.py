@@ -17,6 +17,10 @@ from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
 
 HOLD_S = 3.0
 LOST_S, NO_FRAMES_S, NO_POSES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 4.0, 10.0
+NOTHING_KNOWN_S = 10.0
+CLOCK_LOOSE_S, CLOCK_OVER = 0.05, 0.8
+LOSS_HIGH, LOSS_NO_MORE_HIGH = 0.05, 0.03
+"""Of the packets; what is sent again mends nearly all of less."""
 SILENT_S, RESTARTED_S = 5.0, 30.0
 RESUMED_S = 120.0
 GONE_FOR_S = 600.0
@@ -104,6 +108,7 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
             yield from _of_gone(payload_id, view)
             continue
         yield from _of_flight(payload_id, view)
+        yield from _of_link(payload_id, view, standing)
         yield from _of_board(payload_id, view, standing)
 
 
@@ -120,8 +125,12 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
         yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, text)
     estimates_come = estimate_s is not None and estimate_s <= NO_FRAMES_S
     estimate, state_s = _table(view, "estimate"), _number(view.get("state_s")) or 0.0
-    if estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:
-        reason = str(estimate.get("reason") or "")
+    nothing_s = _number(view.get("nothing_known_s")) or 0.0
+    reason = str(estimate.get("reason") or "")
+    if estimates_come and nothing_s > NOTHING_KNOWN_S and not reason.startswith(NO_MAP):
+        text = f"nothing of the map {estimate.get('map')} has been recognised for {nothing_s:.0f} s"
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, f"{text}: is it this building?")
+    elif estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:
         text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
         yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
     if estimates_come and (overload := str(estimate.get("overload") or "")):
@@ -129,6 +138,21 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
     if frames_come and estimate_s is not None and min(estimate_s, alive_s) > NO_POSES_S:
         text = f"frames come, but none was localized for {estimate_s:.0f} s"
         yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)
+
+
+def _of_link(payload_id: str, view: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
+    note = _table(view, "payload")
+    share, name = _number(note.get("lost_share")), f"radio/{payload_id}"
+    if share is not None and share > (LOSS_NO_MORE_HIGH if name in standing else LOSS_HIGH):
+        signal = _number(_table(note, "health").get("wifi_signal_dBm"))
+        text = f"the radio loses {100 * share:.0f} % of the packets"
+        text += f", at {signal:.0f} dBm" if signal is not None else ""
+        yield Alarm(name, WARNING, payload_id, f"{text}: nearer to the access point?")
+    uncertain_ns = _number(_table(note, "clock").get("uncertainty_ns"))
+    limit_s = CLOCK_LOOSE_S * (CLOCK_OVER if f"clock/{payload_id}" in standing else 1.0)
+    if uncertain_ns is not None and uncertain_ns > 1e9 * limit_s:
+        text = f"the payload's clock is known to ±{1e-6 * uncertain_ns:.0f} ms only: slow network?"
+        yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
     unknown_s = _number(view.get("clock_unknown_s"))
     if unknown_s is not None and unknown_s > CLOCK_UNKNOWN_S:
         text = "the payload's clock is not known: poses have no exact time"

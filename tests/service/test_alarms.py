@@ -74,7 +74,7 @@ def test_a_critical_battery_tells_its_figures(told):
 
 
 def test_too_little_processor_is_said_for_itself_however_good_the_poses(told):
-    text = "overload: 14 of 60 frames skipped in 2 s; keyframes are rare"
+    text = "this computer is too slow: 14 of 60 frames skipped in 2 s; keyframes are rare"
     told[0].estimate(P, station.estimate(state="TRACKING", overload=text))
     (item,) = alarms.judge(told[0].document(), 0, {}).values()
     assert (item.alarm.id, item.alarm.level, item.alarm.text) == (f"overload/{P}", "warning", text)
@@ -90,6 +90,49 @@ def test_lost_for_more_than_two_seconds(told, after_s, found):
     snapshot.frame(P, station.frame())
     snapshot.payload(P, station.payload())
     assert (f"lost/{P}" in ids(snapshot)) == found
+
+
+@pytest.mark.parametrize("state", ["LOST", "INITIALIZING"])
+def test_ten_seconds_in_which_nothing_of_the_map_is_known_ask_for_the_building(told, state):
+    snapshot, clock = told
+
+    def texts() -> list[str]:
+        return [one.alarm.text for one in alarms.judge(snapshot.document(), 0, {}).values()]
+
+    for k in range(12):
+        blind = station.estimate(state=state, reason="searching", position_m=None, map="hall")
+        snapshot.estimate(P, blind)
+        assert any("this building" in text for text in texts()) == (k > 10)
+        clock.ns += S
+        snapshot.payload(P, station.payload())
+        snapshot.frame(P, station.frame())
+        snapshot.process("-", station.process())
+    assert "nothing of the map hall has been recognised for 12 s" in texts()[0]
+    clock.ns += 60 * S  # nothing came, which is no sight of an unknown place
+    snapshot.estimate(P, blind)
+    snapshot.frame(P, station.frame())
+    assert not any("this building" in text for text in texts())
+
+
+@pytest.mark.parametrize(
+    ("link", "standing", "text"),
+    [
+        ({"lost_share": 0.08}, False, "the radio loses 8 % of the packets, at -61 dBm: nearer"),
+        ({"lost_share": 0.04}, False, ""),
+        ({"lost_share": 0.04}, True, "the radio loses 4 % of the packets"),
+        ({"lost_share": 0.02}, True, ""),
+        ({"lost_share": float("nan")}, False, ""),
+        ({"clock": {"uncertainty_ns": 80_000_000}}, False, "known to ±80 ms only: slow network?"),
+        ({"clock": {"uncertainty_ns": 8_000_000}}, True, ""),
+        ({"clock": {"uncertainty_ns": "x"}}, False, ""),
+    ],
+)
+def test_a_bad_link_names_what_is_bad(told, link, standing, text):
+    health = {"time_ns": 1, "wifi_signal_dBm": -61}
+    told[0].payload(P, station.payload(health=health, **link))
+    names = frozenset((f"radio/{P}", f"clock/{P}") if standing else ())
+    texts = [alarm.text for alarm in alarms._found(told[0].document(), 0, names)]
+    assert bool(texts) == bool(text) and all(text in one for one in texts)
 
 
 @pytest.mark.parametrize(("after_s", "found"), [(1.5, False), (2.5, True)])

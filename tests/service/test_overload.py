@@ -35,7 +35,9 @@ def test_a_frame_missed_now_and_then_is_none(localizer):
 
 def test_skipped_frames_are_said_and_keyframes_become_rare(localizer):
     said = fly(Overload(), localizer, 2)
-    assert said[-1] == "overload: 30 of 60 frames skipped in 2 s; keyframes are rare"
+    assert (
+        said[-1] == "this computer is too slow: 30 of 60 frames skipped in 2 s; keyframes are rare"
+    )
     assert localizer.overloaded
 
 
@@ -54,5 +56,5 @@ def test_it_ends_with_its_cause_and_with_a_new_count(localizer):
 def test_late_features_alone_are_said_and_shed_nothing(localizer):
     localizer.keyframe_late_s = 1.4
     said = fly(Overload(), localizer, 1, 60)
-    assert said[-1] == "overload: features under way for 1.4 s; keyframes are late"
+    assert said[-1] == "this computer is too slow: features under way for 1.4 s; keyframes are late"
     assert not localizer.overloaded

@@ -10,7 +10,7 @@ import web_station as station
 
 from ground_station.service import settings
 from ground_station.service.web import trail
-from ground_station.service.web.snapshot import EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
+from ground_station.service.web.snapshot import EVENTS, EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
 
 S = 1_000_000_000
 P = station.PAYLOAD
@@ -154,3 +154,20 @@ def test_standing_still_is_no_gap_and_takes_no_room():
     walked.add(30 * S, [1.0, 0.0, 0.0])
     points, breaks = walked.document()
     assert len(points) == 2 and breaks == []
+
+
+def test_events_outlive_the_web_process_and_their_file_is_bounded(tmp_path):
+    path = tmp_path / "events.jsonl"
+    path.write_bytes(b'{"cut\n[]\n{"payload": 1}\n\xff')
+    first = Snapshot(station.run_of(tmp_path), "0")
+    first.keep_events(path)
+    for k in range(3 * EVENTS):
+        first.event(P, station.event(text=f"event {k}"))
+    assert path.read_text().count("\n") <= 2 * EVENTS
+    with path.open("a") as file:
+        file.write('{"killed while')
+    second = Snapshot(station.run_of(tmp_path), "0")
+    second.keep_events(path)
+    assert second.events() == first.events()
+    assert second.events()[-1]["text"] == f"event {3 * EVENTS - 1}"
+    assert second.events()[-1]["payload"] == P

@@ -302,6 +302,7 @@ def test_a_web_process_that_dies_disturbs_nobody(tracked: Flying) -> None:
     with service.bus() as bus, Viewer(service, NAME) as viewer:
         estimates = Estimates(bus)
         eventually(lambda: viewer.counts.get("estimate", 0) > 5 and estimates.done_ns)
+        events = service.state()["events"]
         os.kill(before["web"].pid, signal.SIGKILL)
         taken = len(estimates.done_ns[NAME])
         page_s = seconds(lambda: another(service, before["web"]) and service.answers())
@@ -310,6 +311,7 @@ def test_a_web_process_that_dies_disturbs_nobody(tracked: Flying) -> None:
         seen = dict(viewer.counts)
         eventually(lambda: viewer.connections == 2 and viewer.counts["video"] > seen["video"] + 5)
     print(f"\nweb: back in {page_s:.1f} s")
+    assert events and service.state()["events"][: len(events)] == events
     eventually(lambda: service.tracking(NAME))
     only_this_one_fell(service, before, "web")
 

@@ -36,8 +36,12 @@ class Overload:
         localizer.overloaded = lost > SKIPPED * told
         if localizer.overloaded:
             return (
-                f"overload: {lost} of {told} frames skipped in {WINDOW_S:g} s; keyframes are rare"
+                f"this computer is too slow: {lost} of {told} frames skipped in {WINDOW_S:g} s;"
+                " keyframes are rare"
             )
         if late_s > LATE_S:
-            return f"overload: features under way for {late_s:.1f} s; keyframes are late"
+            return (
+                f"this computer is too slow: features under way for {late_s:.1f} s;"
+                " keyframes are late"
+            )
         return ""

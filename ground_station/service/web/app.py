@@ -72,6 +72,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     """Puts the application together; it hears the bus while it is served."""
     settings = run.station
     snapshot = Snapshot(run, __version__)
+    snapshot.keep_events(folder / "events.jsonl")
     metrics = Metrics(snapshot)
     access = Access(settings.http, token)
 

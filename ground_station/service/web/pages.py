@@ -136,7 +136,9 @@ def _docs_page(schema: Mapping[str, Any]) -> str:
     parts.append("<section><h2>Types</h2>")
     for name, model in schema.get("components", {}).get("schemas", {}).items():
         text = html.escape(json.dumps(model, indent=1))
-        parts.append(f'<h3 id="{html.escape(name)}">{html.escape(name)}</h3><pre tabindex="0">{text}</pre>')
+        parts.append(
+            f'<h3 id="{html.escape(name)}">{html.escape(name)}</h3><pre tabindex="0">{text}</pre>'
+        )
     return _page(info["title"], "".join(parts) + "</section>")
 
 

@@ -6,7 +6,9 @@ from when a value last came, so that no other clock's error makes an old value l
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import threading
 import time
 from collections import OrderedDict, deque
@@ -29,7 +31,7 @@ from ground_station.service.settings import Run
 from ground_station.service.web.access import is_loopback
 from ground_station.service.web.trail import Trail
 from pi_firmware.wire import messages
-from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.errors import BlimpError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
 
 EVENTS, EVENTS_SHOWN, PAYLOADS, PROCESSES = 500, 200, 32, 32
@@ -59,6 +61,7 @@ class _Payload:
     came_ns: dict[str, int] = field(default_factory=dict)
     message_ns: dict[str, Any] = field(default_factory=dict)
     state_ns: int = 0
+    nothing_ns: int | None = None  # since when frames have been localized in vain
     clock_ns: int | None = None  # since when the payload's clock is not known
     ended: bool = False
     alive_ns: int | None = None  # since when it is heard
@@ -88,6 +91,8 @@ class Snapshot:
         self._payloads: OrderedDict[str, _Payload] = OrderedDict()
         self._processes: dict[str, _Process] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+        self._kept: Path | None = None
+        self._lines = 0  # added to the file
         self._recording: RecordingMessage | None = None
         self._recording_ns = 0
         self._alarms: list[dict[str, Any]] = []
@@ -101,6 +106,31 @@ class Snapshot:
         bus.subscribe(bus_messages.EVENT, EventMessage, self.event)
         bus.subscribe(bus_messages.RECORDING, RecordingMessage, self.recording)
         bus.subscribe(bus_messages.PROCESS, ProcessMessage, self.process)
+
+    def keep_events(self, path: Path) -> None:
+        """Takes up the events that an earlier process of this run kept there, and keeps its own."""
+        with contextlib.suppress(OSError), self._lock:
+            for line in path.read_bytes().splitlines()[-EVENTS:]:
+                with contextlib.suppress(BlimpError, ValueError, KeyError, TypeError):
+                    note = bus_messages.decode(EventMessage, line)
+                    payload_id = str(json.loads(line)["payload"])
+                    self._events.append({**bus_messages.as_document(note), "payload": payload_id})
+        self._kept, self._lines = path, EVENTS  # the first to come writes it anew
+
+    def _add(self, event: dict[str, Any]) -> None:
+        """Call it with the lock held."""
+        self._events.append(event)
+        if self._kept is None:
+            return
+        self._lines += 1
+        anew = self._lines > EVENTS  # the file has twice as many at most
+        text = "".join(json.dumps(one) + "\n" for one in (self._events if anew else (event,)))
+        with (
+            contextlib.suppress(OSError),  # the run's folder is full
+            self._kept.open("w" if anew else "a") as file,
+        ):
+            file.write(text)
+        self._lines = 0 if anew else self._lines
 
     def on_evicted(self, call: Callable[[str], None]) -> None:
         """`call` gets the id of each payload that is forgotten."""
@@ -123,6 +153,11 @@ class Snapshot:
             now_ns = self._clock_ns()
             if item.estimate is None or item.estimate.state != note.state:
                 item.state_ns = now_ns
+            silent = now_ns - item.came_ns.get("estimate", 0) > 1e9 * STALE_S["estimate"]
+            if note.position_m is not None:
+                item.nothing_ns = None
+            elif item.nothing_ns is None or silent:
+                item.nothing_ns = now_ns
             item.came_ns["estimate"] = now_ns
             if len(note.points_px) > 2 * POINTS:
                 note = dataclasses.replace(note, points_px=note.points_px[: 2 * POINTS])
@@ -159,7 +194,7 @@ class Snapshot:
         """Something happened."""
         note = dataclasses.replace(note, text=note.text[:TEXT], name=note.name[:64])
         with self._lock:
-            self._events.append({**bus_messages.as_document(note), "payload": payload_id})
+            self._add({**bus_messages.as_document(note), "payload": payload_id})
             if note.source == "payload" and note.name in _ENDED and payload_id in self._payloads:
                 self._payloads[payload_id].ended = True
 
@@ -178,9 +213,7 @@ class Snapshot:
             event = EventMessage(
                 time_ns, "intake", bus_messages.WARNING, bus_messages.RECORDING_RESUMED, text
             )
-            self._events.append(
-                {**bus_messages.as_document(event), "payload": bus_messages.STATION}
-            )
+            self._add({**bus_messages.as_document(event), "payload": bus_messages.STATION})
 
     def process(self, _: str, note: ProcessMessage) -> None:
         """A process lives. One with another id than before was started again."""
@@ -283,6 +316,7 @@ class Snapshot:
             "age_s": age_s,
             "stale": [name for name, age in age_s.items() if age and age > STALE_S[name]],
             "state_s": _age_s(now_ns, item.state_ns if estimate else None),
+            "nothing_known_s": _age_s(now_ns, item.nothing_ns),
             "clock_unknown_s": _age_s(now_ns, item.clock_ns),
         }
         if full:
