@@ -96,6 +96,7 @@ class EstimateMessage(Message):
     covariance: Matrix6 | None = None
     position_sigma_m: Matrix3 | None = None
     velocity_mps: Vector3 | None = None  # world axes
+    turn_radps: Vector3 | None = None  # about the camera's axes
     heading_deg: float | None = None  # of the view, from the map's x axis towards y
     speed_mps: float | None = None
     height_m: float | None = None

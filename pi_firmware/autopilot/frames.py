@@ -54,12 +54,25 @@ class Mounting:
 class VehiclePose:
     """North, east, down (m) and roll, pitch, yaw (rad) of the vehicle.
 
-    `covariance` (6, 6) is in this order; None where it is not known.
+    `covariance` (6, 6) is in this order; None where it is not known. `velocity_mps` and
+    `turn_radps` are the vehicle's, along and about its own axes; None where they are not known.
     """
 
     position_m: Array
     angles_rad: Array
     covariance: Array | None
+    velocity_mps: Array | None = None
+    turn_radps: Array | None = None
+
+    def quaternion_wxyz(self) -> list[float]:
+        """Of nTb, from its angles."""
+        c, s = np.cos(self.angles_rad / 2).tolist(), np.sin(self.angles_rad / 2).tolist()
+        return [
+            c[0] * c[1] * c[2] + s[0] * s[1] * s[2],
+            s[0] * c[1] * c[2] - c[0] * s[1] * s[2],
+            c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
+            c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
+        ]
 
     def upper_triangle(self) -> list[float]:
         """The 21 numbers of MAVLink, row by row; the first is NaN where it is not known."""
@@ -73,10 +86,13 @@ def vehicle_pose(
     quaternion_xyzw: Sequence[float],
     covariance: Array | None,
     mounting: Mounting,
+    velocity_mps: Sequence[float] | None = None,
+    turn_radps: Sequence[float] | None = None,
 ) -> VehiclePose:
     """The vehicle's pose from the camera's: position and quaternion of wTc, its covariance (6, 6).
 
-    Raises `ValueError` for a quaternion that is no rotation.
+    `velocity_mps` is the camera's in the map's axes, `turn_radps` its turn about its own. Raises
+    `ValueError` for a quaternion that is no rotation.
     """
     wRc = _matrix(quaternion_xyzw)
     bRc, nRw = mounting.bRc, mounting.nRw
@@ -101,7 +117,12 @@ def vehicle_pose(
         jacobian[:3, 3:] = nRc
         jacobian[3:, :3] = turn @ bRc
         covariance = jacobian @ covariance @ jacobian.T
-    return VehiclePose(nRw @ np.asarray(position_m, float) - nRb @ offset, angles, covariance)
+    velocity = turned = None
+    if velocity_mps is not None and turn_radps is not None:
+        turned = bRc @ np.asarray(turn_radps, float)
+        velocity = nRb.T @ nRw @ np.asarray(velocity_mps, float) - np.cross(turned, offset)
+    position = nRw @ np.asarray(position_m, float) - nRb @ offset
+    return VehiclePose(position, angles, covariance, velocity, turned)
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Array:

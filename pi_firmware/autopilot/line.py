@@ -1,4 +1,4 @@
-"""MAVLink 2 with an ArduPilot vehicle over a serial line, on a thread of its own."""
+"""MAVLink 2 with an autopilot over a serial line, on a thread of its own."""
 
 from __future__ import annotations
 
@@ -29,8 +29,16 @@ _AUTOPILOT_COMPONENT = 1
 _UNKNOWN_MV = 0xFFFF
 
 
+def _quality(share: float | None) -> int:
+    """As MAVLink has it: percent from 1, 0 where it is not known."""
+    return 0 if share is None else round(min(max(100 * share, 1), 100))
+
+
 class SerialAutopilot:
-    """Sends `VISION_POSITION_ESTIMATE`, and keeps what heartbeat, attitude and battery say.
+    """Sends `ODOMETRY`, and keeps what heartbeat, attitude and battery say.
+
+    A pose without a velocity goes as `VISION_POSITION_ESTIMATE`: not every autopilot takes an
+    `ODOMETRY` whose velocity is unknown for what it is.
 
     Only the newest pose waits; a line that is slow, stuck or gone costs poses and nothing else. A
     line that vanishes is opened again, ever more seldom up to 5 s.
@@ -168,6 +176,21 @@ class SerialAutopilot:
         pose = self.poses.take(message, time.time_ns())
         if pose is None:
             return None
+        if pose.velocity_mps is not None and pose.turn_radps is not None:
+            return mavlink.MAVLink_odometry_message(
+                message.capture_ns // 1000,
+                mavlink.MAV_FRAME_LOCAL_FRD,  # the one that both ArduPilot and PX4 take
+                mavlink.MAV_FRAME_BODY_FRD,
+                *pose.position_m.tolist(),
+                pose.quaternion_wxyz(),
+                *pose.velocity_mps.tolist(),
+                *pose.turn_radps.tolist(),
+                pose.upper_triangle(),
+                [math.nan] + [0.0] * 20,
+                self.poses.reset_counter,
+                mavlink.MAV_ESTIMATOR_TYPE_VISION,
+                _quality(message.quality),
+            )
         return mavlink.MAVLink_vision_position_estimate_message(
             message.capture_ns // 1000,
             *(float(v) for v in pose.position_m),

@@ -13,6 +13,7 @@ from pi_firmware.wire.messages import Pose
 
 _SENT_STATES = ("TRACKING", "DEGRADED")
 _FARTHEST_M = 10_000.0
+_FASTEST = 100.0  # m/s and rad/s
 _LARGEST_VARIANCE = 1e12  # MAVLink's numbers have single precision
 _SPEED_M_S = 3.0  # no indoor blimp is faster; what moves farther has jumped
 _TURN_DEG_S = 120.0
@@ -78,6 +79,10 @@ class PoseGate:
             return None
         if max(map(abs, position)) > _FARTHEST_M:
             return None
+        motion = message.velocity_mps, message.turn_radps
+        for values in motion:
+            if values is not None and (len(values) != 3 or max(map(abs, values)) > _FASTEST):
+                return None
         covariance = None
         if message.covariance:
             if len(message.covariance) != 36:
@@ -86,7 +91,7 @@ class PoseGate:
             if np.diag(covariance).min() < 0 or np.abs(covariance).max() > _LARGEST_VARIANCE:
                 return None
         try:
-            return vehicle_pose(position, quaternion, covariance, self._mounting)
+            return vehicle_pose(position, quaternion, covariance, self._mounting, *motion)
         except ValueError:
             return None
 

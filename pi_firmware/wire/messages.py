@@ -121,6 +121,8 @@ class Pose(Message):
     `capture_ns` is the frame's, of the payload's clock. Position (m) and quaternion x, y, z, w are
     those of wTc; None where the frame was not solved. `covariance` has 36 numbers, row by row, of
     the right tangent wTc·exp(xi) in the camera's axes, rotation (rad) before translation (m).
+    `velocity_mps` is in world axes, `turn_radps` about the camera's; None where not estimated.
+    `quality` is the share of the landmarks expected in view that were found, 0 to 1.
     """
 
     SCHEMA: ClassVar[str] = "blimp.pose"
@@ -131,6 +133,9 @@ class Pose(Message):
     position_m: list[float] | None = None
     quaternion_xyzw: list[float] | None = None
     covariance: list[float] | None = None
+    velocity_mps: list[float] | None = None
+    turn_radps: list[float] | None = None
+    quality: float | None = None
     relocalized: bool = False
 
 

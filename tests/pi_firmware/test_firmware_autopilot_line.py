@@ -2,6 +2,8 @@
 
 import math
 import os
+import select
+import struct
 import subprocess
 import sys
 import threading
@@ -91,6 +93,49 @@ def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
         vehicle.listen()
 
     until(lambda: vehicle.estimates()[-1].reset_counter >= 1, give_relocalized)
+
+
+def x25(data: bytes) -> int:
+    """MAVLink's checksum, CRC-16/MCRF4XX."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
+    return crc
+
+
+def test_a_pose_with_velocity_is_an_odometry_byte_by_byte(vehicle: Vehicle, pilot: Pilot) -> None:
+    data = b""
+    # It flies along the map's y, to the left of where it looks, and yaws to the left.
+    motion = {"velocity_mps": [0.0, 0.7, 0.0], "turn_radps": [0.0, -0.2, 0.0], "quality": 0.836}
+
+    def give() -> None:
+        nonlocal data
+        pilot.pose(1.0, **motion)
+        if select.select([vehicle.master], [], [], 0.02)[0]:
+            data += os.read(vehicle.master, 4096)
+
+    head = b"\x4b\x01\x00"  # message 331
+    until(lambda: head in data and len(data) - data.index(head) > 300, give)
+    frame = data[data.index(head) - 7 :]
+    magic, length, _, _, _, system, component = frame[:7]
+    assert (magic, system, component) == (0xFD, 1, 197)
+    extra = 91  # of its fields' names and types, in MAVLink's definition
+    assert x25(frame[1 : 10 + length] + bytes([extra])) == int.from_bytes(
+        frame[10 + length : 12 + length], "little"
+    )
+    fields = struct.Struct("<Q3f4f3f3f21f21fBBBBb")
+    payload = frame[10 : 10 + length].ljust(fields.size, b"\0")  # zeros at its end are not sent
+    usec, *values = fields.unpack(payload)
+    assert abs(usec / 1e6 - time.time()) < LIMIT_S
+    assert values[:3] == [1, -2, -3]
+    assert values[3:7] == pytest.approx([1, 0, 0, 0], abs=1e-6)
+    assert values[7:13] == pytest.approx([0, -0.7, 0, 0, 0, -0.2], abs=1e-6)  # body's axes
+    assert [values[13 + k] for k in (0, 6, 11, 15, 18, 20)] == pytest.approx([0.01] * 6)
+    assert math.isnan(values[34]) and values[35:55] == [0] * 20
+    # LOCAL_FRD, BODY_FRD, resets, vision, percent
+    assert values[55:] == [20, 12, 0, 2, 84]
 
 
 def test_stale_and_lost_poses_never_arrive(vehicle: Vehicle, pilot: Pilot) -> None:

@@ -57,6 +57,26 @@ def test_hand_worked_poses(
     np.testing.assert_allclose(rotation(*pose.angles_rad), wanted, atol=1e-12)
 
 
+def test_velocity_is_the_vehicles_centres_in_its_own_axes() -> None:
+    """The camera sits 0.5 m ahead of a centre that rests and yaws to the right: it moves right."""
+    mounting = Mounting(position_m=(0.5, 0.0, 0.0), heading_deg=90)
+    moves_right, yaws_right = (0.5 * 0.4, 0.0, 0.0), (0.0, 0.4, 0.0)  # it looks along the map's y
+    pose = vehicle_pose((1.0, 2.0, 3.0), ALONG_Y, None, mounting, moves_right, yaws_right)
+    assert pose.velocity_mps is not None and pose.turn_radps is not None
+    np.testing.assert_allclose(pose.velocity_mps, 0, atol=1e-12)
+    np.testing.assert_allclose(pose.turn_radps, (0, 0, 0.4), atol=1e-12)
+    ahead = vehicle_pose((1.0, 2.0, 3.0), ALONG_Y, None, mounting, (0.0, 0.7, 0.1), (0, 0, 0))
+    assert ahead.velocity_mps is not None
+    np.testing.assert_allclose(ahead.velocity_mps, (0.7, 0, -0.1), atol=1e-12)
+    down = vehicle_pose((1.0, 2.0, 3.0), DOWN, None, Mounting(pitch_deg=-60))
+    w, x, y, z = down.quaternion_wxyz()
+    np.testing.assert_allclose(
+        [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
+        rotation(*down.angles_rad)[:, 0],
+        atol=1e-12,
+    )
+
+
 def test_an_unknown_covariance_is_nan_in_its_first_number() -> None:
     pose = vehicle_pose((0, 0, 0), ALONG_X, None, Mounting())
     triangle = pose.upper_triangle()
@@ -154,6 +174,9 @@ def test_a_pose_out_of_order_is_not_sent_and_a_clock_set_back_is_survived() -> N
         {"covariance": [0.0] * 35},
         {"covariance": [-1.0] * 36},
         {"covariance": [1e300] * 36},
+        {"velocity_mps": [0.0, 0.0]},
+        {"velocity_mps": [1e9, 0.0, 0.0]},
+        {"turn_radps": []},
     ],
 )
 def test_what_is_no_pose_is_refused(changes: dict[str, object]) -> None:

@@ -48,7 +48,8 @@ def told(estimate: PoseEstimate) -> messages.Pose:
 def test_a_solved_frame_is_where_the_autopilot_takes_it() -> None:
     # Standard deviations about and along the camera's right, down and forward.
     deviations = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
-    message = told(replace(ESTIMATE, wTc=AHEAD, covariance=np.diag(deviations**2)))
+    twist = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.7])
+    message = told(replace(ESTIMATE, wTc=AHEAD, covariance=np.diag(deviations**2), twist=twist))
     assert (message.time_ns, message.capture_ns, message.sequence) == (NOW_NS, 6, 9)
     assert message.relocalized
     gate = PoseGate(AutopilotSettings(uri="off:"))
@@ -56,6 +57,9 @@ def test_a_solved_frame_is_where_the_autopilot_takes_it() -> None:
     assert taken is not None and gate.counts.passed == 1
     np.testing.assert_allclose(taken.position_m, [1, -2, -3], atol=1e-12)  # north, east, down
     np.testing.assert_allclose(rotation(*taken.angles_rad), np.eye(3), atol=1e-12)
+    assert taken.velocity_mps is not None and taken.turn_radps is not None
+    np.testing.assert_allclose(taken.velocity_mps, [0.7, 0, 0], atol=1e-12)  # forward
+    np.testing.assert_allclose(taken.turn_radps, [0, 0, 0.1], atol=1e-12)  # to the right
     # Ahead is north: forward is north, right is east, down is down; turns likewise.
     assert taken.covariance is not None
     expected = np.diag([0.3, 0.1, 0.2, 0.03, 0.01, 0.02]) ** 2

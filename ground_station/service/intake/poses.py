@@ -25,6 +25,9 @@ def pose_message(note: EstimateMessage, now_ns: int) -> messages.Pose:
         position_m=note.position_m,
         quaternion_xyzw=note.quaternion_xyzw,
         covariance=note.covariance,
+        velocity_mps=note.velocity_mps,
+        turn_radps=note.turn_radps,
+        quality=min(1.0, note.inliers / note.expected) if note.expected > 0 else None,
         relocalized=note.relocalized,
     )
 

@@ -92,7 +92,8 @@ def estimate_note(
             sigma = position_covariance(wTc, covariance).ravel().tolist()
         else:
             covariance = None
-    velocity = world_velocity(wTc, estimate.twist)
+    twist = estimate.twist
+    velocity = world_velocity(wTc, twist)
     return EstimateMessage(
         sequence=frame.sequence,
         time_ns=frame.time_ns,
@@ -106,6 +107,7 @@ def estimate_note(
         covariance=None if covariance is None else covariance.ravel().tolist(),
         position_sigma_m=sigma,
         velocity_mps=None if velocity is None else velocity.tolist(),
+        turn_radps=None if twist is None or velocity is None else twist[:3].tolist(),
         heading_deg=heading_deg(wTc),
         speed_mps=None if velocity is None else float(np.linalg.norm(velocity)),
         height_m=float(wTc[2, 3]),
