@@ -41,7 +41,8 @@ class Watched:
 
     def __init__(self, browser: Any, served: Served) -> None:
         width, height = SIZES["desk"]
-        self.page = browser.new_page(viewport={"width": width, "height": height})
+        size = {"width": width, "height": height}
+        self.page = browser.new_context(viewport=size).new_page()
         self.page.set_default_timeout(LIMIT_MS)
         self.problems: list[str] = []
         self.hosts: set[str] = set()
@@ -487,25 +488,23 @@ def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: 
 
 
 def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
-    browser: Any, served: Served
+    shown: Watched, served: Served
 ) -> None:
-    size = {"width": 640, "height": 480}
-    context = browser.new_context(color_scheme="light", viewport=size)
-    page = context.new_page()
-    ground = "getComputedStyle(document.body).backgroundColor"
-    page.goto(served.url)
-    light = page.evaluate(ground)
-    page.click('.video [data-do="swap"]')
-    page.click("#help-open")
-    page.click('[data-scheme="dark"]')
-    page.reload()
-    page.wait_for_selector('.video[data-place="main"]')
-    assert page.get_attribute(".plan", "data-place") == "side"
-    assert page.evaluate(ground) != light
-    page.click("#help-open")
-    page.click('[data-scheme=""]')
-    assert page.evaluate(ground) == light
-    context.close()
+    ground, light = "getComputedStyle(document.body).backgroundColor", "rgb(233, 237, 240)"
+    assert shown.page.evaluate(ground) == light
+    shown.page.click('.video [data-do="swap"]')
+    assert shown.page.get_attribute(".plan", "data-place") == "side"
+    shown.page.click("#help-open")
+    shown.page.click('[data-scheme="dark"]')
+    another = shown.page.context.new_page()
+    another.goto(served.url)
+    another.wait_for_selector('.video[data-place="main"]')
+    assert another.evaluate(ground) == shown.page.evaluate(ground) != light
+    another.close()
+    shown.page.click('[data-scheme=""]')
+    assert shown.page.evaluate(ground) == light
+    shown.page.keyboard.press("Escape")
+    shown.page.click('.plan [data-do="swap"]')
 
 
 def test_who_is_signed_out_is_asked_for_the_token(browser: Any) -> None:
