@@ -70,6 +70,7 @@ class FrameMessage(Message):
     entropy_bits: float = 0.0
     sharpness: float = 0.0
     heartbeat: bool = False
+    shown: Count = 0  # frames of this session up to this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ class EstimateMessage(Message):
     tangent in the camera's axes, rotation before translation; `position_sigma_m` (9) is the
     position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns,
     `landmarks` their indices in the map, which only a replay asks for.
-    `processed`, `localized` and `skipped` count this payload's frames since the localizer's start.
+    `processed`, `localized` and `skipped` count the frames of this payload's session.
     `overload` says in words that the processor is too slow for them; "" while it is not.
     """
 

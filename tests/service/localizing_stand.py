@@ -59,7 +59,7 @@ class Station:
         self.estimates: list[EstimateMessage] = []
         self.events: list[EventMessage] = []
         self.beats: list[ProcessMessage] = []
-        self.said = 0
+        self.said, self.ssrc = 0, 1
         self.pictures = PictureWriter(run_folder, PAYLOAD)
         self.bus.subscribe(
             bus_messages.ESTIMATE, EstimateMessage, lambda _, note: self.estimates.append(note)
@@ -88,6 +88,9 @@ class Station:
     def show(self, image: Any, sequence: int, time_ns: int, /, **fields: Any) -> FrameMessage:
         """A frame as an intake tells it."""
         slot, stamp = self.pictures.write(image)
+        ssrc = fields.get("ssrc", 1)
+        if isinstance(ssrc, int) and ssrc != self.ssrc:
+            self.ssrc, self.said = ssrc, 0
         now_ns = time.time_ns()
         values: dict[str, Any] = {
             "slot": slot,
@@ -100,6 +103,7 @@ class Station:
             "width_px": image.shape[1],
             "height_px": image.shape[0],
             "ssrc": 1,
+            "shown": self.said + 1,
         }
         return self.say(FrameMessage(**(values | fields)))
 

@@ -89,7 +89,7 @@ class Heard:
 
     @property
     def told(self) -> Counter[str]:
-        """What the localizer says that it processed and skipped, since its start."""
+        """What the localizer says that it processed and skipped of this flight."""
         note = self.estimate
         fates = ("processed", "localized", "skipped")
         return Counter({fate: getattr(note, fate) for fate in fates} if note else {})
@@ -215,7 +215,7 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
         garbage = stack.enter_context(Garbage(service.video))
         sampler = Sampler(service, heard, flown, options)
         while sampler.passed_s < duration_s and not interrupted.is_set():
-            before, number_ = heard.told, len(flown.flights)
+            number_ = len(flown.flights)
             with service.fly(NAME, folder / f"flight-{number_}", port=link.port) as one:
                 sampler.payload = one.pid
                 sampler.wait(min(flight_s, max(20.0, duration_s - sampler.passed_s)), interrupted)
@@ -223,7 +223,7 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
                 ended = one.end()
             eventually(lambda: link.idle)
             if not interrupted.is_set():  # the whole service ends with a Ctrl-C, with its accounts
-                flown.flights.append(account(heard, ended, before))
+                flown.flights.append(account(heard, ended))
                 print(f"{sampler.passed_s / 60:5.1f} min {flown.flights[-1]}", flush=True)
                 sampler.wait(options.gap_s, interrupted)
         flown.flown_s = sampler.passed_s
@@ -237,7 +237,7 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
         flown.recordings = len(list(service.recordings.glob("*.mcap")))
 
 
-def account(heard: Heard, ended: Ended, before: Counter[str]) -> Flight:
+def account(heard: Heard, ended: Ended) -> Flight:
     """The three accounts of a flight that has ended, once none of them changes any more."""
     counts = ended.counts
 
@@ -253,7 +253,6 @@ def account(heard: Heard, ended: Ended, before: Counter[str]) -> Flight:
         time.sleep(1.0)
     intake = dict(heard.payload.frames) if heard.payload else {}
     told = heard.told
-    told.subtract(before)
     tidy = ended.status == 0 and "Traceback" not in ended.out + ended.err
     return Flight(counts, intake, dict(told), tidy)
 

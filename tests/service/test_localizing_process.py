@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -286,7 +287,7 @@ def test_a_picture_that_was_overwritten_is_skipped(
     until(lambda: len(told.estimates) == 2)
     for _ in range(SLOTS):
         told.pictures.write(flight[2].image)
-    told.say(old)
+    told.say(replace(old, shown=old.shown + 1))
     said = localized(told, flight[3])
     assert (said.processed, said.skipped) == (3, 1)
     assert told.event("frame-refused") is None
@@ -422,3 +423,27 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
             stop.set()
             thread.join()
     assert ended == ([RESTART] if times == 10 else [0])
+
+
+def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(
+    run_folder: Path, flight: list[Frame]
+) -> None:
+    def with_a_map(before: int = 0) -> bool:
+        return "map-loaded" in [event.name for event in told.events[before:]]
+
+    with station(run_folder) as told:
+        with localizer(run_folder) as process:
+            until(with_a_map, "the map")
+            for frame in flight[:3]:
+                localized(told, frame)
+            process.kill()
+        for frame in flight[3:5]:  # nobody takes them
+            told.show(frame.image, frame.index, frame.time_ns)
+        before = len(told.events)
+        with localizer(run_folder):
+            until(lambda: with_a_map(before), "the map")
+            found = localized(told, flight[5])
+            # What was processed within the last quarter of a second may count as skipped.
+            assert 2 <= found.processed <= 4 and found.processed + found.skipped == 6
+            found = localized(told, flight[6], ssrc=2)
+            assert (found.processed, found.skipped) == (1, 0)

@@ -56,7 +56,7 @@ class Payload:
         self._base = Counters()
         """Of the stream, before the payload's newest session: one may keep its SSRC."""
         self._before: int | None = None
-        self._dropped = 0
+        self._dropped = self._shown = 0
         self._samples: deque[tuple[float, int, int]] = deque()
         self._account = StreamAccount()
 
@@ -71,13 +71,14 @@ class Payload:
             if self._first is None or self._first[0] != frame.ssrc:
                 units = self.stream.counters.access_units if self.stream else 1
                 self._first = (frame.ssrc, frame.sequence, units)
+                self._shown = 0
             elif self._began_anew(frame) and self.stream is not None:
                 counters = self.stream.counters
                 self._base = dataclasses.replace(
                     counters, access_units=counters.access_units - 1, decoded=counters.decoded - 1
                 )
                 self._first = (frame.ssrc, frame.sequence, 1)
-                self._before, self._dropped = None, 0
+                self._before, self._dropped, self._shown = None, 0, 0
             self._last_sequence, self._last_ns = frame.sequence, frame.arrival_ns
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
@@ -101,6 +102,7 @@ class Payload:
         except OSError:  # the run's folder is full
             self._dropped += 1
             return
+        self._shown += 1
         height, width = frame.image.shape[:2]
         note = FrameMessage(
             slot=slot,
@@ -118,6 +120,7 @@ class Payload:
             entropy_bits=frame.entropy_bits,
             sharpness=frame.sharpness,
             heartbeat=frame.heartbeat,
+            shown=self._shown,
         )
         self._say(bus_messages.FRAME, self.id, note)
 

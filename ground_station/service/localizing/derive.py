@@ -18,7 +18,7 @@ STEEPEST_DEG = 85.0
 
 @dataclass(frozen=True)
 class Accounts:
-    """A payload's frames since the start: those taken, of these localized, and those not taken."""
+    """The frames of a payload's session: those taken, of these localized, and those not taken."""
 
     processed: int = 0
     localized: int = 0

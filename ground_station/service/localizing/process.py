@@ -23,7 +23,7 @@ from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
 from ground_station.service.localizing import derive
-from ground_station.service.localizing.derive import Accounts
+from ground_station.service.localizing.accounting import Accounting
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
 from ground_station.service.localizing.overload import Overload
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
@@ -61,7 +61,8 @@ class Localizing:
         self._forget = threading.Event()
         self._stream: tuple[int, int] | None = None  # ssrc and time of the last frame
         self._failed = 0
-        self._own, self._overload = Accounts(), Overload()
+        self._accounting = Accounting(folder / f"counts-{payload_id}")
+        self._overload = Overload()
         self._told_s = 0.0
         self._complain = RateLimitedLog(
             lambda name, text: self._event(bus_messages.WARNING, name, text)
@@ -71,11 +72,6 @@ class Localizing:
         self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, most)
         self._loader.begin(Path(run.station.map.folder))
         bus.serve(bus.process, self._do)
-
-    @property
-    def accounts(self) -> Accounts:
-        """Every frame that was ever told of: processed + skipped, but for one not yet taken."""
-        return replace(self._own, skipped=self._own.skipped + self._newest.skipped)
 
     def run(self, stop: threading.Event) -> int:
         """Until `stop` is set: 0, or `RESTART` after too many failures in a row."""
@@ -94,19 +90,17 @@ class Localizing:
     # Frames
 
     def _frame(self, note: FrameMessage) -> None:
+        self._accounting.frame(note)
         if self._localizer is None:
-            self._skip()
+            self._accounting.skip()
             self._tell_waiting(note)
             return
         image = self._pictures.read(note.slot, note.stamp)
         if image is None:  # overwritten before it was read
-            self._skip()
+            self._accounting.skip()
             return
         self._follow_stream(self._localizer, note)
         self._localize(self._localizer, note, image)
-
-    def _skip(self) -> None:
-        self._own = replace(self._own, skipped=self._own.skipped + 1)
 
     def _follow_stream(self, localizer: Localizer, note: FrameMessage) -> None:
         """Begins anew where another stream does: the payload was restarted, or its replay was."""
@@ -130,10 +124,9 @@ class Localizing:
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
             self._fail(localizer, reason)
-        own = self._own
-        solved = estimate is not None and estimate.localized
-        self._own = replace(own, processed=own.processed + 1, localized=own.localized + solved)
-        about = (self.accounts, self._map, time.time_ns())
+        self._accounting.take(localized=estimate is not None and estimate.localized)
+        accounts = self._accounting.accounts
+        about = (accounts, self._map, time.time_ns())
         if estimate is not None:
             told = derive.estimate_note(note, estimate, *about)
             if self._run.landmarks:
@@ -143,7 +136,6 @@ class Localizing:
             fresh = localizer.state is State.INITIALIZING
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
-        accounts = self.accounts
         said = self._overload.watch(
             localizer, time.monotonic(), accounts.processed, accounts.skipped
         )
@@ -185,7 +177,7 @@ class Localizing:
         if now_s - self._told_s < _WAITING_EVERY_S:
             return
         self._told_s = now_s
-        about = (self.accounts, "", time.time_ns())
+        about = (self._accounting.accounts, "", time.time_ns())
         told = derive.unsolved_note(note, State.INITIALIZING, self._waiting, *about)
         self._bus.publish(bus_messages.ESTIMATE, self._payload_id, told)
 

@@ -73,7 +73,7 @@ def of_received(heard: int, received: int, dropped: int) -> list[str]:
 
 
 def of_localizer(taken: Sequence[tuple[int, int]]) -> list[str]:
-    """processed + skipped is every frame since the localizer's start, of one process.
+    """processed + skipped is every frame of a session since the first that was told of.
 
     `taken` has, for each estimate, its frame's place among all frames that were shown and the sum
     processed + skipped that was told with it. A frame that is neither moves all later sums by one:
@@ -96,7 +96,7 @@ def of_localizer(taken: Sequence[tuple[int, int]]) -> list[str]:
 
 
 def by_process(counts: Sequence[tuple[Hashable, int, int]]) -> list[list[tuple[int, int]]]:
-    """(service's run, place, told) by localizer process: a new one counts from the beginning."""
+    """(service's run, place, told) by session: a new one counts from the beginning."""
     result: list[list[tuple[int, int]]] = []
     before: tuple[Hashable, int] | None = None
     for run, place, told in counts:
