@@ -104,7 +104,7 @@ sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed se
 	@$(BLIMP) map export maps/atrium --png maps/atrium/map.png
 
 picture: setup  ## Make README's picture of the dashboard anew, with the system's Chromium
-	@.venv/bin/python tests/service/dashboard_picture.py ground_station/service/dashboard.jpg
+	@.venv/bin/python tests/service/dashboard_picture.py maps/atrium/dashboard.jpg
 
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
 	@sh tests/pi_firmware/virtual_camera/setup.sh

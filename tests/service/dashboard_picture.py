@@ -1,6 +1,6 @@
 """Makes README's picture of the dashboard from the sample flight, at a third of its rate.
 
-    python tests/service/dashboard_picture.py ground_station/service/dashboard.jpg
+    python tests/service/dashboard_picture.py maps/atrium/dashboard.jpg
 
 It waits for a moment of tracking without an alarm, which may take long on a busy machine.
 """
