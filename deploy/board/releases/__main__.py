@@ -1,4 +1,4 @@
-"""`python3 -m deploy.board.releases receive|watch|status|holds`: the card's side of an update."""
+"""`python3 -m deploy.board.releases ACTION`: the card's side of an update."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ def main() -> int:
     parser.add_argument("--root", default="/", help=argparse.SUPPRESS)
     parser.add_argument(
         "action",
-        choices=("receive", "watch", "status", "holds"),
-        help="take a bundle from standard input; watch a trial; tell what runs; tell the files",
+        choices=("receive", "watch", "verify", "status", "holds"),
+        help="take a bundle from standard input; watch a trial; read the release in force again;"
+        " tell what runs; tell the files",
     )
     parser.add_argument("--force", action="store_true", help="receive while the autopilot is armed")
     given = parser.parse_args()
@@ -33,6 +34,9 @@ def main() -> int:
             answer = receive.receive(at, sys.stdin.buffer, service, force=given.force)
         elif given.action == "watch":
             watch.watch(at, service, lambda line: print(line, flush=True))
+            return 0
+        elif given.action == "verify":
+            print(watch.verify(at, service) or "as it was installed", flush=True)
             return 0
         elif given.action == "status":
             answer = watch.status(at)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any
 
 from deploy.board.releases import choose, manifest, places, shelf
-from deploy.board.releases.choose import FELL_BACK, HEALTHY
-from deploy.board.releases.places import Places
+from deploy.board.releases.choose import FELL_BACK, HEALTHY, MANIFEST
+from deploy.board.releases.places import FACTORY, Places
 from deploy.board.releases.service import Seen, Service
 
 LIMIT_S = 120.0
@@ -92,6 +92,25 @@ def watch(
             sleep(_LOOK_S)
         say(f"{trial['release']}: {outcome}{f': {reason}' if reason else ''}")
         shelf.finish(at, service if outcome == FELL_BACK else None, trial, outcome, reason)
+
+
+def verify(at: Places, service: Service) -> str:
+    """Goes back from a release of which the card reads other bytes than it was given; '' if none.
+
+    What lies there compiled is in no list. An armed vehicle flies on with what it has loaded, and
+    its next start is another release's.
+    """
+    with shelf.lock(at):
+        name = at.linked("current")
+        if shelf.settle(at, service) is not None or shelf.in_force(at)[0] == FACTORY:
+            return ""
+        folder = at.folder(name)
+        fault = shelf.hash_fault(folder, manifest.parse((folder / MANIFEST).read_bytes()))
+        if fault:
+            ended = {"id": "", "release": name, "previous": at.linked("previous")}
+            restarts = None if service.seen().armed else service
+            shelf.finish(at, restarts, ended, FELL_BACK, f"{name}: {fault}")
+        return fault
 
 
 def limit_of(at: Places) -> float:

@@ -302,3 +302,21 @@ def test_what_the_firmware_lays_into_its_folder_holds_up_no_root(card: Card, kin
         secret.write_text('{"release": "of root"}')
         card.at.running.symlink_to(secret)
     assert watch.status(card.at)["running"] is None
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_release_whose_bits_rot_goes_back(card: Card, armed: bool) -> None:
+    watched(card, trial_of(card))
+    card.service.now = WELL._replace(armed=armed)
+    before = card.service.restarts
+    assert watch.verify(card.at, card.service) == ""  # type: ignore[arg-type]
+    assert card.choice() == Choice(NEW, "update")
+    path = card.at.folder(NEW) / "site/native.so"
+    rotten = bytearray(path.read_bytes())
+    rotten[5000] ^= 1  # of the same size
+    path.write_bytes(rotten)
+    found = watch.verify(card.at, card.service)  # type: ignore[arg-type]
+    assert found == "site/native.so: the card reads other bytes than it was given"
+    assert card.choice() == Choice("", "fell back", f"{NEW}: {found}")
+    assert card.service.restarts == before + (not armed)
+    assert watch.verify(card.at, card.service) == ""  # type: ignore[arg-type]
