@@ -89,6 +89,18 @@ def test_only_those_named_are_taken_up() -> None:
     assert roster.refused == set()
 
 
+def test_who_announces_no_more_makes_room_for_who_does() -> None:
+    announced = Announced(clock := Clock())
+    for number in range(70):
+        announced.said(f"blimp-{number}", number)
+    assert announced.ssrc("blimp-69") is None  # 64 announce at once
+    clock.now_s += 10.0
+    announced.said("blimp-0", 0)
+    announced.said("blimp-69", 69)
+    assert announced.ssrc("blimp-69") == 69 and announced.ssrc("blimp-0") == 0
+    assert announced.ssrc("blimp-1") is None
+
+
 def test_a_restart_is_no_dispute_and_two_programs_of_one_id_are() -> None:
     announced = Announced(clock := Clock())
     for ssrc in (1, 1, 2, 2, 3):

@@ -27,7 +27,11 @@ class Announced:
         now_s = self._clock()
         with self._lock:
             if payload_id not in self._heard and len(self._heard) >= _PAYLOADS:
-                return
+                silent = min(self._heard, key=lambda who: max(self._heard[who].values()))
+                if now_s - max(self._heard[silent].values()) < _RECENT_S:
+                    return
+                del self._heard[silent]
+                self._returned_s.pop(silent, None)
             heard = self._heard.setdefault(payload_id, {})
             # A payload that starts anew takes another SSRC and never its old one again.
             if ssrc in heard and next(reversed(heard)) != ssrc:
