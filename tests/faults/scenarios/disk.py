@@ -71,6 +71,7 @@ def limit_files(pid: int, size_bytes: int | None) -> None:
             raise
 
 
-def largest(folder: Path) -> int:
-    """The size of the largest recording in a folder, bytes; 0 without any."""
-    return max((path.stat().st_size for path in folder.glob("*.mcap")), default=0)
+def size_now(folder: Path) -> int:
+    """The size of the newest recording in a folder, bytes; 0 without any."""
+    newest = max(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns, default=None)
+    return newest.stat().st_size if newest is not None else 0

@@ -124,7 +124,7 @@ class GaugeFault(Step):
         note = world.heard.payload(NAME)
         battery = note.battery if note is not None else None
         if battery is None or battery.time_ns / 1e9 < time.time() - 2.0:
-            return "" if self.kind == "absent" else "no battery is told of"
+            return ""
         return "" if battery.refused + battery.read_errors else "all readings are good"
 
     def inject(self, world: World) -> None:
@@ -158,7 +158,7 @@ class CardFull(Step):
 
     def inject(self, world: World) -> None:
         world.kept[id(self)] = (world.run, world.end_recording("card"))
-        disk.limit_files(world.run.process.pid, disk.largest(world.card))
+        disk.limit_files(world.run.process.pid, disk.size_now(world.card))
 
     def lacking(self, world: World) -> str:
         note = world.heard.payload(NAME)

@@ -113,7 +113,7 @@ class DiskFull(Step):
         if world.disk is not None:
             world.disk.fill()
         elif found := world.child("intake"):
-            disk.limit_files(found.pid, disk.largest(world.service.recordings))
+            disk.limit_files(found.pid, disk.size_now(world.service.recordings))
         world.kept[id(self)] = (found, world.end_recording("ground"))
 
     def lacking(self, world: World) -> str:
