@@ -179,11 +179,11 @@ class Capture:
         media = self._media
         return media.limit_bitrate(kbps) if media is not None else kbps
 
-    def link_report(self, report: messages.LinkReport) -> None:
+    def link_report(self, report: messages.LinkReport, corrections: float = 0.0) -> None:
         """What the ground saw of the link of late."""
         media = self._media
         if media is not None:
-            media.link_report(report)
+            media.link_report(report, corrections)
 
     def answered(self, sequence: int) -> None:
         """The ground is done with this frame and all before it."""

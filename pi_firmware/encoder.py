@@ -92,7 +92,7 @@ class Encoder:
         self._lateness, self._lock = StandingDelay(), threading.Lock()
         self._since_idr = 0
         self._beside_kbps = 0.0
-        """What is sent again, beside what the encoder makes."""
+        """What is sent again and corrections, beside what the encoder makes."""
         self._set_kbps = encoder.bitrate_kbps
 
     @property
@@ -103,7 +103,7 @@ class Encoder:
     def set_bitrate(self, kbps: int) -> int:
         """Has no more than this sent, within the configured bounds; returns what is asked for.
 
-        That is less by what is sent again.
+        That is less by what is sent beside.
         """
         self._adaptation.bitrate_kbps = self._adaptation.limited(kbps)
         own_kbps = self._adaptation.bitrate_kbps - self._beside_kbps
@@ -123,12 +123,16 @@ class Encoder:
         self._adaptation.ceiling_kbps = min(kbps, self._settings.bitrate_kbps)
         return self.set_bitrate(round(self._adaptation.bitrate_kbps))
 
-    def link_report(self, report: LinkReport) -> None:
-        """Adapts to what the ground saw, unless `encoder.adapt` is false."""
+    def link_report(self, report: LinkReport, corrections: float = 0.0) -> None:
+        """Adapts to what the ground saw, unless `encoder.adapt` is false.
+
+        `corrections` are sent beside the video, as a share of it.
+        """
         if self._settings.adapt:
             self._adaptation.report(self._of_the_link(report), time.monotonic())
             again_kbps = report.retransmitted_kbps or 0.0
-            self._beside_kbps = min(max(again_kbps, 0.0), self._adaptation.bitrate_kbps)
+            own_kbps = (self._adaptation.bitrate_kbps - max(again_kbps, 0.0)) / (1.0 + corrections)
+            self._beside_kbps = self._adaptation.bitrate_kbps - max(own_kbps, 0.0)
             self.set_bitrate(round(self._adaptation.bitrate_kbps))
 
     def _of_the_link(self, report: LinkReport) -> LinkReport:

@@ -48,7 +48,9 @@ class Ground:
     ) -> None:
         self._discovers = settings.host == DISCOVERED
         self._ssrc = ssrc
-        self._link, self._capture, self._telemetry = link, capture, telemetry
+        self.link = link
+        """What the video leaves by."""
+        self._capture, self._telemetry = capture, telemetry
         self._on_heard = on_heard
         self._clock = clock
         self._lock = threading.Lock()
@@ -62,11 +64,6 @@ class Ground:
         """The newest report of our video; None when none came within 5 s."""
         seen = self._seen
         return seen if seen and self._clock() - seen.heard_s < _SILENT_S else None
-
-    @property
-    def rtx_ssrc(self) -> int | None:
-        """What the ground asks for again comes with it; None: nothing does."""
-        return self._link.rtx_ssrc
 
     def heard(self, report: LinkReport) -> None:
         """Takes a report; on any thread. One that cannot be changes nothing."""
@@ -87,7 +84,7 @@ class Ground:
             if wanted:
                 self._capture.force_idr()
             return
-        self._capture.link_report(report)
+        self._capture.link_report(report, self.link.report(report, now_s))
 
     def _follow(self, report: LinkReport, now_s: float) -> None:
         other = report.ground != self._followed
@@ -96,4 +93,4 @@ class Ground:
         address = self._telemetry.ground_address(report.ground)
         if address is not None:
             self._followed, self._followed_s = report.ground, now_s
-            self._link.redirect(address, report.video_port)
+            self.link.redirect(address, report.video_port)

@@ -16,9 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from pi_firmware import gstreamer, retransmission
+from pi_firmware.correction import ForwardCorrection, Sender
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import srtp, video
 from pi_firmware.wire.errors import StreamError
+from pi_firmware.wire.messages import LinkReport
 
 DISCOVERED = "auto"
 """`link.host` that waits for a ground station to say where it is."""
@@ -58,7 +60,7 @@ def description(link: LinkSettings, ssrc: int, *, encrypted: bool = False) -> st
     return (
         "appsrc name=link is-live=true format=time max-bytes=0 "
         "caps=video/x-h264,stream-format=byte-stream,alignment=au "
-        f"! rtph264pay pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={mtu_bytes} "
+        f"! rtph264pay name=payloader pt={video.PAYLOAD_TYPE} ssrc={ssrc} mtu={mtu_bytes} "
         f"config-interval=0 aggregate-mode=none {history}{protect}"
         "! udpsink name=out sync=false async=false"
     )
@@ -75,7 +77,8 @@ class Link:
     host. An SSRC must not serve two links with one key: both would encrypt with the same keystream
     (RFC 3711, 9.1), so that a fixed `link.ssrc` is refused, too.
 
-    What a ground station asks for again within `link.history_s` is sent again, beside.
+    What a ground station asks for again within `link.history_s` is sent again, beside, and so are
+    corrections, as far as its `report` asks for them.
     """
 
     def __init__(self, link: LinkSettings, ssrc: int, key: bytes | None = None) -> None:
@@ -105,6 +108,10 @@ class Link:
                 self._pipeline, link, ssrc, key if encrypted else None
             )
             self.rtx_ssrc = retransmission.rtx_ssrc(ssrc)
+        self._correction: ForwardCorrection | None = None
+        if link.correction:
+            sender = Sender(link, ssrc, sends_again=self.rtx_ssrc is not None)
+            self._correction = ForwardCorrection(self._pipeline, sender)
         self._first_ns: int | None = None
         self._to: tuple[str, int] | None = None
         self._waits_for_idr = False
@@ -129,6 +136,11 @@ class Link:
         """Numeric address and port that packets go to; None while there is none."""
         return self._to
 
+    @property
+    def correction_ssrc(self) -> int | None:
+        """Corrections come with it; None: there are never any."""
+        return self._correction.sender.ssrc if self._correction is not None else None
+
     def start(self) -> None:
         """Sets the pipeline to playing; raises `StreamError` with one line."""
         if self._pipeline.set_state(self._gst.State.PLAYING) == self._gst.StateChangeReturn.FAILURE:
@@ -150,6 +162,10 @@ class Link:
             self._to = (host, port)
             self.problem = ""
         return True
+
+    def report(self, report: LinkReport, now_s: float) -> float:
+        """Takes what the ground saw; the share of corrections beside what is sent, of late."""
+        return self._correction.report(report, now_s) if self._correction is not None else 0.0
 
     def send(self, access_unit: bytes, clock_ns: int, *, idr: bool) -> bool:
         """Queues one access unit of an instant on a clock that only rises; whether it will leave.

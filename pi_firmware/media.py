@@ -170,9 +170,9 @@ class Media:
         """Makes the next frame an IDR."""
         self._encoder.force_idr()
 
-    def link_report(self, report: LinkReport) -> None:
+    def link_report(self, report: LinkReport, corrections: float = 0.0) -> None:
         """What the ground saw of the link of late."""
-        self._encoder.link_report(report)
+        self._encoder.link_report(report, corrections)
 
     def _build(self) -> Any:
         settings, source = self._settings, self._source

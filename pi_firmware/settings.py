@@ -96,6 +96,12 @@ class LinkSettings:
     history_s: float = key(
         1.5, "how long a packet can be sent again, as lost; 0: never", unit="s", low=0, high=5
     )
+    correction: float = key(
+        1.0, "packets of forward correction for each of the video, at most; 0: none", low=0, high=1
+    )
+    assumed_loss: float = key(
+        0.0, "lost packets it reckons with at least, as where nothing is reported", low=0, high=0.5
+    )
     encrypted: bool = key(True, "SRTP with the key of telemetry.certificates, or loopback only")
 
 

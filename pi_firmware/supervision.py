@@ -174,7 +174,8 @@ class Supervision:
             release=self.release.how,
             release_reason=self.release.reason,
             early_reports=True,
-            rtx_ssrc=ground.rtx_ssrc,
+            rtx_ssrc=ground.link.rtx_ssrc,
+            correction_ssrc=ground.link.correction_ssrc,
             **asdict(self._board.read()),
         )
 

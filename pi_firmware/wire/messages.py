@@ -205,6 +205,7 @@ class Health(Message):
     release_reason: str = ""  # why an update did not stay
     early_reports: bool = False  # it takes link reports between those of each second
     rtx_ssrc: int | None = None  # what is asked for again comes with it; None: nothing does
+    correction_ssrc: int | None = None  # forward correction comes with it; None: none ever does
 
 
 @dataclass(frozen=True)
@@ -218,12 +219,13 @@ class LinkReport(Message):
     or has nothing to measure them by.
 
     A packet was sent, and is one of `packets` or of `packets_lost`; `packets_mended` of the former
-    were missing, asked for again, and came in time. So `lost` is what is left after mending, and
-    `missed` and `dropped` are of what the link lost before it.
+    were missing, asked for again, and came in time, and `packets_corrected` were found from
+    corrections. So `lost` is what is left after both, and `missed` and `dropped` are of what the
+    link lost before them.
     """
 
     SCHEMA: ClassVar[str] = "blimp.link"
-    MINOR: ClassVar[int] = 3
+    MINOR: ClassVar[int] = 4
 
     ground: str  # its name
     video_port: int  # where it takes the video
@@ -239,6 +241,10 @@ class LinkReport(Message):
     packets_mended: int = 0
     missed: float | None = None  # share of packets that were lost or mended, of late
     retransmitted_kbps: float | None = None  # of received_kbps: packets that were sent again
+    corrects: bool = False  # it takes forward correction
+    packets_corrected: int = 0
+    answered: int = 0  # retransmissions, whether or not their packets had been corrected meanwhile
+    burst: float | None = None  # packets that were missing in a row, on average, of late
 
 
 @dataclass(frozen=True)

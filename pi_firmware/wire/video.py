@@ -12,6 +12,12 @@ RTX_PAYLOAD_TYPE = 97
 OSN_BYTES = 2
 """What such a packet begins with: its original sequence number."""
 
+CORRECTION_PAYLOAD_TYPE = 98
+"""RTP payload type of forward correction, on an SSRC of its own (RFC 5109; RFC 5956, 4.3)."""
+
+PAYLOAD_TYPES = (PAYLOAD_TYPE, RTX_PAYLOAD_TYPE, CORRECTION_PAYLOAD_TYPE)
+"""All that come at the video's port."""
+
 CLOCK_RATE_HZ = 90_000
 """RTP clock of H.264 (RFC 6184, 8.2.1)."""
 

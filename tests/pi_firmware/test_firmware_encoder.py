@@ -100,6 +100,16 @@ def test_what_is_sent_again_is_part_of_the_bit_rate() -> None:
     assert controlled.bitrate_kbps >= 1000
 
 
+def test_corrections_are_part_of_the_bit_rate() -> None:
+    controlled = Encoder(Element(), EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=300), 30.0)
+    report = LinkReport(1, "main", 5600, received_kbps=2000.0, queue_s=0.0, dropped=0.02)
+    for corrections, again_kbps, asked_kbps in (
+        (0.0, 0.0, 2000), (0.25, 0.0, 1600), (0.25, 200.0, 1440), (0.0, 0.0, 2000),
+    ):  # fmt: skip
+        controlled.link_report(replace(report, retransmitted_kbps=again_kbps), corrections)
+        assert controlled.bitrate_kbps == asked_kbps
+
+
 def test_without_adaptation_the_bit_rate_stays() -> None:
     controlled = Encoder(Element(), EncoderSettings(adapt=False), 30.0)
     report = LinkReport(1, "main", 5600, received_kbps=2000.0, queue_s=0.0, dropped=0.0)

@@ -18,13 +18,17 @@ class Link:
     def redirect(self, host: str, port: int) -> None:
         self.to.append((host, port))
 
+    def report(self, report: LinkReport, now_s: float) -> float:
+        return 10 * report.lost
+
 
 class Capture:
     def __init__(self) -> None:
         self.reports: list[LinkReport] = []
         self.idrs = 0
 
-    def link_report(self, report: LinkReport) -> None:
+    def link_report(self, report: LinkReport, corrections: float) -> None:
+        assert corrections == 10 * report.lost
         self.reports.append(report)
 
     def force_idr(self) -> None:

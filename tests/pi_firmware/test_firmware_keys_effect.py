@@ -112,6 +112,10 @@ SEEN_BY: dict[str, tuple[str, ...]] = {
         "battery.resistance_mohm",
         "battery.temperature_C",
     ),
+    "rooms::test_corrections_are_as_many_as_assumed_and_allowed": (
+        "link.correction",
+        "link.assumed_loss",
+    ),
     "rooms::test_a_radio_is_restarted_after_so_long_a_silence": ("wifi.restart_after_s",),
     "rooms::test_a_recordings_file_ends_at_its_size": ("recording.max_file_MB",),
     "rooms::test_old_recordings_go_when_all_are_too_large": ("recording.max_total_MB",),

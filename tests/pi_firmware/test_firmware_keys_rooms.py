@@ -6,6 +6,7 @@ Each key is loaded as the program loads it and compared with its default at the 
 from __future__ import annotations
 
 import math
+import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from pi_firmware import encoder
 from pi_firmware.autopilot.poses import PoseGate
 from pi_firmware.battery import Monitor
 from pi_firmware.battery.bus import Counts
+from pi_firmware.correction import Sender
 from pi_firmware.health import Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import Settings, load
@@ -231,6 +233,18 @@ def test_a_key_is_seen_where_it_is_used(
 def test_a_cell_of_more_resistance_holds_more_charge_at_the_same_voltage(setting: str) -> None:
     typical, loaded = charge_under_load(load(None)), charge_under_load(load(None, [setting]))
     assert 0.0 < typical < loaded - 0.05
+
+
+def test_corrections_are_as_many_as_assumed_and_allowed() -> None:
+    frame = [struct.pack(">BBHII", 0x80, 96, number, 0, 77) + b"a" for number in range(6)]
+    for asked, sent in (
+        ([], 0),
+        (["link.assumed_loss=0.02"], 3),
+        (["link.assumed_loss=0.02", "link.correction=0.3"], 2),
+        (["link.assumed_loss=0.02", "link.correction=0"], 0),
+    ):
+        sender = Sender(load(None, asked).link, 77, sends_again=True)
+        assert len([*sender.of(frame)] if sender.wanted else []) == sent
 
 
 @pytest.mark.parametrize("restart_after_s", [5, 40])
