@@ -28,15 +28,17 @@ _TICKS_PER_S = 90_000  # RFC 6184, 8.2.1
 class Flow:
     """A stream of late; None where nothing came to measure it by.
 
-    `received_kbps` are the payloads of its packets, each once, and `retransmitted_kbps` of them are
-    of packets that were sent again; `queue_s` is what frames waited on the way, `dropped` the share
-    of packets, 0 to 1, that were lost while others came, whether or not they were mended.
+    `received_kbps` are the payloads of its packets, each once, and of its corrections;
+    `retransmitted_kbps` of them are of packets that were sent again. `queue_s` is what frames
+    waited on the way, `dropped` the share of packets, 0 to 1, that were lost while others came,
+    whether or not they were mended, and `burst` how many of these in a row.
     """
 
     received_kbps: float
     queue_s: float | None
     dropped: float
     retransmitted_kbps: float = 0.0
+    burst: float | None = None
 
 
 @dataclass
@@ -59,6 +61,7 @@ class Arrivals:
         self._began_ns = self._last_ns = 0
         self._packets: deque[tuple[int, int]] = deque()  # arrival, bytes; of LOSS_NS
         self._again: deque[tuple[int, int]] = deque()  # the same of what was sent again
+        self._corrections: deque[tuple[int, int]] = deque()
         self._missing: dict[int, int] = {}  # sequence number, when it was missed; of LOSS_NS
         self._forget_delays()
 
@@ -71,8 +74,9 @@ class Arrivals:
     def add(self, packet: Packet) -> None:
         """Takes one packet; a duplicate and one that was not missed change nothing."""
         with self._lock:
-            if packet.again:  # of the link's load, and of nothing else
-                self._again.append((packet.came_ns, len(packet.payload)))
+            if packet.again or packet.corrects:  # of the link's load, and of nothing else
+                beside = self._again if packet.again else self._corrections
+                beside.append((packet.came_ns, len(packet.payload)))
                 self._forget(packet.came_ns)
                 return
             if not self._is_new(packet):
@@ -90,17 +94,19 @@ class Arrivals:
             if self._highest is None or now_ns - self._began_ns < WINDOW_NS // 2:
                 return None
             span_ns = min(WINDOW_NS, now_ns - self._began_ns)
-            size, again = (
+            size, again, corrections = (
                 sum(size for at_ns, size in packets if now_ns - at_ns < span_ns)
-                for packets in (self._packets, self._again)
+                for packets in (self._packets, self._again, self._corrections)
             )
             missed = sum(now_ns - at_ns >= _OVERTAKEN_NS for at_ns in self._missing.values())
+            runs = sum((number - 1) & 0xFFFF not in self._missing for number in self._missing)
             sent = len(self._packets) + missed
             return Flow(
-                received_kbps=(size + again) * 8e6 / span_ns,
+                received_kbps=(size + again + corrections) * 8e6 / span_ns,
                 queue_s=self._queue_s(now_ns),
                 dropped=missed / sent if self._packets else 0.0,
                 retransmitted_kbps=again * 8e6 / span_ns,
+                burst=len(self._missing) / runs if runs else None,
             )
 
     def _is_new(self, packet: Packet) -> bool:
@@ -145,7 +151,7 @@ class Arrivals:
 
     def _forget(self, now_ns: int) -> None:
         """Lets go of what is too old; of the delays the last ones stay, to go on from."""
-        for packets in (self._packets, self._again):
+        for packets in (self._packets, self._again, self._corrections):
             while packets and now_ns - packets[0][0] >= LOSS_NS:
                 packets.popleft()
         while self._missing:

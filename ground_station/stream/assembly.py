@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
 from ground_station.stream.arrivals import Arrivals
+from ground_station.stream.correction import Correction
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
 from ground_station.stream.retransmission import Retransmission
@@ -70,6 +71,8 @@ class Assembly:
         """How its packets come, for whoever sends them."""
         self.retransmission = Retransmission(counters)
         """What is missing of it, and when that is to be asked for."""
+        self.correction = Correction()
+        """What is found of it from corrections."""
         self._counters = counters
         self._reorderer = rtp.Reorderer(counters, retransmission=self.retransmission)
         self._depacketizer = rtp.Depacketizer(counters)
@@ -96,15 +99,21 @@ class Assembly:
         )
 
     def push(self, packet: rtp.Packet) -> Iterator[ReceivedFrame]:
-        """Takes a packet, sent once or again; the frames that are whole with it."""
-        if not packet.again:
-            self._counters.packets += 1
+        """Takes a packet, sent once or again, or a correction; the frames whole with it."""
         self.arrivals.add(packet)
         self.last_arrival_ns = packet.arrival_ns
         if self._first_arrival_ns is None:
             self._first_arrival_ns = packet.arrival_ns
-        for ordered, gap in self._reorderer.push(packet):
-            yield from self._assemble(ordered, gap)
+        if packet.corrects:
+            self._counters.corrections += 1
+            self._reorderer.corrected_ns = packet.arrival_ns
+        else:
+            self._counters.packets += not packet.again
+            for ordered, gap in self._reorderer.push(packet):
+                yield from self._assemble(ordered, gap)
+        for found in self.correction.take(packet):
+            for ordered, gap in self._reorderer.push(found):
+                yield from self._assemble(ordered, gap)
 
     def expire(self, now_ns: int) -> Iterator[ReceivedFrame]:
         """The frames that are whole because what is missing before them is given up."""

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 class Counters:
     """What came in and what became of it.
 
-    Datagrams are `packets` of the stream, `retransmissions` of it, of `other_streams`, or
-    `garbage`; where keys are asked for, also `refused` (not authentic) or `replayed` (authentic,
-    but not for the first time).
+    Datagrams are `packets` of the stream, `retransmissions` or `corrections` of it, of
+    `other_streams`, or `garbage`; where keys are asked for, also `refused` (not authentic) or
+    `replayed` (authentic, but not for the first time).
     A packet that was sent came by itself (`packets` less `packets_late`, which came again or after
-    they were given up), is one of `packets_mended` (missing, asked for, and sent again in time), or
-    one of `packets_lost`. `packets_asked` are those that were asked for, each once.
+    they were given up), is one of `packets_mended` (missing, asked for, and sent again in time), of
+    `packets_corrected` (missing, and found from corrections in time), or one of `packets_lost`.
+    `packets_asked` are those that were asked for, each once.
     Every access unit of which anything arrived is one of `decoded`, `withheld` (damaged, or after
     a loss and before the next IDR), `failed` (the decoder refused it) or `unstamped` (without
     capture time).
@@ -27,7 +28,9 @@ class Counters:
     packets_late: int = 0
     packets_asked: int = 0
     packets_mended: int = 0
+    packets_corrected: int = 0
     retransmissions: int = 0
+    corrections: int = 0
     garbage: int = 0
     other_streams: int = 0
     refused: int = 0

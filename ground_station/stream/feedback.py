@@ -58,6 +58,10 @@ class Video(Protocol):
         """
         ...
 
+    def corrects(self, ssrc: int | None) -> None:
+        """Hears with what SSRC its payload sends corrections; None: it never does."""
+        ...
+
 
 @dataclass(frozen=True)
 class Awaited:
@@ -73,6 +77,9 @@ class Awaited:
     def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
         """Nothing is asked for."""
 
+    def corrects(self, ssrc: int | None) -> None:
+        """Nothing is corrected."""
+
 
 @dataclass(frozen=True)
 class Tally:
@@ -80,13 +87,16 @@ class Tally:
 
     A packet that comes late was given up before and stays lost; a duplicate counts once. So both
     together are the packets that were sent. `frames` is how many the payload says it sent, `mended`
-    those of the packets in time that had to be sent again.
+    those of the packets in time that had to be sent again, `corrected` those that were found, and
+    `again` what came again at all.
     """
 
     packets: int = 0
     lost: int = 0
     frames: int = 0
     mended: int = 0
+    corrected: int = 0
+    again: int = 0
 
     def __sub__(self, other: Tally) -> Tally:
         return Tally(
@@ -94,6 +104,8 @@ class Tally:
             max(0, self.lost - other.lost),
             max(0, self.frames - other.frames),
             max(0, self.mended - other.mended),
+            max(0, self.corrected - other.corrected),
+            max(0, self.again - other.again),
         )
 
     @property
@@ -108,7 +120,8 @@ class Tally:
     def share_missed(self) -> float:
         """The same of what was lost before it was mended."""
         if self.packets + self.lost:
-            return (self.lost + self.mended) / (self.packets + self.lost)
+            missed = self.lost + self.mended + self.corrected
+            return missed / (self.packets + self.lost)
         return self.share_lost
 
 
@@ -181,8 +194,10 @@ def _is_urgent(seen: Flow | messages.LinkReport | None) -> bool:
 
 
 def _tally(counters: Counters, frames: int) -> Tally:
-    in_time = counters.packets - counters.packets_late + counters.packets_mended
-    return Tally(in_time, counters.packets_lost, frames, counters.packets_mended)
+    mended, corrected = counters.packets_mended, counters.packets_corrected
+    in_time = counters.packets - counters.packets_late + mended + corrected
+    again = counters.retransmissions
+    return Tally(in_time, counters.packets_lost, frames, mended, corrected, again)
 
 
 class Feedback:
@@ -277,6 +292,7 @@ class Feedback:
             flow = video.flow()
             health = state.health if state is not None else None
             video.retransmits(health.rtx_ssrc if health is not None else None, round_trip_s)
+            video.corrects(health.correction_ssrc if health is not None else None)
             frames = state.frames if state is not None else None
             account = self._accounts.setdefault(payload_id, StreamAccount())
             sent = frames.sent if frames is not None else 0
@@ -297,6 +313,10 @@ class Feedback:
             packets_mended=tally.mended,
             missed=missed,
             retransmitted_kbps=flow.retransmitted_kbps if flow is not None else None,
+            corrects=True,
+            packets_corrected=tally.corrected,
+            answered=tally.again,
+            burst=flow.burst if flow is not None else None,
         )
 
     def _publish(self, payload_id: str, report: messages.LinkReport) -> None:

@@ -71,6 +71,8 @@ class Stream:
         self.ssrc, self.key_owner = source
         self.rtx_ssrc: int | None = None
         """What comes with it is sent again (RFC 4588); None: nothing is."""
+        self.correction_ssrc: int | None = None
+        """What comes with it corrects (RFC 5109); None: nothing does."""
         self.payload_id = payload_id
         self.port = port
         self.bytes = 0
@@ -114,6 +116,11 @@ class Stream:
         if round_trip_s is not None:
             retransmission.round_trip.hint(int(1e9 * round_trip_s), time.monotonic_ns())
         retransmission.offered = rtx_ssrc is not None
+
+    def corrects(self, ssrc: int | None) -> None:
+        """Takes with what SSRC its payload says that it sends corrections; None: never."""
+        self.correction_ssrc = ssrc
+        self._assembly.correction.offered = ssrc is not None
 
     def put(self, packet: rtp.Packet, address: Address | None = None) -> None:
         """Queues a packet; a stream that is decoded too slowly loses it, and nobody else does.
@@ -314,18 +321,20 @@ class MultiStreamReceiver:
             self._counters.garbage += 1
             return
         source = packet.ssrc, key_owner
-        stream = self._again(source) if packet.again else self._streams.get(source)
+        is_beside = packet.again or packet.corrects
+        stream = self._beside(packet, source) if is_beside else self._streams.get(source)
         if stream is not None:
             stream.put(packet, address)
-        elif packet.again:
+        elif is_beside:
             self._counters.other_streams += 1
         else:
             self._hold(source, packet, address)
 
-    def _again(self, source: _Source) -> Stream | None:
-        """The stream of a retransmission, if its payload sent it; None for a stranger's."""
+    def _beside(self, packet: rtp.Packet, source: _Source) -> Stream | None:
+        """The stream of a retransmission or correction, if its payload sent it; None otherwise."""
         for stream in self._streams.values():
-            if source == (stream.rtx_ssrc, stream.key_owner):
+            ssrc = stream.rtx_ssrc if packet.again else stream.correction_ssrc
+            if source == (ssrc, stream.key_owner):
                 return stream
         return None
 

@@ -127,6 +127,10 @@ class Retransmission:
         """Whether this one can still come."""
         return sequence in self._missing
 
+    def corrected(self, sequence: int) -> None:
+        """Takes note of one that need not come any more."""
+        self._missing.pop(sequence, None)
+
     def came(self, sequence: int, now_ns: int, *, again: bool) -> bool:
         """Takes note of one that came, `again` as a retransmission; whether it was waited for."""
         missing = self._missing.get(sequence)

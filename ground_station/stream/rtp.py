@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ground_station.stream.counters import Counters
-from ground_station.stream.retransmission import Retransmission
+from ground_station.stream.retransmission import LIVE_NS, Retransmission
 from pi_firmware.wire import video
 from pi_firmware.wire.annexb import NAL_AUD, NAL_SPS, START_CODE
 
@@ -17,6 +17,8 @@ _FU_START, _FU_END = 0x80, 0x40
 MAX_JUMP = 3000
 """A sequence number further ahead than this is a new stream, not a loss (RFC 3550, A.1)."""
 MAX_ACCESS_UNIT_BYTES = 4 << 20
+_CORRECTED_NS = 1_000_000_000
+"""After so long without a correction none is waited for."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class Packet:
 
     It is when it was read; before that it lay in the machine for `waited_ns`. `again`: a
     retransmission (RFC 4588), of whose packet `sequence` and `payload` are the original's.
+    `corrects`: no packet of H.264, but what corrects others (RFC 5109). `corrected`: found from
+    such. `plain`: without CSRCs, extension and padding.
     """
 
     sequence: int
@@ -35,6 +39,9 @@ class Packet:
     arrival_ns: int
     waited_ns: int = 0
     again: bool = False
+    corrects: bool = False
+    corrected: bool = False
+    plain: bool = True
 
     @property
     def came_ns(self) -> int:
@@ -45,14 +52,15 @@ class Packet:
 def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None:
     """The packet in a datagram; None when it is not RTP version 2 with a payload type of the video.
 
-    Of a retransmission `ssrc` is its own stream's, and not the original's.
+    Of a retransmission and a correction `ssrc` is their own stream's, and not the original's.
     """
     if len(datagram) < _HEADER_BYTES:
         return None
     first, second, sequence, timestamp, ssrc = struct.unpack_from(">BBHII", datagram)
-    again = second & 0x7F == video.RTX_PAYLOAD_TYPE
-    if first >> 6 != 2 or not (again or second & 0x7F == video.PAYLOAD_TYPE):
+    kind = second & 0x7F
+    if first >> 6 != 2 or kind not in video.PAYLOAD_TYPES:
         return None
+    again, corrects = kind == video.RTX_PAYLOAD_TYPE, kind == video.CORRECTION_PAYLOAD_TYPE
     start = _HEADER_BYTES + 4 * (first & 0x0F)
     if first & 0x10:  # header extension
         if len(datagram) < start + 4:
@@ -69,14 +77,18 @@ def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None
     if start >= end:
         return None
     payload, marker = datagram[start:end], bool(second & 0x80)
-    return Packet(sequence, timestamp, ssrc, marker, payload, arrival_ns, waited_ns, again)
+    return Packet(
+        sequence, timestamp, ssrc, marker, payload, arrival_ns, waited_ns, again, corrects,
+        plain=not first & 0x3F,
+    )  # fmt: skip
 
 
 class Reorderer:
     """Puts packets of one stream in order and decides when a missing one is lost.
 
     While `retransmission` helps, that is when it cannot come any more. Otherwise it is waited for
-    until `depth` later ones are here, or `wait_ns` have passed.
+    until `depth` later ones are here, or `wait_ns` have passed; while corrections come, which
+    follow their frame, only those of later frames count.
     """
 
     def __init__(
@@ -96,6 +108,8 @@ class Reorderer:
         self._next = 0
         """After the newest packet."""
         self._came_ns = 0
+        self.corrected_ns: int | None = None
+        """When the newest correction came."""
         self._jumped: Packet | None = None
 
     def push(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
@@ -113,21 +127,38 @@ class Reorderer:
         assert self._expected is not None
         ahead = (packet.sequence - self._expected) & 0xFFFF
         if MAX_JUMP < ahead < 0x10000 - MAX_JUMP:
-            yield from self._restart(packet)
+            if not packet.corrected:
+                yield from self._restart(packet)
         elif ahead > MAX_JUMP or packet.sequence in self._held:
-            self._counters.packets_late += 1  # given up on, or here already
+            self._counters.packets_late += not packet.corrected  # given up on, or here already
         else:
+            self._counters.packets_corrected += packet.corrected
             self._note(packet)
             self._held[packet.sequence] = packet
-            helps = self.retransmission.helps
-            yield from self._release(patient=helps or len(self._held) <= self._depth)
+            patient = self.retransmission.helps or len(self._held) <= self._depth
+            if not patient:
+                patient = len(self._later(packet.arrival_ns)) <= self._depth
+            yield from self._release(patient=patient)
 
     def expire(self, now_ns: int) -> Iterator[tuple[Packet, bool]]:
         """Packets that go on because what is missing before them has not come in time."""
         if self._held:
-            oldest_ns = min(packet.arrival_ns for packet in self._held.values())
-            patient = self.retransmission.helps or now_ns - oldest_ns < self._wait_ns
+            later = (packet.arrival_ns for packet in self._later(now_ns))
+            patient = (
+                self.retransmission.helps or now_ns - min(later, default=now_ns) < self._wait_ns
+            )
             yield from self._release(patient=patient)
+
+    def _later(self, now_ns: int) -> list[Packet]:
+        """Held packets behind which nothing that is missing is on its way, but for overtaking."""
+        held = list(self._held.values())
+        oldest = min(held, key=lambda packet: packet.arrival_ns)
+        corrected_ns = self.corrected_ns
+        if corrected_ns is None or now_ns - corrected_ns > _CORRECTED_NS:
+            return held
+        if now_ns - oldest.arrival_ns >= LIVE_NS:
+            return held
+        return [packet for packet in held if packet.timestamp != oldest.timestamp]
 
     def _begin(self, sequence: int) -> None:
         self._expected = self._next = sequence
@@ -136,6 +167,8 @@ class Reorderer:
         """Takes note of what is missing before the newest packet."""
         retransmission, now_ns = self.retransmission, packet.arrival_ns
         ahead = (packet.sequence - self._next) & 0xFFFF
+        if packet.corrected:
+            retransmission.corrected(packet.sequence)
         if ahead > MAX_JUMP:
             retransmission.came(packet.sequence, now_ns, again=False)
             return

@@ -78,7 +78,7 @@ def _parse(datagram: bytes) -> _Packet | None:
     if len(datagram) < _HEADER_BYTES + TAG_BYTES:
         return None
     first, second, sequence, ssrc = struct.unpack_from(">BBH4xI", datagram)
-    if first >> 6 != 2 or second & 0x7F not in (video.PAYLOAD_TYPE, video.RTX_PAYLOAD_TYPE):
+    if first >> 6 != 2 or second & 0x7F not in video.PAYLOAD_TYPES:
         return None
     authenticated = datagram[:-TAG_BYTES]
     size = _HEADER_BYTES + 4 * (first & 0x0F)

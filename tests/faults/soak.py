@@ -110,6 +110,7 @@ def fly(flown: Flown, options: Any, interrupted: threading.Event) -> None:
                 f"camera.uri={options.camera}",
                 f"camera.rate_hz={RATE_HZ}",
                 f"link.port={link.port}",
+                "link.correction=0",
                 "link.history_s=0",  # what the link loses stays lost: each frame can be told
                 f"telemetry.connect={json.dumps(listener.endpoints)}",
                 prefix=("setsid",),  # a Ctrl-C is ours: the flight ends as it always does

@@ -18,6 +18,7 @@ READERS = (
     Reader("annexb", "H.264 access units and the SEI in them"),
     Reader("rtp", "RTP packets, reordered and put together"),
     Reader("retransmission", "RTP packets that were asked for again, and others"),
+    Reader("correction", "RTP packets that correct others, genuine and forged"),
     Reader("rtcp", "what is asked of the payload, as RTCP and SRTCP"),
     Reader("assembly", "RTP packets to decoded pictures", 8192),
     Reader("srtp", "SRTP packets, authentic and forged"),

@@ -87,7 +87,7 @@ def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
         Stand(tmp_path) as stand,
         ImpairedLink(stand.port, Impairment(loss=0.02), seed=5) as link,
     ):
-        payload = stand.payload("blimp-1", port=link.port)
+        payload = stand.payload("blimp-1", "link.correction=0", port=link.port)
         eventually(lambda: len(stand.heard.of("blimp-1")) > 150)
         ended = payload.end().counts
         eventually(lambda: link.idle)

@@ -1,7 +1,8 @@
-"""A link that loses packets and a sender that has kept them, without a program or a clock.
+"""A link that loses packets and a sender that mends them, without a program or a clock.
 
-Packets, what is asked for and what is sent again take half a round trip each and are lost by the
-same draws; time goes on in steps of a millisecond. All is drawn with a seed.
+Packets, what is asked for, what is sent again and corrections take half a round trip each and are
+lost by the same draws; the ground's reports, one a second, come at once. Time goes on in steps of a
+millisecond. All is drawn with a seed.
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ from dataclasses import dataclass, field
 from impaired_link import Impairment
 
 from ground_station.stream import rtp
+from ground_station.stream.arrivals import Arrivals
+from ground_station.stream.correction import Correction
 from ground_station.stream.counters import Counters
 from ground_station.stream.rtp import AccessUnit
+from pi_firmware.correction import Sender
+from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import rtcp
+from pi_firmware.wire.messages import LinkReport
 
 MS = 1_000_000
 RATE_HZ = 30
@@ -45,6 +51,8 @@ class Mended:
     lost: int = 0
     nacks: int = 0
     again: int = 0
+    sent_bytes: int = 0
+    correction_bytes: int = 0
 
 
 def fly(
@@ -57,9 +65,12 @@ def fly(
     history_ms: int = 500,
     ssrc: int = 77,
     drop: Collection[int] = (),
+    corrected: bool = False,
+    link: LinkSettings = LinkSettings(),  # noqa: B008  # frozen
 ) -> Mended:
     """Sends a frame's datagrams each 1/30 s; `offered`: what is missing is asked for.
 
+    `corrected`: the ground takes corrections, of which those follow that the `link` has made.
     `drop` are those, in their order, that are lost besides the first time.
     """
     made = Mended()
@@ -68,6 +79,12 @@ def fly(
     depacketizer, retransmission = rtp.Depacketizer(counters), reorderer.retransmission
     retransmission.offered = offered
     retransmission.round_trip.hint(round_trip_ms * MS, 0)
+    corrections, arrivals, correction = (
+        Sender(link, ssrc, sends_again=offered),
+        Arrivals(),
+        Correction(),
+    )
+    correction.offered = corrected
     ahead, back = Loss(does, seed), Loss(does, seed + 1)
     number, sends = itertools.count(), itertools.count()
     events: list[tuple[int, int, str, bytes]] = []  # when, in what order, what happens
@@ -81,7 +98,8 @@ def fly(
         while events and events[0][0] <= now_ms:
             _, _, what, datagram = heapq.heappop(events)
             if what == "send":
-                history[int.from_bytes(datagram[2:4], "big")] = (now_ms, datagram)
+                if datagram[1] & 0x7F == 96:
+                    history[int.from_bytes(datagram[2:4], "big")] = (now_ms, datagram)
                 sent = next(sends)
                 if ahead.takes() or sent in drop:
                     made.lost += 1
@@ -95,14 +113,41 @@ def fly(
             else:
                 packet = rtp.parse(datagram, now_ms * MS)
                 assert packet is not None
+                arrivals.add(packet)
                 made.again += packet.again
-                counters.packets += not packet.again
-                yield from reorderer.push(packet)
+                if packet.corrects:
+                    counters.corrections += 1
+                    reorderer.corrected_ns = packet.arrival_ns
+                else:
+                    counters.packets += not packet.again
+                    yield from reorderer.push(packet)
+                for found in correction.take(packet):
+                    yield from reorderer.push(found)
 
-    for index, datagrams in enumerate(frames):
-        for place, datagram in enumerate(datagrams):
+    def send(index: int, datagrams: Sequence[bytes]) -> None:
+        made.sent_bytes += sum(map(len, datagrams))
+        behind = [*corrections.of(datagrams)] if datagrams and corrections.wanted else []
+        made.correction_bytes += sum(map(len, behind))
+        for place, datagram in enumerate([*datagrams, *behind]):
             later(1000 * index // RATE_HZ + place // 4, "send", datagram)
+
+    def report(now_ms: int) -> None:
+        flow = arrivals.flow(now_ms * MS)
+        corrections.forecast.report(
+            LinkReport(
+                now_ms * MS, "main", 5600, ssrc, corrects=corrected,
+                packets_lost=counters.packets_lost, answered=counters.retransmissions,
+                dropped=flow.dropped if flow else None, burst=flow.burst if flow else None,
+            ),
+            now_ms / 1000,
+        )  # fmt: skip
+
+    starts = {1000 * index // RATE_HZ: index for index in range(len(frames))}
     for now_ms in range(last_ms + 1000):
+        if now_ms in starts:
+            send(starts[now_ms], frames[starts[now_ms]])
+        if now_ms % 1000 == 999:
+            report(now_ms)
         ready = list(happened(now_ms))
         if asked := retransmission.due(now_ms * MS):
             made.nacks += 1

@@ -104,3 +104,9 @@ class Receiver:
         stream = self._stream()
         if stream is not None:
             stream.retransmits(rtx_ssrc, round_trip_s)
+
+    def corrects(self, ssrc: int | None) -> None:
+        """Hears what `Feedback` tells a stream."""
+        stream = self._stream()
+        if stream is not None:
+            stream.corrects(ssrc)

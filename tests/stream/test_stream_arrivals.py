@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable
+from dataclasses import replace
 
 import pytest
 
@@ -125,6 +126,18 @@ def test_losses_are_counted_and_disorder_and_duplicates_are_none() -> None:
     seen = flow(taken([p for packet in swapped for p in (packet, packet)]), 60)
     assert seen.dropped == 0.0
     assert seen.received_kbps == flow(taken(sent), 60).received_kbps
+
+
+def test_corrections_load_the_link_and_how_many_are_lost_in_a_row_is_told() -> None:
+    sent = packets(range(60))
+    beside = [replace(p, payload=bytes(BYTES), corrects=True) for p in sent[::PER_FRAME]]
+    plain, more = flow(taken(sent), 60), flow(taken(sent, beside), 60)
+    assert plain.burst is None and more.retransmitted_kbps == more.dropped == 0.0
+    assert more.received_kbps == pytest.approx(1.2 * plain.received_kbps, rel=0.03)
+    # Every tenth, and beside it the two after every thirtieth.
+    lost = {k for k in range(0, 290) if k % 10 == 5 or k % 30 in (6, 7)}
+    kept = [p for k, p in enumerate(sent) if k not in lost]
+    assert flow(taken(kept), 60).burst == pytest.approx(5 / 3, rel=0.1)
 
 
 def test_what_an_outage_takes_is_not_dropped() -> None:

@@ -32,6 +32,10 @@ class Video:
     counters: Counters = field(default_factory=Counters)
     seen: Flow | None = None
     told: tuple[int | None, float | None] = (None, None)
+    correction_ssrc: int | None = None
+
+    def corrects(self, ssrc: int | None) -> None:
+        self.correction_ssrc = ssrc
 
     def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
         self.told = (rtx_ssrc, round_trip_s)
@@ -53,12 +57,15 @@ def test_a_late_packet_stays_lost_and_a_duplicate_counts_once() -> None:
 def test_what_was_mended_is_not_lost_but_was_missed() -> None:
     account = StreamAccount()
     account.add(7, Counters(), 0, 0.0)
-    # Of 100 sent 10 did not come by themselves: 7 were sent again in time, 3 given up, of which
-    # one came late.
-    came = Counters(packets=91, packets_late=1, packets_lost=3, packets_asked=10, packets_mended=7)
+    # Of 100 sent 15 did not come by themselves: 7 were sent again in time, 5 were found, 3 given
+    # up, of which one came late.
+    came = Counters(
+        packets=86, packets_late=1, packets_lost=3, packets_asked=10, packets_mended=7,
+        packets_corrected=5,
+    )  # fmt: skip
     tally, lost = account.add(7, came, 20, 1.0)
-    assert (tally.packets, tally.mended, tally.lost) == (97, 7, 3)
-    assert lost == pytest.approx(0.03) and account.late.share_missed == pytest.approx(0.1)
+    assert (tally.packets, tally.mended, tally.corrected, tally.lost) == (97, 7, 5, 3)
+    assert lost == pytest.approx(0.03) and account.late.share_missed == pytest.approx(0.15)
 
 
 def test_the_share_is_of_the_last_two_seconds() -> None:
@@ -167,21 +174,25 @@ def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener
         ear.close()
 
 
-def test_a_stream_hears_what_its_payload_sends_again_and_reports_what_that_mended(
+def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_mended(
     listener: TelemetryListener,
 ) -> None:
     ear = Ear(listener, "one")
-    counters = Counters(packets=95, packets_lost=1, packets_asked=5, packets_mended=4)
-    video = Video(5601, 11, counters, Flow(900.0, 0.0, 0.05, 40.0))
+    counters = Counters(
+        packets=92, packets_lost=1, packets_mended=4, packets_corrected=3, retransmissions=6
+    )
+    video = Video(5601, 11, counters, Flow(900.0, 0.0, 0.05, 40.0, 1.5))
     ear.telemetry.gate(gate(10, 11))
     assert listener.wait("one", lambda s: s.alive and s.ssrc is not None, LIMIT_S)
     with Feedback(listener, lambda _: video, period_s=0.05):
         told = ear.wait(lambda report: report.packets_mended == 4)
         assert told is not None and told.missed is not None
         assert (told.packets, told.packets_lost, told.retransmitted_kbps) == (99, 1, 40.0)
-        assert video.told[0] is None  # an older payload says nothing of it
-        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=4711))
-        assert until(lambda: video.told[0] == 4711)
+        assert told.corrects and (told.packets_corrected, told.answered, told.burst) == (3, 6, 1.5)
+        # An older payload says nothing of it.
+        assert video.told[0] is None and video.correction_ssrc is None
+        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=4711, correction_ssrc=4712))
+        assert until(lambda: video.told[0] == 4711 and video.correction_ssrc == 4712)
         assert until(lambda: video.told[1] is not None)
         video.ssrc = 12  # a stream that is not the payload's own
         video.told = (None, None)

@@ -7,8 +7,10 @@ import json
 import random
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 from impaired_link import CLEAN, ImpairedLink, Impairment
@@ -34,6 +36,7 @@ from pi_firmware.link import Link
 from pi_firmware.retransmission import Budget, rtx_ssrc
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import rtcp
+from pi_firmware.wire.messages import LinkReport
 from pi_firmware.wire.srtcp import SrtcpProtector
 
 KEY = bytes(range(30))
@@ -124,6 +127,52 @@ def test_the_payloads_own_link_sends_again_what_was_lost(key: bytes | None) -> N
         assert len(numbers(flown.frames)) == 95 - counters.withheld >= 70
         assert counters.withheld == 0 or counters.packets_lost > 0
         assert flown.receiver.counters.refused == flown.receiver.counters.other_streams == 0
+
+
+LOSSY = LinkReport(1, "main", 5600, ssrc=77, corrects=True, dropped=0.05, burst=1.0)
+
+
+@pytest.mark.parametrize("key", [None, KEY], ids=["plain", "encrypted"])
+def test_the_payloads_own_link_corrects_what_was_lost_and_a_clean_one_carries_no_more(
+    key: bytes | None,
+) -> None:
+    with flying(key=key, history_s=0.0) as flown:
+        kinds: Counter[int] = Counter()
+        sizes: list[int] = []
+
+        def tap(datagram: bytes, _: bool) -> None:
+            kinds[datagram[1] & 0x7F] += 1
+            sizes.append(len(datagram))
+
+        flown.air._tap = tap
+        flown.link.report(replace(LOSSY, dropped=0.0), 0.0)
+        send(flown, 5)
+        assert until(lambda: len(flown.frames) == 5)
+        assert set(kinds) == {96}
+        flown.stream.corrects(flown.link.correction_ssrc)
+        flown.link.report(LOSSY, 100.0)
+        flown.air.impair(Impairment(loss=0.05))
+        send(flown, 55, first=5)
+        assert until(lambda: flown.air.idle)
+        flown.air.impair(CLEAN)
+        assert 0.1 < flown.link.report(LOSSY, 100.0) < 1.1
+        send(flown, 20, first=60)
+        assert until(lambda: flown.frames[-1].sequence == 79)
+        counters, link = flown.stream.counters, flown.air.counts
+        assert len(numbers(flown.frames)) == 80 - counters.withheld >= 50
+        assert counters.withheld == 0 or counters.packets_lost > 0
+        assert counters.packets_corrected >= 10 > 5 * counters.packets_lost
+        assert kinds[98] > counters.corrections > 0
+        assert counters.packets + counters.corrections == link.passed
+        assert max(sizes) <= 600
+        port = flown.receiver.counters
+        assert port.refused == port.other_streams == port.garbage == 0
+        # The losses are over: so are the corrections.
+        flown.link.report(replace(LOSSY, dropped=0.0), 200.0)
+        kinds.clear()
+        send(flown, 3, first=80)
+        assert until(lambda: flown.frames[-1].sequence == 82)
+        assert set(kinds) == {96}
 
 
 def test_an_older_payload_is_asked_for_nothing() -> None:
@@ -248,9 +297,10 @@ def test_what_was_packed_by_another_is_asked_for_in_its_own_numbers() -> None:
         assert receiver.counters.other_streams == 1
 
 
-def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames() -> None:
+@pytest.mark.parametrize("way", ["link.correction=0", "link.history_s=0"])
+def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames(way: str) -> None:
     """The program that flies, its telemetry, and what it announces in it."""
-    seconds = 8
+    seconds = 6
     shown_at: list[int] = []
     with (
         TelemetryListener(["tcp/127.0.0.1:0"]) as listener,
@@ -267,6 +317,7 @@ def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames() -> None:
             f"camera.uri=test:?pattern=zone-plate&duration_s={seconds}",
             "gate.enabled=false",
             f"link.port={air.port}",
+            way,
             f"telemetry.connect={json.dumps(listener.endpoints)}",
         )
         try:
@@ -281,16 +332,22 @@ def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames() -> None:
         state = listener.state("blimp-1")
         counters, link = stream.counters, air.counts
     assert state is not None and state.health is not None
-    assert state.health.rtx_ssrc == stream.rtx_ssrc is not None
-    # The first two seconds it is not known yet that anything comes again.
+    # The first two seconds it is not known yet that anything comes again, or what is lost.
     late = [sequence for sequence in shown_at if sequence >= 60]
-    assert len(late) >= 0.95 * (30 * seconds - 60)
+    if "history_s" in way:
+        assert state.health.correction_ssrc == stream.correction_ssrc is not None
+        assert stream.rtx_ssrc is None and len(late) >= 0.6 * (30 * seconds - 60)
+        assert counters.packets_corrected > counters.packets_lost
+        return
+    assert state.health.rtx_ssrc == stream.rtx_ssrc is not None
+    assert stream.correction_ssrc is None and len(late) >= 0.95 * (30 * seconds - 60)
     assert counters.packets_mended > 0.5 * link.lost
     assert counters.packets_lost <= 0.5 * link.lost
 
 
 def _datagrams(stream: Stream) -> int:
-    return stream.counters.packets + stream.counters.retransmissions
+    counters = stream.counters
+    return counters.packets + counters.retransmissions + counters.corrections
 
 
 @pytest.mark.parametrize("lacks", ["rtprtxsend", "cryptography"])

@@ -219,7 +219,7 @@ def test_other_keys_and_plain_packets_are_refused(sender: SrtpSender) -> None:
 def test_what_cannot_be_the_videos_is_refused_without_a_search(sender: SrtpSender) -> None:
     genuine = sender.protect([rtp(0)])[0]
     other_type, other_version = bytearray(genuine), bytearray(genuine)
-    other_type[1] ^= 2  # 97 are those that are sent again
+    other_type[1] ^= 4  # 97 and 98 come beside the video
     other_version[0] ^= 0x40
     endless = bytes([genuine[0] | 0x10]) + genuine[1:14] + b"\xff\xff" + genuine[16:]
     unprotector = Unprotector({ID: KEY})

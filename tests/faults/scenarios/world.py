@@ -230,6 +230,7 @@ class World:
             "payload_id": NAME,
             "camera.uri": camera.uri + pace,
             "camera.rate_hz": f"{self._rate_hz:g}",
+            "link.correction": "0",
             "link.port": str(self.link.port),
             "link.ssrc": str(ssrc),
             "link.history_s": "0",  # what the link loses stays lost: each frame can be told
