@@ -97,13 +97,13 @@ limits: setup  ## Search what loss, delay, bit rate, CPU and payloads the system
 	@mkdir -p out
 	@.venv/bin/python tests/hil/limits.py --out out/limits.json $(if $(ONLY),--only "$(ONLY)") $(OPTIONS)
 
-sample: setup  ## Make the shipped sample of maps/atrium anew, from its fixed seeds (about 10 minutes)
+sample: setup  ## Make the shipped sample of maps/atrium again, from its fixed seeds (about 10 minutes)
 	@$(BLIMP) simulate --sample maps/atrium
 	@$(BLIMP) map build maps/atrium/mapping.mcap --settings maps/atrium/mapping.toml --out maps/atrium
 	@$(BLIMP) map register maps/atrium --pairs maps/atrium/PAIRS.csv
 	@$(BLIMP) map export maps/atrium --png maps/atrium/map.png
 
-picture: setup  ## Make README's picture of the dashboard anew, with the system's Chromium
+picture: setup  ## Make README's picture of the dashboard again, with the system's Chromium
 	@.venv/bin/python tests/service/dashboard_picture.py maps/atrium/dashboard.jpg
 
 virtual-camera: setup  ## A Debian 13 in out/ with libcamera's virtual camera, for its tests (as root)
@@ -117,7 +117,7 @@ soak-stream: setup  ## One unbroken stream of HOURS=1 through the live localizer
 	@mkdir -p out
 	@.venv/bin/python tests/service/soak_stream.py --hours "$(or $(HOURS),1)" --out out/soak-stream.json
 
-lock:  ## Resolve requirements.lock anew from pyproject.toml
+lock:  ## Resolve requirements.lock again from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv
 	@out/lock/bin/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url \
 	  --no-header --no-annotate --python-version 3.11 --extra dev pyproject.toml -o requirements.lock

@@ -25,7 +25,7 @@ _COMMANDS = (
     (
         "doctor",
         "ground_station.doctor.command",
-        "check this machine, and say how to mend it",
+        "check this machine, and say how to fix it",
     ),
     ("import", "ground_station.recording.import_command", "make a recording of a plain video"),
     ("export", "ground_station.recording.export_command", "a recording's poses for other programs"),

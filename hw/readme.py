@@ -34,7 +34,7 @@ def sections() -> dict[str, str]:
 
 
 def filled(page: str) -> str:
-    """The page with every marked stretch made anew; raises `HardwareError` for a missing marker."""
+    """The page with each marked stretch made again; raises `HardwareError` for a missing marker."""
     for name, text in sections().items():
         pattern = re.compile(rf"(<!-- {name}: made .*?-->\n).*?(<!-- /{name} -->)", re.DOTALL)
         found = list(pattern.finditer(page))

@@ -74,8 +74,8 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
 def main() -> int:
     """Runs the payload.
 
-    Status 0 at the end of the stream or on a signal, 2 on what a person can mend, 3 when the
-    process must be started anew.
+    Status 0 at the end of the stream or on a signal, 2 on what a person can fix, 3 when the
+    process must be restarted.
     """
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):  # first of all: it may come while modules load

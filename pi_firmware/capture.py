@@ -1,4 +1,4 @@
-"""Camera and encoder, kept alive: what hangs or fails is closed and opened anew, and counted."""
+"""Camera and encoder, kept alive: what hangs or fails is closed and opened again, and counted."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _STARTED_ANEW = {
 
 
 class UnrecoverableError(StreamError):
-    """Starting anew inside the process has not helped: the process must be."""
+    """Starting again inside the process has not helped: the process must be."""
 
     restart = True
 
 
 @dataclass
 class Restarts:
-    """Times that the camera and the encoder were started anew since the program's start."""
+    """Times that the camera and the encoder were restarted since the program's start."""
 
     camera: int = 0
     encoder: int = 0
@@ -44,7 +44,7 @@ class Restarts:
 class Capture:
     """The camera and the encoder of a flight: `start`, `step` until it ends, `close`.
 
-    A recording is not started anew: what fails there ends the flight. `announce` gets an event's
+    A recording is not restarted: what fails there ends the flight. `announce` gets an event's
     name and text. Raises `BlimpError` with one line for what cannot be opened at first.
     """
 
@@ -77,7 +77,7 @@ class Capture:
 
     @property
     def live(self) -> bool:
-        """Whether frames come from a camera, which goes on while we start it anew."""
+        """Whether frames come from a camera, which goes on while we start it again."""
         return not self._settings.camera.uri.startswith("replay:")
 
     @property
@@ -114,7 +114,7 @@ class Capture:
     def step(self) -> bool:
         """Waits 50 ms at most for what happens and acts on it; False at the stream's end.
 
-        Raises `BlimpError` for a fault that a restart does not mend, `UnrecoverableError` after too
+        Raises `BlimpError` for a fault that a restart does not fix, `UnrecoverableError` after too
         many.
         """
         self._serve()
@@ -192,7 +192,7 @@ class Capture:
             source.window.answered(sequence)
 
     def ask_for(self, camera: CameraSettings) -> Future[None]:
-        """Has the camera started anew with other settings; with the old ones when it refuses.
+        """Has the camera restarted with other settings; with the old ones when it refuses.
 
         From any thread: `step` does it. The result is there when it was done, or a `BlimpError`.
         """
@@ -228,7 +228,7 @@ class Capture:
             raise
 
     def _give_up(self, error: BlimpError) -> None:
-        """The source says that opening it anew would be no better: settings that were asked for on
+        """The source says that opening it again would be no better: settings that were asked for on
         the way are taken back, and with those of the start the flight ends.
         """
         if self._trusted is None:
@@ -294,7 +294,7 @@ class Capture:
             self._fail(_CAMERA, StreamError(f"the camera gave no frame for {limit_s:g} s"))
 
     def _fail(self, what: str, error: BlimpError) -> None:
-        """Closes both; they are opened anew after a pause, or `UnrecoverableError` is raised."""
+        """Closes both; they are opened again after a pause, or `UnrecoverableError` is raised."""
         if not self.live or self._ending:
             raise error
         self._shut()

@@ -14,7 +14,7 @@ def wall_at(pipeline: Any, running_ns: int) -> int:
 
     The two clocks cannot be read at once, and the thread may be held between: of up to five tries
     the one counts whose reading of the wall clock is framed most tightly. A wall clock that was set
-    anew since shifts the result by as much: it is the wall clock of now that is meant.
+    again since shifts the result by as much: it is the wall clock of now that is meant.
     """
     clock = pipeline.get_clock()
     best_ns, offset_ns = 1 << 62, 0

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """`blinks` short ones and a pause; `mend` is what a person can do about it."""
+    """`blinks` short ones and a pause; `fix` is what a person can do about it."""
 
     blinks: int
     what: str
-    mend: str
+    fix: str
 
 
 NO_PROVISIONING = Fault(
@@ -40,7 +40,7 @@ NO_NETWORK = Fault(
 NO_DATA = Fault(
     6,
     "the data partition is broken or full",
-    "Save what you need of it (it is the card's third partition, ext4), then write the card anew."
+    "Save what you need of it (it is the card's third partition, ext4), then write the card again."
     " A card that this happens to again is worn: take another one.",
 )
 ALL = (NO_PROVISIONING, REFUSED, NO_VIDEO, NO_NETWORK, NO_DATA)

@@ -5,7 +5,7 @@ The image's last partition is small; a card is as large as it is. One sector, th
 system follows when it is mounted (systemd's growfs, online and journalled).
 
 It runs before udev: that takes a written partition table for a new disk, announces all partitions
-anew, and systemd then unmounts what it had just mounted.
+again, and systemd then unmounts what it had just mounted.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tells how the card is, by the light and STATUS.txt: `python3 -m deploy.board.light`.
 
-It decides nothing and mends nothing: what it tells of goes on without it.
+It decides nothing and fixes nothing: what it tells of goes on without it.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def render(status: Status) -> bytes:
     if fault and status.reason:
         lines.append(f"Reason:   {one_line(status.reason)}")
     if fault:
-        lines.append(f"To mend:  {fault.mend}")
+        lines.append(f"To fix:  {fault.fix}")
     if status.warning:
         lines.append(f"Warning:  {one_line(status.warning)}")
     lines += [

@@ -44,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Status 0 when the board has powered off or was cut off, 2 on what a person can mend."""
+    """Status 0 when the board has powered off or was cut off, 2 on what a person can fix."""
     try:
         return _boot(_parser().parse_args())
     except DeployError as error:

@@ -100,7 +100,7 @@ def health(image: Path, folder: Path, root_digest: str) -> Health:
     """Looks at a card whose power was cut, on copies: the card itself is left as it is.
 
     Root must have not one byte changed: it is mounted read-only. Data gets its journal played back,
-    as each mount does, and must then have nothing for `e2fsck -f` to mend. The boot partition has
+    as each mount does, and must then have nothing for `e2fsck -f` to fix. The boot partition has
     no journal: `fsck.vfat -n` must find nothing but the mark that it was not unmounted.
     """
     problems = []

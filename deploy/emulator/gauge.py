@@ -79,5 +79,5 @@ def was_reset(image: bytes) -> bool:
 
 
 def write(path: Path, volts: float, percentage: float, rate_per_h: float = 0.0) -> None:
-    """Writes a register file anew, as if the cell had been taken out and put in again."""
+    """Writes a register file again, as if the cell had been taken out and put in again."""
     path.write_bytes(registers(volts, percentage, rate_per_h))

@@ -87,7 +87,7 @@ class BootPartition:
         return self._run("mtype", self._path(path))
 
     def write(self, path: str, data: bytes) -> None:
-        """Writes a file anew; its folder must be there."""
+        """Writes a file again; its folder must be there."""
         self._run("mcopy", "-o", "-D", "o", "-", self._path(path), data=data)
 
     def make_folder(self, path: str) -> None:

@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the flasher: status 0, 2 on what a person can mend, 130 when interrupted."""
+    """Runs the flasher: status 0, 2 on what a person can fix, 130 when interrupted."""
     options = _parser().parse_args(arguments)
     try:
         with _interruptible():
@@ -138,8 +138,8 @@ def _stored(options: argparse.Namespace, boot: BootPartition) -> Provisioning | 
         existing = customise.stored(boot)
     except DeployError as error:
         if options.payload is None:
-            raise DeployError(f"{error} (name all anew: --payload and Wi-Fi)") from None
-        print(f"the card's {error}; it is written anew")
+            raise DeployError(f"{error} (name all again: --payload and Wi-Fi)") from None
+        print(f"the card's {error}; it is written again")
     if existing is None:
         if options.payload is None:
             raise DeployError("--payload is missing: the card does not have a name yet")

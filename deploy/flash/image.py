@@ -163,7 +163,7 @@ def _stretches(path: Path, file: BinaryIO, size: int) -> list[Stretch]:
             wrong = bmap.verify(file, stretches)
             if wrong is not None:
                 raise DeployError(
-                    f"{place}: not the map of this image (byte {wrong}); delete it, or build anew"
+                    f"{place}: not the map of this image (byte {wrong}); delete it, or build again"
                 )
             return stretches
     return [Stretch(0, size)]

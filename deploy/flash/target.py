@@ -94,7 +94,7 @@ class Target:
         os.posix_fadvise(self._fd, 0, 0, os.POSIX_FADV_DONTNEED)
 
     def reread_table(self) -> bool:
-        """Makes the kernel take the partition table anew; False when it must be plugged anew."""
+        """Makes the kernel take the partition table again; False when it must be plugged again."""
         if not self.is_device:
             return True
         try:

@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Builds an image; status 0, or 2 with one line on what a person can mend."""
+    """Builds an image; status 0, or 2 with one line on what a person can fix."""
     options = _parser().parse_args(arguments)
     started = time.monotonic()
 

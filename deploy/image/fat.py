@@ -23,7 +23,7 @@ def make(image: Path, size: int, tree: Tree, label: str, serial: int, epoch: int
     """Makes a file system of `size` bytes with the tree's files; owners and modes are lost.
 
     Args:
-        image: made anew.
+        image: made again.
         size: bytes.
         tree: files and folders; FAT knows no links.
         label: up to 11 capital letters.

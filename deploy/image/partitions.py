@@ -49,7 +49,7 @@ def assemble(image: Path, partitions: list[Partition], disk: int, size: int | No
     """Writes the table and the partitions, in order, into a new file.
 
     Args:
-        image: made anew, with holes where nothing that matters lies.
+        image: made again, with holes where nothing that matters lies.
         partitions: at most 4; each begins at a multiple of `ALIGN_BYTES`.
         disk: the disk's number, 32 bits, not 0.
         size: of the image in bytes (default: to the last partition's end).

@@ -7,7 +7,7 @@ Raspberry Pi OS itself, which was out of reach: it was tested with small images 
 of the real one, and with a Debian armhf in its place.
 
 The root partition is taken out, changed with debugfs, checked, and put into a card of the same
-layout as the other boards'. The boot partition is made anew from the base's files.
+layout as the other boards'. The boot partition is made again from the base's files.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def _document(text: bytes) -> dict[str, Any]:
     if text.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise DeployError("it is UTF-16; save it as UTF-8")
     if b"\0" in text:
-        raise DeployError("it holds a NUL byte: the file is cut or damaged, write it anew")
+        raise DeployError("it holds a NUL byte: the file is cut or damaged, write it again")
     try:
         return toml_text.read(text)
     except UnicodeDecodeError as error:

@@ -151,7 +151,7 @@ class Card:
 
         Raises `DeployError` when it is not heard in time.
 
-        A link that goes and comes back, as it may while the firmware is started anew, is no end.
+        A link that goes and comes back, as it may while the firmware is restarted, is no end.
         """
         limit_s += _SLACK_S
         until_s, fault = clock() + limit_s, ""
@@ -192,7 +192,7 @@ class Card:
         if any("HOST IDENTIFICATION HAS CHANGED" in line for line in lines) or any(
             "Host key verification failed" in line for line in lines
         ):
-            forget = f"; flashed anew without its keys? ssh-keygen -R {self.name} -f {self.known}"
+            forget = f"; flashed again without its keys? ssh-keygen -R {self.name} -f {self.known}"
             why = "it has another host key than this payload's"
             return f"{self.host}: {why}{'' if self._pinned else forget}"
         last = printable(lines[-1])[:300] if lines else ""

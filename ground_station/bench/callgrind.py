@@ -118,15 +118,15 @@ def by_group(profile: Profile) -> dict[str, float]:
     result = dict.fromkeys(GROUPS, 0.0)
     left: dict[Code, float] = {code: float(cost) for code, cost in profile.own.items()}
     for _ in range(_CALLS_DEEP):
-        borne: dict[Code, float] = defaultdict(float)
+        sustained: dict[Code, float] = defaultdict(float)
         for code, cost in left.items():
             shares = callers.get(code)
             if shares is None or not shares.total():
                 result[group_of(code.object)] += cost
                 continue
             for caller, share in shares.items():
-                borne[caller] += cost * share / shares.total()
-        left = borne
+                sustained[caller] += cost * share / shares.total()
+        left = sustained
     result[OTHER] += sum(left.values())  # functions that call each other in a ring
     return result
 

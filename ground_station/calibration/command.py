@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints or calibrates; raises a `BlimpError` with one line for what a person can mend."""
+    """Prints or calibrates; raises a `BlimpError` with one line for what a person can fix."""
     printing = args.inputs == ["board"]
     for name in _OF_VIEWS if printing else _OF_BOARD:
         if getattr(args, name) is not None:

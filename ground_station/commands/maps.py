@@ -42,5 +42,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs the command; raises `BlimpError` for what a person can mend."""
+    """Runs the command; raises `BlimpError` for what a person can fix."""
     return int(_COMMANDS[args.map_command].run(args))

@@ -1,4 +1,4 @@
-"""`blimp doctor`: what the ground station needs of its machine, and how to mend what is not so."""
+"""`blimp doctor`: what the ground station needs of its machine, and how to fix what is not so."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`blimp doctor`: checks this machine for the ground station and says how to mend it."""
+"""`blimp doctor`: checks this machine for the ground station and says how to fix it."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
         first = findings.ok("settings", name)
         todo += of_settings(loaded)
     except BlimpError as error:
-        mend = f"mend {name}; what depends on it is not checked"
-        first = findings.problem("settings", str(error), mend)
+        fix = f"fix {name}; what depends on it is not checked"
+        first = findings.problem("settings", str(error), fix)
     found = findings.examine([Check("settings", lambda: first), *todo])
     colour = sys.stdout.isatty() and "NO_COLOR" not in os.environ
     print(findings.text(found, colour=colour))

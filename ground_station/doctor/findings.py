@@ -20,12 +20,12 @@ _WORKERS = 4
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's: `level` is ok, warning or problem; `mend` says what to do."""
+    """One line of the doctor's: `level` is ok, warning or problem; `fix` says what to do."""
 
     name: str
     level: str
     found: str
-    mend: str = ""
+    fix: str = ""
 
 
 @dataclass(frozen=True)
@@ -37,18 +37,18 @@ class Check:
 
 
 def ok(name: str, found: str) -> Finding:
-    """Nothing to mend."""
+    """Nothing to fix."""
     return Finding(name, OK, found)
 
 
-def warning(name: str, found: str, mend: str) -> Finding:
+def warning(name: str, found: str, fix: str) -> Finding:
     """It works, but not as well or as surely as it could."""
-    return Finding(name, WARNING, found, mend)
+    return Finding(name, WARNING, found, fix)
 
 
-def problem(name: str, found: str, mend: str) -> Finding:
+def problem(name: str, found: str, fix: str) -> Finding:
     """The service cannot do its work like this."""
-    return Finding(name, PROBLEM, found, mend)
+    return Finding(name, PROBLEM, found, fix)
 
 
 def examine(checks: Sequence[Check]) -> list[Finding]:
@@ -95,10 +95,10 @@ def text(findings: Sequence[Finding], *, colour: bool, width: int | None = None)
         found = _wrapped(finding.found, columns - indent)
         lines.append(f"{finding.name.ljust(names)}  {level}  {found[0]}")
         lines += [" " * indent + line for line in found[1:]]
-        if finding.mend:
-            mend = _wrapped(finding.mend, columns - indent - 3)
-            lines.append(f"{' ' * indent}-> {mend[0]}")
-            lines += [" " * (indent + 3) + line for line in mend[1:]]
+        if finding.fix:
+            fix = _wrapped(finding.fix, columns - indent - 3)
+            lines.append(f"{' ' * indent}-> {fix[0]}")
+            lines += [" " * (indent + 3) + line for line in fix[1:]]
     return "\n".join([*lines, "", _summary(findings)])
 
 

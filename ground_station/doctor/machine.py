@@ -26,17 +26,17 @@ _MEBI = 2**20
 def clock(timesync: Path = _TIMESYNC) -> Finding:
     """The clock is right: payloads, which have none, take their time from it."""
     year = time.gmtime().tm_year
-    mend = "sudo timedatectl set-ntp true (or install chrony); where there is no network: sudo date"
+    fix = "sudo timedatectl set-ntp true (or install chrony); where there is no network: sudo date"
     made_s = Path(__file__).stat().st_mtime
     if time.time() < made_s - 86_400:
         found = f"it is {year} by this clock, which is before this program was installed"
-        return problem("clock", found, mend)
+        return problem("clock", found, fix)
     state, error_ms = _adjtimex()
     if timesync.exists() or (state is not None and state != _TIME_ERROR):
         within = f" within {error_ms:.0f} ms" if error_ms is not None else ""
         return ok("clock", f"synchronised{within}")
     return warning(
-        "clock", "not synchronised; payloads and recordings take their time from it", mend
+        "clock", "not synchronised; payloads and recordings take their time from it", fix
     )
 
 
@@ -65,8 +65,8 @@ def memory(most: int, meminfo: Path = Path("/proc/meminfo")) -> Finding:
     if free < one:
         return problem("memory", found, f"end other programs: one payload needs {one} MB")
     if free < all_:
-        mend = f"payloads.most = {most} needs {all_} MB: set it lower, or end other programs"
-        return warning("memory", found, mend)
+        fix = f"payloads.most = {most} needs {all_} MB: set it lower, or end other programs"
+        return warning("memory", found, fix)
     if cores < 2:
         return warning("memory", found, "two cores are needed to keep up with 30 Hz")
     return ok("memory", f"{found}, for up to {most} payloads")
@@ -88,11 +88,11 @@ def disk(recording: RecordingSettings) -> Finding:
     found = f"{folder}{new}: {free_mb:.0f} MB free, {rate:.0f} MB/s written through"
     room_mb = free_mb - recording.min_free_MB
     if room_mb <= 0:
-        mend = f"make room: recording ends below recording.min_free_MB = {recording.min_free_MB}"
-        return problem("disk", found, mend)
+        fix = f"make room: recording ends below recording.min_free_MB = {recording.min_free_MB}"
+        return problem("disk", found, fix)
     if room_mb < recording.max_file_MB:
-        mend = f"make room: no whole file of {recording.max_file_MB} MB fits before recording ends"
-        return warning("disk", found, mend)
+        fix = f"make room: no whole file of {recording.max_file_MB} MB fits before recording ends"
+        return warning("disk", found, fix)
     if rate < _SLOWEST_MB_S:
         return warning("disk", found, "set recording.folder to a faster disk")
     return ok("disk", found)

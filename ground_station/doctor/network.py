@@ -100,10 +100,10 @@ def _port(port: Port) -> Finding:
         return problem(name, f"held by {who}", f"{end}, or set {port.setting} to another")
     reason = error.strerror or str(error)
     addresses = "ip -brief address shows this machine's"
-    mend = f"set {port.setting.partition('.')[0]}.host to an address of this machine; {addresses}"
+    fix = f"set {port.setting.partition('.')[0]}.host to an address of this machine; {addresses}"
     if isinstance(error, PermissionError):
-        mend = f"ports below 1024 are root's: set {port.setting} to a higher one"
-    return problem(name, f"{port.host} cannot be listened on: {reason}", mend)
+        fix = f"ports below 1024 are root's: set {port.setting} to a higher one"
+    return problem(name, f"{port.host} cannot be listened on: {reason}", fix)
 
 
 def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:
@@ -113,8 +113,8 @@ def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:
     if allowed >= BUFFER_BYTES:
         return ok("receive buffer", found)
     line = f"net.core.rmem_max={BUFFER_BYTES}"
-    mend = f"echo {line} | sudo tee /etc/sysctl.d/60-blimp.conf && sudo sysctl -w {line}"
-    return warning("receive buffer", f"{found}: bursts are lost when the machine is busy", mend)
+    fix = f"echo {line} | sudo tee /etc/sysctl.d/60-blimp.conf && sudo sysctl -w {line}"
+    return warning("receive buffer", f"{found}: bursts are lost when the machine is busy", fix)
 
 
 def firewall_rules(settings: StationSettings) -> Finding:
@@ -184,8 +184,8 @@ def discovery(settings: StationSettings) -> Finding:
         return problem("discovery", f"there is no interface '{interface}'", choose)
     address = scouting.interface_address(interface)
     if address is None:
-        mend = f"sudo ip link set {interface} up, and give it one (nmcli device connect)"
-        return problem("discovery", f"'{interface}' has no IPv4 address", mend)
+        fix = f"sudo ip link set {interface} up, and give it one (nmcli device connect)"
+        return problem("discovery", f"'{interface}' has no IPv4 address", fix)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         member = struct.pack("4s4s", *map(socket.inet_aton, (_SCOUTING_GROUP, address)))
         try:

@@ -51,8 +51,8 @@ def judge_unit(state: dict[str, str]) -> Finding:
     if restarts:
         return warning("service", f"{said}, restarted {restarts} times", look)
     if state.get("UnitFileState") != "enabled":
-        mend = f"sudo systemctl enable {UNIT}"
-        return warning("service", f"{said}, but not from the next start of the machine", mend)
+        fix = f"sudo systemctl enable {UNIT}"
+        return warning("service", f"{said}, but not from the next start of the machine", fix)
     return ok("service", said)
 
 
@@ -72,7 +72,7 @@ def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
             time.sleep(listen_s)
             heard = {name: listener.state(name) for name in listener.payloads()}
     except TelemetryError as error:
-        return problem("payloads", str(error), "mend telemetry.listen and telemetry.certificates")
+        return problem("payloads", str(error), "fix telemetry.listen and telemetry.certificates")
     if not heard:
         return ok("payloads", f"none within {listen_s:g} s")
     other = [name for name, state in heard.items() if state is not None and state.refused]
@@ -84,16 +84,16 @@ def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
 
 def judge_payloads(heard: dict[str, PayloadState | None], root: Path) -> Finding:
     """The versions of those that are heard, beside the firmware at `root`."""
-    found, mend = [], []
+    found, fix = [], []
     for name, state in heard.items():
         said = f"{name} runs {versions.told(state)}"
         version = state.health.version if state is not None and state.health is not None else ""
         if reason := versions.trouble(state):
             said += f": {reason}"
-            mend.append(f"mend that and update {name} again")
+            fix.append(f"fix that and update {name} again")
         if differs := versions.difference(version, root) if version else "":
             said += f"; {differs}"
-            mend.append(f"make update PAYLOAD={name}, or leave it: both speak the same messages")
+            fix.append(f"make update PAYLOAD={name}, or leave it: both speak the same messages")
         found.append(said)
     told = "; ".join(found)
-    return warning("payloads", told, "; ".join(mend)) if mend else ok("payloads", told)
+    return warning("payloads", told, "; ".join(fix)) if fix else ok("payloads", told)

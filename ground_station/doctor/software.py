@@ -133,8 +133,8 @@ def gstreamer() -> Finding:
     try:
         gst = _gst()
     except (ImportError, ValueError) as error:
-        mend = "sudo apt-get install gir1.2-gstreamer-1.0 gir1.2-gst-plugins-base-1.0"
-        return problem("gstreamer", f"cannot be loaded: {error}", mend)
+        fix = "sudo apt-get install gir1.2-gstreamer-1.0 gir1.2-gst-plugins-base-1.0"
+        return problem("gstreamer", f"cannot be loaded: {error}", fix)
     found = {name: gst.ElementFactory.find(name) is not None for name in _ELEMENTS}
     version = ".".join(map(str, gst.version()[:3]))
     if missing := [name for name, there in found.items() if not there]:

@@ -29,12 +29,12 @@ def maps(settings: MapSettings, preset: str) -> Iterator[Finding]:
     try:
         map_ = store.load(folder)
     except GroundStationError as error:
-        yield problem("map", str(error), f"{choose}, or copy it here anew")
+        yield problem("map", str(error), f"{choose}, or copy it here again")
         return
     name, points = map_.info.name, len(map_.landmarks)
     if not map_.info.registered:
-        mend = f"blimp map register {folder} --pairs PAIRS.csv"
-        yield problem("map", f"'{name}' is not registered to a floor plan", mend)
+        fix = f"blimp map register {folder} --pairs PAIRS.csv"
+        yield problem("map", f"'{name}' is not registered to a floor plan", fix)
     elif not points:
         yield problem("map", f"'{name}' has no landmarks", choose)
     else:
@@ -55,11 +55,11 @@ def _features(info, preset: str, folder: Path) -> Finding:  # type: ignore[no-un
     try:
         extractor = extractor_for(info, load_preset(preset).features)
     except GroundStationError as error:
-        mend = (
-            f"bring that model (blimp models), or build {folder} anew with features that are here "
+        fix = (
+            f"bring that model (blimp models), or build {folder} again with features that are here "
             "(blimp map build --features NAME)"
         )
-        return problem("features", str(error), mend)
+        return problem("features", str(error), fix)
     found = f"'{extractor.name}' ({extractor.sha256[:12]}), the map's; preset '{preset}'"
     return ok("features", found)
 
@@ -69,12 +69,12 @@ def _floorplan(folder: Path) -> Finding:
 
     path = folder / "floorplan.yaml"
     if not path.exists():
-        mend = f"put floorplan.yaml and its picture, in ROS map_server's form, into {folder}"
-        return warning("floor plan", "the map has none; the dashboard draws landmarks only", mend)
+        fix = f"put floorplan.yaml and its picture, in ROS map_server's form, into {folder}"
+        return warning("floor plan", "the map has none; the dashboard draws landmarks only", fix)
     try:
         plan = load_floorplan(path)
     except BlimpError as error:
-        return problem("floor plan", str(error), f"mend {path}, or take it away")
+        return problem("floor plan", str(error), f"fix {path}, or take it away")
     width_m, height_m = plan.size_m
     return ok("floor plan", f"{width_m:.1f} x {height_m:.1f} m at {plan.resolution_m:g} m a pixel")
 
@@ -103,9 +103,9 @@ def certificate(settings: StationSettings) -> Finding:
         if is_loopback(settings.video.host):
             return ok(name, "none: telemetry and video on loopback only")
         found = f"none, and video.host is {settings.video.host}: plain RTP can be forged"
-        mend = f"blimp keys ground {settings.name}, then set telemetry.certificates"
-        return warning(name, found, mend)
-    anew = f"copy the folder of 'blimp keys ground {settings.name}' here anew"
+        fix = f"blimp keys ground {settings.name}, then set telemetry.certificates"
+        return warning(name, found, fix)
+    anew = f"copy the folder of 'blimp keys ground {settings.name}' here again"
     try:
         held = credentials.load(text)
         read = (held.folder / credentials.CERTIFICATE).read_bytes()
@@ -151,20 +151,20 @@ def _card(path: Path, station: str) -> Finding:
         is_told = station in note["peers"]
     except (OSError, ValueError, KeyError, TypeError):
         return warning(
-            name, f"{path}: cannot be read", f"make flash PAYLOAD={payload} makes it anew"
+            name, f"{path}: cannot be read", f"make flash PAYLOAD={payload} makes it again"
         )
     if is_told:
         return ok(name, f"{found}, for {stations}")
-    mend = f"make flash PAYLOAD={payload} again, or set name to that station's"
-    return problem(name, f"{found} for {stations}; this station is {station}", mend)
+    fix = f"make flash PAYLOAD={payload} again, or set name to that station's"
+    return problem(name, f"{found} for {stations}; this station is {station}", fix)
 
 
 def _lasting(held: credentials.Credentials, until: datetime.datetime) -> Finding:
     """Of a good certificate: its end, its files' modes, and the keys of the payloads' video."""
     name, left = "certificate", until - datetime.datetime.now(datetime.UTC)
     if left <= datetime.timedelta(0):
-        mend = "blimp keys rotate (three times, copying the folders between)"
-        return problem(name, f"ended on {until:%Y-%m-%d}", mend)
+        fix = "blimp keys rotate (three times, copying the folders between)"
+        return problem(name, f"ended on {until:%Y-%m-%d}", fix)
     if open_ := [path for path in held.folder.rglob("*.key") if path.stat().st_mode & 0o077]:
         return problem(name, f"others can read {open_[0]}", f"chmod -R go= {held.folder}")
     if (held.folder / credentials.KEY).stat().st_mode & 0o077:
@@ -175,7 +175,7 @@ def _lasting(held: credentials.Credentials, until: datetime.datetime) -> Finding
         found = f"no video key of {', '.join(lacking)}"
         return problem(name, found, "copy the folder from the authority again")
     if left < _SOON:
-        mend = "blimp keys rotate, and copy the folders"
-        return warning(name, f"ends on {until:%Y-%m-%d}, in {left.days} days", mend)
+        fix = "blimp keys rotate, and copy the folders"
+        return warning(name, f"ends on {until:%Y-%m-%d}, in {left.days} days", fix)
     who = ", ".join(sorted(payloads)) or "no payload yet"
     return ok(name, f"{held.name} until {until:%Y-%m-%d}, for {who}")

@@ -15,7 +15,7 @@ examples:
 
 What is flown stands in experiments.toml beside this command's module; --file takes another. Flights
 are simulated once and kept in the folder of --out, as are maps and runs, under what they depend on:
-after a change only what it touches is made anew."""
+after a change only what it touches is made again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Flies, maps, localizes, reports; 1 where the default is not better, or a claim not kept.
 
-    Raises `BlimpError` for what a person can mend. Real video that is not there is left out with
+    Raises `BlimpError` for what a person can fix. Real video that is not there is left out with
     a line, unless it was asked for by name.
     """
     import sys

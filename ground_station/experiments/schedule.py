@@ -26,7 +26,7 @@ Work = Callable[[Job, Path, Path], None]
 def carry_out(plan: Plan, store: Store, data: Path, jobs: int, do: Work = work) -> int:
     """Does what is not there yet, `jobs` at a time, each by `do`; the number of jobs done.
 
-    Raises the first error that a person can mend, after the others in hand are finished; what was
+    Raises the first error that a person can fix, after the others in hand are finished; what was
     done is kept. A job that its process did not survive is kept as failed.
     """
     open_ = {key: job for key, job in plan.jobs.items() if not store.done(job)}

@@ -99,13 +99,13 @@ def misfit(camera: Camera, width_px: int, height_px: int) -> str:
     size, theirs = f"{width_px}x{height_px}", f"{camera.width_px}x{camera.height_px}"
     if _same_shape(turned(camera, 1), width_px, height_px):
         how = ("lies", "stands upright") if width_px > height_px else ("stands upright", "lies")
-        mend = (
+        fix = (
             f"it {how[0]}, the camera's picture {how[1]}: hold the camera as when it was"
             " calibrated, or calibrate it like this (blimp calibrate)"
         )
     else:
-        mend = f"use pictures of {theirs}, or calibrate at {size} (blimp calibrate)"
-    return f"{size} pixels, the camera {theirs}: {mend}"
+        fix = f"use pictures of {theirs}, or calibrate at {size} (blimp calibrate)"
+    return f"{size} pixels, the camera {theirs}: {fix}"
 
 
 def _same_shape(camera: Camera, width: int, height: int) -> bool:

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints; raises `BlimpError` for what a person can mend."""
+    """Prints; raises `BlimpError` for what a person can fix."""
     from ground_station.map.store import load
     from ground_station.map.summary import describe
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes; raises `BlimpError` for what a person can mend."""
+    """Writes; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import InputError
     from ground_station.map.store import load
 

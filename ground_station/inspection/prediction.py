@@ -45,7 +45,7 @@ class Prediction:
 
     @property
     def lost(self) -> Bools:
-        """Where fewer landmarks are expected than are followed; to be found anew it takes more."""
+        """Where fewer landmarks are expected than are followed; to be found again it takes more."""
         return self.count < self.needs.count
 
 

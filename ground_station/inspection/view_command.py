@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes the page; raises `BlimpError` for what a person can mend."""
+    """Writes the page; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import InputError
     from ground_station.inspection import page
     from ground_station.inspection.comparison import compare

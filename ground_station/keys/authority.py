@@ -8,7 +8,7 @@
     FOLDER/ground/NAME/           to copy to the ground station: the same, and all SRTP keys
 
 Zenoh reads no revocation list. A revoked name leaves the access lists of all others, which holds on
-each machine once its new folder is there and its program was started anew; a rotation of the
+each machine once its new folder is there and its program was restarted; a rotation of the
 authority ends what the old one signed, whatever the lists say. The key of the releases goes along
 with it, step by step.
 
@@ -158,7 +158,7 @@ class Authority:
         Raises `KeysError` when somebody took it away: another one would be trusted by no card.
 
         An authority older than releases has none: it gets one, and its payloads' folders the public
-        part, which reaches a card only when it is provisioned anew.
+        part, which reaches a card only when it is provisioned again.
         """
         path = self.folder / "releases" / str(self.signing)
         made = not path.with_name(f"{path.name}.pub").is_file()
@@ -199,13 +199,13 @@ class Authority:
                 problems.append(f"{name}: {error}")
                 continue
             if name.startswith(PAYLOAD) and not self._trusts_releases(held.folder):
-                problems.append(f"{name}: takes no releases of this authority; 'release' mends it")
+                problems.append(f"{name}: takes no releases of this authority; 'release' fixes it")
             if common != name or held.name != name:
                 problems.append(f"{name}: the certificate is {common}'s")
             if set(held.peers) != set(self._peers(name)):
                 problems.append(f"{name}: its access list is not the authority's")
             if until - now < datetime.timedelta(days=soon_days):
-                problems.append(f"{name}: ends on {until:%Y-%m-%d}; 'renew' mends it")
+                problems.append(f"{name}: ends on {until:%Y-%m-%d}; 'renew' fixes it")
         for path in sorted(self.folder.rglob("*")):
             if path.is_file() and path.stat().st_mode & 0o077:
                 problems.append(f"{path}: others can read it; allowed is mode 0600")

@@ -155,7 +155,7 @@ class Reprojection:
         """The cost at a pose (4, 4) and twist (6,).
 
         After the `last` one, landmarks' covariances in the image stay what they were there, so that
-        both costs compare; with `move` they are linearised anew where `last` moved the landmarks.
+        both costs compare; with `move` they are linearised again where `last` moved the landmarks.
         With `sharp` the information is the cost's second derivative, which is less than that of the
         reweighted observations beyond Huber's reach and makes for longer steps.
         """
@@ -308,7 +308,7 @@ def descend(
     """The minimum of the observations' cost and the prior's, from a pose (4, 4) and twist (6,).
 
     Gauss-Newton on reweighted observations, with Levenberg's damping when a step would raise the
-    cost; near the minimum Newton's, the landmarks linearised anew at each step. A rough one ends
+    cost; near the minimum Newton's, the landmarks linearised again at each step. A rough one ends
     before that, and its `linear` is of the step before."""
     damping, before = 0.0, math.inf
     sharp, sharpen = False, True

@@ -115,7 +115,7 @@ def advance(
 
 
 def _static(state: Kinematics, dt_s: float, settings: MotionSettings) -> tuple[F64, F64, F64, F64]:
-    # A velocity that is drawn anew each time: over one step its variance is walk/dt, so that the
+    # A velocity that is drawn again each time: over one step its variance is walk/dt, so that the
     # pose walks at random, and nothing of the old one is kept.
     walk = np.array([settings.walk_rotation_rad2_s] * 3 + [settings.walk_translation_m2_s] * 3)
     transition = np.zeros((12, 12))

@@ -61,7 +61,7 @@ def from_arrays(
 ) -> Reconstruction:
     """A reconstruction of a model's arrays, image k with id `image_id[k]`.
 
-    `feature` is made anew, unless all key points of each image (N, 2), undistorted, are given.
+    `feature` is made again, unless all key points of each image (N, 2), undistorted, are given.
 
     COLMAP's adjustment has one loss for all observations. So `weight` (K,) of the images becomes a
     camera for each weight whose pixels are so much smaller: the same rays, with residuals scaled.

@@ -40,7 +40,7 @@ class Modes:
         return np.arange(len(place)) + shift[place], place
 
     def among(self, kept: Bools) -> Modes | None:
-        """Those of the landmarks that are kept of all M, (M,), which are counted anew."""
+        """Those of the landmarks that are kept of all M, (M,), which are counted again."""
         rows = np.flatnonzero(kept[self.landmark])
         landmark = (np.cumsum(kept) - 1)[self.landmark[rows]]
         return Modes(landmark.astype(np.int32), _some(self.descriptor, rows)) if len(rows) else None

@@ -68,7 +68,7 @@ CAMERA_TABLE = "camera"
 
 
 class FrameSource(Protocol):
-    """A folder of images, a video file or a recording. Iterating opens it anew from its start.
+    """A folder of images, a video file or a recording. Iterating opens it again from its start.
 
     `camera` is None unless the input carries one; `notes` holds lines a person should see, such as
     where a cut recording ends (complete only after the iteration).

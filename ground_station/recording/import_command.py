@@ -13,7 +13,7 @@ examples:
   blimp replay walk.mcap --map maps/hall        # through the payload's firmware
 
 A recording carries its camera, which `blimp calibrate` finds. Frames keep their times; they are
-encoded anew, in grey, as the payload would. `blimp map build` and `blimp localize` take videos as
+encoded again, in grey, as the payload would. `blimp map build` and `blimp localize` take videos as
 they are."""
 
 _MOST_PX = (1920, 1088)

@@ -29,7 +29,7 @@ def import_frames(
 ) -> int:
     """Writes the frames of the input `name` with its camera as a recording; gives how many.
 
-    The frames keep their times; they are encoded anew, without B-frames, grey. `step` is called
+    The frames keep their times; they are encoded again, without B-frames, grey. `step` is called
     after each. The recording is written beside and renamed. Raises `InputError` with one line for
     frames that are not of the camera's size, and for sides that are odd, which H.264 does not take.
     """

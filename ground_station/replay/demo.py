@@ -37,7 +37,7 @@ def run(
     mapping, flight = sample / "mapping.mcap", sample / "flight.mcap"
     for path in (mapping, flight, sample / "mapping.toml", sample / "PAIRS.csv"):
         if not path.is_file():
-            raise InputError(f"{path}: the sample is incomplete; `make sample` makes it anew")
+            raise InputError(f"{path}: the sample is incomplete; `make sample` makes it again")
     out.mkdir(parents=True, exist_ok=True)
     print("1 of 3: a map of the atrium from the mapping flight", flush=True)
     start_s = time.monotonic()

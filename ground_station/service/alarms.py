@@ -20,7 +20,7 @@ LOST_S, NO_FRAMES_S, NO_POSES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 4.0, 10.0
 NOTHING_KNOWN_S = 10.0
 CLOCK_LOOSE_S, CLOCK_OVER = 0.05, 0.8
 LOSS_HIGH, LOSS_NO_MORE_HIGH = 0.05, 0.03
-"""Of the packets; what is sent again mends nearly all of less."""
+"""Of the packets; what is sent again fixes nearly all of less."""
 SILENT_S, RESTARTED_S = 5.0, 30.0
 RESUMED_S = 120.0
 GONE_FOR_S = 600.0

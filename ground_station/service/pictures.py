@@ -28,7 +28,7 @@ def path_of(folder: Path, payload_id: str) -> Path:
 
 
 class PictureWriter:
-    """Writes pictures (H, W) uint8; the file is made anew when their size changes."""
+    """Writes pictures (H, W) uint8; the file is made again when their size changes."""
 
     def __init__(self, folder: Path, payload_id: str) -> None:
         self._path = path_of(folder, payload_id)
@@ -76,7 +76,7 @@ class PictureWriter:
 
 
 class PictureReader:
-    """Reads a payload's pictures; opens the ring again by itself when it was made anew."""
+    """Reads a payload's pictures; opens the ring again by itself when it was made again."""
 
     def __init__(self, folder: Path, payload_id: str) -> None:
         self._path = path_of(folder, payload_id)

@@ -1,6 +1,6 @@
 """The service's processes: one table, started, watched and started again.
 
-Each says on the bus that it lives (`Bus.heartbeat`). One that ends or falls silent is started anew,
+Each says on the bus that it lives (`Bus.heartbeat`). One that ends or falls silent is restarted,
 after a pause that doubles; nobody else waits for it.
 """
 
@@ -57,7 +57,7 @@ class Child:
         self.spec = spec
         self.restarts = 0
         self.reason = ""
-        """Why it was started anew last."""
+        """Why it was restarted last."""
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
         self._started_s = 0.0
@@ -84,7 +84,7 @@ class Child:
 
     @property
     def hopeful(self) -> bool:
-        """Whether it was heard within a minute: restarts of its own may still mend it."""
+        """Whether it was heard within a minute: restarts of its own may still fix it."""
         return not self.spec.beats or self._clock() - self._last_heard_s < _START_S
 
     def heartbeat(self, pid: int) -> None:
@@ -156,7 +156,7 @@ class Child:
         self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
         self.restarts += 1
         self.reason = reason
-        return f"{self.spec.name} {reason}; it is started anew"
+        return f"{self.spec.name} {reason}; it is restarted"
 
     def _kill(self) -> None:
         assert self._process is not None
@@ -219,7 +219,7 @@ class Children:
         return {name: pid for name, pid in running.items() if pid is not None}
 
     def restarts(self) -> dict[str, int]:
-        """How often each was started anew."""
+        """How often each was restarted."""
         return {name: child.restarts for name, child in list(self._children.items())}
 
     def living(self) -> bool:

@@ -112,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs it; raises `SimulatorError` on what a person can mend. 130 after Ctrl-C."""
+    """Runs it; raises `SimulatorError` on what a person can fix. 130 after Ctrl-C."""
     from ground_station.simulator.scene import SimulatorError
 
     if args.sample is not None:

@@ -153,7 +153,7 @@ class StreamAccount:
         while len(self._window) > 1 and now_s - self._window[1][0] >= WINDOW_S:
             self._window.popleft()
         since = self._window[0][1] if self._window else Tally(frames=frames)
-        if frames < since.frames:  # the payload counts anew
+        if frames < since.frames:  # the payload counts again
             self._window.clear()
         self._window.append((now_s, tally))
         self.late = tally - since

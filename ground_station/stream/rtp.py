@@ -178,7 +178,7 @@ class Reorderer:
         self._came_ns = now_ns
 
     def _restart(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
-        """The sender began anew if two packets in a row are far off; one alone is a stray."""
+        """The sender began again if two packets in a row are far off; one alone is a stray."""
         before, self._jumped = self._jumped, packet
         if before is None or (before.sequence + 1) & 0xFFFF != packet.sequence:
             return

@@ -209,7 +209,7 @@ class Corpus:
             except (OSError, SafetensorError) as error:
                 line = str(error).splitlines()[0]
                 raise TrainingError(
-                    f"{path}: {line}; without this file, --resume makes it anew"
+                    f"{path}: {line}; without this file, --resume makes it again"
                 ) from None
         return self._open[path]
 

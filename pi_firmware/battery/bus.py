@@ -1,7 +1,7 @@
 """I2C with bounded retries and counted errors: what the gauges' drivers speak through.
 
 The drivers use the calls of `smbus2.SMBus`, so that register-exact fakes can stand behind them.
-Re-opening mends a stale file handle and a driver that was bound again. Clocking a slave free that
+Re-opening fixes a stale file handle and a driver that was bound again. Clocking a slave free that
 holds SDA low is the kernel's business (its bus recovery), not possible from here.
 """
 
@@ -47,7 +47,7 @@ class WordBus:
     """16-bit registers, most significant byte first, of one chip.
 
     `open_bus` opens the bus and may raise `OSError`. A failed transfer (errno 121, remote I/O, is
-    the usual one) is tried four times with growing pauses; then the bus is opened anew and the
+    the usual one) is tried four times with growing pauses; then the bus is opened again and the
     transfer tried four times more; then it is a `GaugeError`. Not safe from several threads.
     """
 

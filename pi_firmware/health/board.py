@@ -74,7 +74,7 @@ class Board:
         found = [value / 1000 for value in values if value is not None]
         found = [value for value in found if _COLDEST_C <= value <= _HOTTEST_C]
         if not found:
-            self._zones = []  # the driver may have been loaded anew
+            self._zones = []  # the driver may have been loaded again
         return max(found, default=None)
 
     def _cpu(self) -> float | None:

@@ -18,7 +18,7 @@ _LONGEST_PAUSE_S = 600.0
 _OFF_S = 1.0
 _ON_ATTEMPTS = 3
 _FIRST_ON_PAUSE_S = 5.0
-_POWER_SAVE_S = 60.0  # a network manager that connects anew may switch it on
+_POWER_SAVE_S = 60.0  # a network manager that connects again may switch it on
 _ASK_SIGNAL_S = 5.0  # by a program, where the kernel has no file for it
 _STALE_S = 10.0  # a signal read longer ago says nothing: the driver hangs
 _JOIN_LIMIT_S = 8.0  # an `ip` that hangs, twice, and its end
@@ -37,7 +37,7 @@ class WifiState:
 class Wifi:
     """Keeps the radio awake and restarts it when a ground station, once heard, falls silent.
 
-    The silence that is borne doubles with each restart, up to 10 minutes, until the ground is heard
+    The silence allowed doubles with each restart, up to 10 minutes, until the ground is heard
     again. A radio that was left switched off is switched on. What fails is announced once, as
     `radio-failed`, and tried again; the flight goes on. `heard`, `step` and `state` never wait: the
     work is done on a thread of its own, whatever a driver does. `announce` gets an event's name and

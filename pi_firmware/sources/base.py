@@ -41,7 +41,7 @@ class Source(Protocol):
     """Why a recording ended early, in words; empty when it did not."""
 
     error: BlimpError | None
-    """What ended the source for good, when it was not its end: opening it anew would not help.
+    """What ended the source for good, when it was not its end: opening it again would not help.
 
     None where the pipeline's error is one of the moment, as of a camera that was unplugged.
     """

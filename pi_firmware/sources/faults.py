@@ -1,6 +1,6 @@
 """A test camera that misbehaves when asked: unplugged for a while, or silent without an error.
 
-Sources are closed and opened anew when they fail. So the times count from the first opening of the
+Sources are closed and opened again when they fail. So the times count from the first opening of the
 URI in this process, on a clock that nobody sets.
 """
 
@@ -30,7 +30,7 @@ class Faults:
 
     Raises `SourceError` with one line while the camera is to be gone: it cannot be opened then. One
     that was open before ends with an error and stays dead; one that hangs delivers again when the
-    time is over, or at once when it is opened anew.
+    time is over, or at once when it is opened again.
     """
 
     def __init__(self, uri: Uri) -> None:

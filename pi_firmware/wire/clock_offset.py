@@ -57,7 +57,7 @@ class Offset:
 
 
 class OffsetFilter:
-    """Keeps the newest round trips and trusts the tightest; a clock that steps starts it anew."""
+    """Keeps the newest round trips and trusts the tightest; a clock that steps starts it again."""
 
     def __init__(self) -> None:
         self._trips: deque[RoundTrip] = deque(maxlen=WINDOW)

@@ -10,7 +10,7 @@ class BlimpError(Exception):
 
     The text is one line that names the value and the limit, whatever it was made from; programs
     print it on standard error and exit with status 2, or 3 where `restart` says that only a new
-    process can mend it.
+    process can fix it.
     """
 
     restart = False

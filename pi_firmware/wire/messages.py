@@ -60,7 +60,7 @@ class Battery(Message):
     alarm: str = ALARM_NONE
     read_errors: int = 0  # failed transfers so far; most of them were repeated with success
     refused: int = 0  # readings that could not be, none of which was sent
-    reopened: int = 0  # times the bus was opened anew
+    reopened: int = 0  # times the bus was opened again
     resets: int = 0  # times the gauge had lost its settings
 
 

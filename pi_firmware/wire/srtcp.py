@@ -71,7 +71,7 @@ class SessionKeys:
 class SrtcpProtector:
     """Protects what is said to one payload, in all its streams; from any thread.
 
-    Each sender's SSRC is to be drawn anew at its start: no index is used twice with it.
+    Each sender's SSRC is to be drawn again at its start: no index is used twice with it.
     """
 
     def __init__(self, payload_id: str, master: bytes) -> None:

@@ -124,7 +124,7 @@ def test_a_port_that_is_held_names_its_holder() -> None:
         found = {f.name: f for f in network.ports(only(StationSettings(), video=video))}
         finding = found[f"port {video.port}/udp"]
         assert finding.level == PROBLEM
-        assert str(os.getpid()) in finding.found and "video.port" in finding.mend
+        assert str(os.getpid()) in finding.found and "video.port" in finding.fix
     with socket.create_server(("127.0.0.1", 0)) as listening:
         http = HttpSettings(port=listening.getsockname()[1])
         names = {f.name: f for f in network.ports(only(StationSettings(), http=http))}
@@ -136,14 +136,14 @@ def test_a_port_that_is_held_names_its_holder() -> None:
 def test_an_address_of_another_machine_cannot_be_listened_on() -> None:
     video = VideoSettings(host="192.0.2.1")  # RFC 5737: nobody's
     found = next(network.ports(only(StationSettings(), video=video)))
-    assert found.level == PROBLEM and "video.host" in found.mend
+    assert found.level == PROBLEM and "video.host" in found.fix
 
 
 def test_the_receive_buffer_s_limit(tmp_path: Path) -> None:
     limit = tmp_path / "rmem_max"
     limit.write_text("212992\n")
     found = network.receive_buffer(limit)
-    assert found.level == WARNING and "net.core.rmem_max=4194304" in found.mend
+    assert found.level == WARNING and "net.core.rmem_max=4194304" in found.fix
     limit.write_text("8388608\n")
     assert network.receive_buffer(limit).level == OK
 
@@ -152,7 +152,7 @@ def test_a_firewall_that_drops_something_is_named_with_how_to_open_it() -> None:
     ports = [network.Port("video.port", socket.SOCK_DGRAM, "0.0.0.0", 5600)]
     closed = "*filter\n:INPUT DROP [0:0]\nCOMMIT\n"
     found = network.judged(ports, {"nft": '{"nftables": []}', "iptables": closed})
-    assert found.level == WARNING and "(iptables)" in found.found and "5600" in found.mend
+    assert found.level == WARNING and "(iptables)" in found.found and "5600" in found.fix
     rejecting = '{"nftables": [{"rule": {"expr": [{"reject": null}]}}]}'
     assert network.judged(ports, {"nft": rejecting}).level == WARNING
     opened = closed.replace("DROP", "ACCEPT")
@@ -210,7 +210,7 @@ def test_a_map_that_is_not_fit(
     assert old in changed
     (tmp_path / file).write_text(changed.replace(old, new, 1))
     found = {f.name: f for f in world.maps(MapSettings(folder=str(tmp_path)), "default")}
-    assert found[name].level == level and found[name].mend
+    assert found[name].level == level and found[name].fix
 
 
 def test_a_map_that_is_cut_or_away(tmp_path: Path) -> None:
@@ -238,7 +238,7 @@ def test_the_certificate(tmp_path: Path) -> None:
     assert good.level == OK and "blimp-1" in good.found
     assert certified(folder, "other").level == PROBLEM
     (folder / "key.pem").chmod(0o644)
-    assert "chmod" in certified(folder).mend
+    assert "chmod" in certified(folder).fix
     (folder / "key.pem").chmod(0o600)
     (folder / "srtp" / "blimp-1.key").unlink()
     assert "blimp-1" in certified(folder).found

@@ -65,7 +65,7 @@ def test_a_machine_that_is_well(tmp_path: Path) -> None:
     names = [finding["name"] for finding in document["findings"]]
     for name in ("python", "packages", "encoder", "map", "clock", "disk", "firewall", "payloads"):
         assert name in names
-    assert all(finding["mend"] for finding in document["findings"] if finding["level"] != OK)
+    assert all(finding["fix"] for finding in document["findings"] if finding["level"] != OK)
     assert "\x1b" not in run.stdout
     assert not (tmp_path / "recordings").exists()
 

@@ -80,9 +80,9 @@ def test_versions_are_told_and_an_update_that_did_not_stay_is_a_warning(checkout
     same = running.judge_payloads({"blimp-1": heard(version, "update")}, checkout)
     assert (same.level, same.found) == (OK, f"blimp-1 runs {version} (update)")
     back = running.judge_payloads({"blimp-1": heard(version, "fell back", "no frames")}, checkout)
-    assert back.level == WARNING and back.found.endswith("(fell back): no frames") and back.mend
+    assert back.level == WARNING and back.found.endswith("(fell back): no frames") and back.fix
     other = running.judge_payloads({"blimp-1": heard("0.0.1", "factory")}, checkout)
     assert other.level == WARNING and f"here it is {__version__}" in other.found
-    assert "make update PAYLOAD=blimp-1" in other.mend
+    assert "make update PAYLOAD=blimp-1" in other.fix
     older = running.judge_payloads({"blimp-1": heard(""), "blimp-2": None}, checkout)
     assert older.level == OK and older.found.count("a version that it does not tell") == 2

@@ -1,4 +1,4 @@
-"""A camera that goes or hangs, an encoder that stalls: started anew in the process, or with it."""
+"""A camera that goes or hangs, an encoder that stalls: restarted in the process, or with it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMALL = (
 )
 TAKES_AND_GIVES_NONE, DOES_NOT_COME_BACK = 1, 2
 HOPELESS = 3
-"""Exit status by which systemd starts the process anew."""
+"""Exit status by which systemd starts the process again."""
 
 
 def events_of(ground: Ground) -> list[str]:

@@ -51,7 +51,7 @@ def test_a_clock_that_is_stepped(recording: Path, tmp_path: Path, step_ns: int) 
         account = flight.finish()
     account.assert_exact()
     state = ground.listener.state("blimp-1")
-    assert state is not None  # nothing was started anew for a clock
+    assert state is not None  # nothing was restarted for a clock
     assert {event.name for event in state.events} == {
         messages.EVENT_STARTED,
         messages.EVENT_STOPPED,

@@ -264,7 +264,7 @@ def test_a_wire_carries_is_cut_and_is_mended() -> None:
             wire.cut()
             near.settimeout(5.0)
             assert near.recv(10) == b""
-            wire.mend()
+            wire.fix()
             with socket.create_connection(("127.0.0.1", wire.port), 5.0) as again:
                 far, _ = there.accept()
                 far.settimeout(0.3)
@@ -272,7 +272,7 @@ def test_a_wire_carries_is_cut_and_is_mended() -> None:
                 again.sendall(b"two")
                 with pytest.raises(TimeoutError):
                     far.recv(10)
-                wire.mend()
+                wire.fix()
                 far.settimeout(5.0)
                 assert far.recv(10) == b"two"
 

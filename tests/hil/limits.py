@@ -55,7 +55,7 @@ def parser() -> Parser:
     )
     result.add_argument(
         "--undisturbed", action="store_true",
-        help=f"measure anew where others used more than {QUIET_CORES:g} cores meanwhile",
+        help=f"measure again where others used more than {QUIET_CORES:g} cores meanwhile",
     )  # fmt: skip
     result.add_argument(
         "--accept", action="store_true", help="measure nothing: take --out's table into README"
@@ -110,12 +110,12 @@ def _level(
 
 def _in_words(axis: Axis, found: Found) -> str:
     text = [level.text for level in axis.levels]
-    if found.borne is None:
-        return f"not even {text[0]} is borne"
-    words = f"{text[found.borne]} is borne"
+    if found.sustained is None:
+        return f"not even {text[0]} is sustained"
+    words = f"{text[found.sustained]} is sustained"
     words += f", {text[found.refused]} is not" if found.refused is not None else ", the last level"
     if found.odd:
-        words += f"; not monotonic: {', '.join(text[n] for n in found.odd)} is borne again"
+        words += f"; not monotonic: {', '.join(text[n] for n in found.odd)} is sustained again"
     return words
 
 

@@ -1,4 +1,4 @@
-"""The search for the highest level that is borne, on a declared list, without trusting monotony."""
+"""The search for the highest level of a list that is sustained, without trusting monotony."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Tried:
     shares: tuple[float, ...]
 
     @property
-    def borne(self) -> bool:
+    def sustained(self) -> bool:
         """Whether all seeds keep the share; NaN keeps nothing."""
         return bool(self.shares) and all(share >= BORNE for share in self.shares)
 
@@ -25,19 +25,19 @@ class Tried:
 class Found:
     """What a search knows: levels by their place in the list, 0 the easiest.
 
-    `borne` is the highest level up to which every tried one is borne, None when not even the first
+    `sustained` is the highest level up to which every tried one is so, None when not even the first
     is; `refused` the next one that is not, None when there is no harder level. `odd` are tried
-    levels above a refused one that are borne all the same: there the answer is not monotonic.
+    levels above a refused one that are sustained all the same: there the answer is not monotonic.
     """
 
     tried: dict[int, Tried] = field(default_factory=dict)
 
     @property
     def refused(self) -> int | None:
-        return min((n for n, one in self.tried.items() if not one.borne), default=None)
+        return min((n for n, one in self.tried.items() if not one.sustained), default=None)
 
     @property
-    def borne(self) -> int | None:
+    def sustained(self) -> int | None:
         refused = self.refused
         below = [n for n in self.tried if refused is None or n < refused]
         return max(below, default=None)
@@ -47,14 +47,14 @@ class Found:
         refused = self.refused
         if refused is None:
             return []
-        return sorted(n for n, one in self.tried.items() if n > refused and one.borne)
+        return sorted(n for n, one in self.tried.items() if n > refused and one.sustained)
 
 
 def search(levels: int, measure: Callable[[int], Sequence[float]], found: Found) -> Found:
     """Brackets the limit among `levels` levels, easiest first, and looks at both its sides.
 
-    `measure` gives a level's shares by seed. Level 0 comes first: when that is not borne nothing is
-    said of the others. Then the list is halved until the highest level borne and the lowest one
+    `measure` gives a level's shares by seed. Level 0 comes first: when it is refused, nothing is
+    said of the others. Then the list is halved until the highest level sustained and the lowest one
     refused are neighbours. One level beyond and one below are tried as well; should the one below
     fail, the search goes on beneath it. What `found` has already is not measured again, and it is
     filled as the search goes, so that an interruption keeps it.
@@ -63,11 +63,11 @@ def search(levels: int, measure: Callable[[int], Sequence[float]], found: Found)
     def holds(level: int) -> bool:
         if level not in found.tried:
             found.tried[level] = Tried(tuple(measure(level)))
-        return found.tried[level].borne
+        return found.tried[level].sustained
 
     if levels < 1 or not holds(0):
         return found
-    low, high = 0, levels  # `low` is borne; `high` is refused, or beyond the list
+    low, high = 0, levels  # `low` is sustained; `high` is refused, or beyond the list
     while True:
         while high - low > 1:
             middle = (low + high) // 2

@@ -93,14 +93,14 @@ class Store:
     def conclude(self, axis: Axis, found: Found, *, complete: bool, problem: str = "") -> None:
         """Keeps what is known of an axis."""
         text = [level.text for level in axis.levels]
-        borne, refused = found.borne, found.refused
+        sustained, refused = found.sustained, found.refused
         self.document["axes"][axis.name] = {
             "title": axis.title,
             "complete": complete,
             "problem": problem,
-            "borne": None if borne is None else text[borne],
+            "sustained": None if sustained is None else text[sustained],
             "refused": None if refused is None else text[refused],
-            "last": borne is not None and borne == len(text) - 1,
+            "last": sustained is not None and sustained == len(text) - 1,
             "odd": [text[n] for n in found.odd],
             "shares": {text[n]: list(one.shares) for n, one in sorted(found.tried.items())},
             **self._beside(axis, found),

@@ -35,20 +35,20 @@ def render(document: dict[str, Any]) -> str:
         f" {machine['load_before']:g} before; others used {max(others, default=0.0):.2f} cores at"
         " most meanwhile. Of a link only the video's packets are burdened."
     )
-    rows = [("burden", "borne", "TRACKING there", "not borne", "TRACKING there")]
+    rows = [("burden", "sustained", "TRACKING there", "not sustained", "TRACKING there")]
     notes: list[str] = []
     for axis in document["axes"].values():
         shares = axis["shares"]
-        borne, refused = axis["borne"], axis["refused"]
+        sustained, refused = axis["sustained"], axis["refused"]
         name = axis["title"]
         if axis["odd"]:
             notes.append(
-                f"Not monotonic: {name}: {', '.join(axis['odd'])} is borne again beyond {refused}."
+                f"Not monotonic: {name}: {', '.join(axis['odd'])} is sustained beyond {refused}."
             )
             name += " (see below)"
         least = "more was not tried" if axis["last"] else "none of those tried"
-        at_borne, at_refused = _spread(shares.get(borne)), _spread(shares.get(refused))
-        rows.append((name, borne or "nothing", at_borne, refused or least, at_refused))
+        at_borne, at_refused = _spread(shares.get(sustained)), _spread(shares.get(refused))
+        rows.append((name, sustained or "nothing", at_borne, refused or least, at_refused))
     held = sorted({by for axis in document["axes"].values() for by in axis["held_by"]})
     if held:
         notes.append(f"The processor was held back by {' and '.join(held)}.")

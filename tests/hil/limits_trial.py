@@ -33,7 +33,7 @@ search for its place before its frames count."""
 TRACKING_S = 90.0
 LATE_S = 3.0
 SEAM_S = 2.0
-"""A flight in a loop begins anew elsewhere: this much of each round says nothing of a limit."""
+"""A flight in a loop begins again elsewhere: this much of each round says nothing of a limit."""
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ def test_limits_of_the_made_up_system_are_found_and_told(
     out = tmp_path / "deep" / "limits.json"
     assert limits.main(["--out", str(out), "--only", "loss,jitter"], Made()) == 0
     axes = document(out)["axes"]
-    assert (axes["loss"]["borne"], axes["loss"]["refused"]) == ("2 %", "3 %")
-    assert (axes["jitter"]["borne"], axes["jitter"]["refused"]) == ("50 ms", "100 ms")
+    assert (axes["loss"]["sustained"], axes["loss"]["refused"]) == ("2 %", "3 %")
+    assert (axes["jitter"]["sustained"], axes["jitter"]["refused"]) == ("50 ms", "100 ms")
     assert axes["loss"]["shares"]["2 %"] == pytest.approx([0.989, 0.988, 0.987])
     said = capsys.readouterr()
     assert "| 2 % | 98.7 to 98.9 % | 3 % | 89 % |" in said.out  # given up at its first run
@@ -62,7 +62,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
     assert len(kept["trials"]) == 5 and not kept["axes"]["loss"]["complete"]
     assert limits.main(["--out", str(out), "--only", "loss"], second) == 0
     assert first.flown + second.flown == whole.flown
-    assert document(out)["axes"]["loss"]["borne"] == "2 %"
+    assert document(out)["axes"]["loss"]["sustained"] == "2 %"
 
 
 def test_an_axis_measured_later_joins_the_others_of_the_file(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_share_just_below_the_bound_is_not_rounded_up_to_it() -> None:
         "machine": {"cores": 2, "model": "A|B", "load_before": 0.1, "date": "2026-01-01"},
         "seeds": [1, 2], "duration_s": 32.0, "borne_from": 0.95, "flight": "f.mcap, 1",
         "axes": {"loss": {
-            "title": "loss", "borne": None, "refused": "none", "last": False, "odd": [],
+            "title": "loss", "sustained": None, "refused": "none", "last": False, "odd": [],
             "shares": {"none": [0.94999, 0.9999]}, "held_by": [], "others_cores_most": None,
         }},
     }  # fmt: skip

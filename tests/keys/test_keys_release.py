@@ -84,7 +84,7 @@ def test_an_authority_from_before_releases_gets_its_key(
     shutil.rmtree(authority.folder / "releases")
     signers(authority).unlink()
     assert Authority(authority.folder).check(now) == [
-        "payload.blimp-1: takes no releases of this authority; 'release' mends it"
+        "payload.blimp-1: takes no releases of this authority; 'release' fixes it"
     ]
     assert not (authority.folder / "releases").exists()  # who checks changes nothing
     folder = ["--folder", str(authority.folder)]

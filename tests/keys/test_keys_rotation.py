@@ -48,7 +48,7 @@ def is_heard(listener: TelemetryListener, telemetry: Telemetry, voltage: float) 
 
 
 def test_payload_and_ground_speak_at_each_step_of_a_rotation(tmp_path: Path) -> None:
-    """At each step one is started anew with its new folder, then the other, in either order."""
+    """At each step one is restarted with its new folder, then the other, in either order."""
     authority = Authority.create(tmp_path / "keys")
     authority.add("ground", "main")
     authority.add("payload", "blimp-1")

@@ -1,4 +1,4 @@
-"""A test camera goes and hangs when asked, across its being closed and opened anew."""
+"""A test camera goes and hangs when asked, across its being closed and opened again."""
 
 import time
 from collections.abc import Callable
@@ -104,7 +104,7 @@ def test_a_camera_hangs_without_a_word_and_delivers_again(clock: Clock, pattern:
         time.sleep(0.1)  # a frame may be on its way
         stood = flight.count
         assert flight.error(0.3) == "" and flight.count == stood
-        with Running(uri) as anew:  # opening it anew helps
+        with Running(uri) as anew:  # opening it again helps
             anew.await_frames(3)
         assert flight.count == stood
         clock.now_s += 60

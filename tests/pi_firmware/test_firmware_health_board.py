@@ -74,7 +74,7 @@ def test_a_processor_that_did_nothing_or_all_stays_between_0_and_1(zero_w: Path)
     assert board.read().cpu == 0.0
     write(zero_w, {"proc/stat": STAT.format(user=1200, idle=8090)})  # idle went back a little
     assert board.read().cpu == 1.0
-    write(zero_w, {"proc/stat": STAT.format(user=10, idle=10)})  # began anew
+    write(zero_w, {"proc/stat": STAT.format(user=10, idle=10)})  # began again
     assert board.read().cpu is None
 
 

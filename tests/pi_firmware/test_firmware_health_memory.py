@@ -67,9 +67,9 @@ def test_a_flight_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
     watching = supervision.Supervision(Settings(), lambda name, text: None)
     monkeypatch.setattr(watching, "health", lambda *_: None)
     silent = SimpleNamespace(health=lambda _: None, ask_time=lambda: None, refusals=list)
-    nothing: Any = SimpleNamespace(seen=None)
+    nothing: Any = SimpleNamespace(seen=None, armed=False)
     try:
-        watching.start(nothing, nothing, nothing, cast(Any, silent))
+        watching.start(nothing, nothing, nothing, cast(Any, silent), nothing)
         assert collected.wait(20)
         assert supervision.MEMORY in watching.table.ages()
     finally:

@@ -167,7 +167,7 @@ def test_a_silent_ground_restarts_the_radio_ever_more_seldom(root: Path) -> None
     assert [name for name, _ in rig.events] == [RESTARTED] * 7
     assert "silent for 20 s" in rig.events[0][1]
     rig.wifi.heard()
-    assert rig.restarts(70) == [20, 60], "heard again: it begins anew"
+    assert rig.restarts(70) == [20, 60], "heard again: it begins again"
 
 
 def test_a_restart_is_down_up_and_power_save_off_again(root: Path) -> None:

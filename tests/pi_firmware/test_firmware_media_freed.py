@@ -1,4 +1,4 @@
-"""A camera that is opened anew again and again, for hours, takes no more than one."""
+"""A camera that is opened again again and again, for hours, takes no more than one."""
 
 import gc
 from pathlib import Path

@@ -125,7 +125,7 @@ def test_a_stream_whose_first_time_is_late_keeps_it(tmp_path: Path) -> None:
 
 @dataclass
 class Stamped:
-    """What the mending of times reads of a picture."""
+    """What the fixing of times reads of a picture."""
 
     pts: int | None
     time_base: Fraction = Fraction(1, 1000)

@@ -124,7 +124,7 @@ def measure(seconds: float, payloads: int, rate_hz: float, *, browser: bool) -> 
         for name in names:
             now = _fates(service, name)
             result.fates[name] = {fate: now[fate] - fates[name][fate] for fate in now}
-        assert set(service.processes().values()) <= set(watched), "a process was started anew"
+        assert set(service.processes().values()) <= set(watched), "a process was restarted"
     return result
 
 

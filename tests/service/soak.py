@@ -282,7 +282,7 @@ def rows(flown: Flown, options: Any) -> list[Row]:
         Row("messages to a viewer", str(sum(flown.viewer.values()))),
         Row("connections of that viewer", str(connections), "1", connections == 1),
         Row(
-            "processes started anew",
+            "processes restarted",
             str(sum(flown.restarts.values()) + changed(flown.watch)),
             "0",
             bool(flown.restarts) and not any(flown.restarts.values()) and not changed(flown.watch),

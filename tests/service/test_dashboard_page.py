@@ -53,7 +53,7 @@ class Watched:
         self.page.add_init_script(WATCH_POLICY)
         self.page.goto(served.url)
         self.page.wait_for_selector('#link[data-phase="open"]')
-        self.page.evaluate("window.marker = 'not loaded anew'")
+        self.page.evaluate("window.marker = 'not loaded again'")
 
     def _said(self, message: Any) -> None:
         expected = any(word in message.text for word in OF_THE_BROWSER)
@@ -107,7 +107,7 @@ def shown(opened: Watched, served: Served) -> Iterator[Watched]:
     assert opened.problems == []
     assert opened.page.evaluate("violations") == []
     assert opened.hosts == {f"127.0.0.1:{served.port}"}
-    assert opened.page.evaluate("window.marker") == "not loaded anew"
+    assert opened.page.evaluate("window.marker") == "not loaded again"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A payload whose SSRC is configured starts anew: its new session has an account of its own."""
+"""A payload whose SSRC is configured restarts: its new session has an account of its own."""
 
 from __future__ import annotations
 

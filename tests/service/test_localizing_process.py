@@ -296,7 +296,7 @@ def test_a_picture_that_was_overwritten_is_skipped(
 def test_an_intake_that_comes_back_is_heard_again(
     running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
 ) -> None:
-    """It makes its ring anew."""
+    """It makes its ring again."""
     told, _ = running
     localized(told, flight[0])
     told.pictures.close()

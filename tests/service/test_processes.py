@@ -1,4 +1,4 @@
-"""Processes that end, hang or refuse are started anew or end the service; nobody is left behind."""
+"""Processes that end, hang or refuse are restarted or end the service; nobody is left behind."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_process_that_ends_is_started_anew_after_ever_longer_pauses(modules: P
         pauses.append(clock.now_s - before_s)
         said: list[str] = []
         until(lambda s=said: any(s), lambda s=said: s.append(child.step()))  # type: ignore[misc]
-        assert said[-1] == "ends ended with status 1; it is started anew"
+        assert said[-1] == "ends ended with status 1; it is restarted"
     assert child.restarts == 7
     assert pauses == sorted(pauses) and 9 < pauses[-1] <= 10.5
 

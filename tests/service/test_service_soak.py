@@ -113,7 +113,7 @@ def test_frames_before_the_localizer_was_up_are_only_the_first_flights() -> None
 def test_another_process_under_a_name_of_the_service_is_a_restart() -> None:
     flown = run()
     flown.watch.changed = {"payload": 20, "web": 1}
-    assert missed(soak.rows(flown, options())) == ["processes started anew"]
+    assert missed(soak.rows(flown, options())) == ["processes restarted"]
 
 
 @pytest.mark.parametrize(

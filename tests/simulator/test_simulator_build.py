@@ -25,7 +25,7 @@ FLOWN = {
     "camera_tilt_down_deg": 7.0,
 }  # fmt: skip
 """As written down when the sample's flights were recorded. Not to be renewed with `builds.toml`:
-where they differ the sample is of another vehicle, and has to be made anew."""
+where they differ the sample is of another vehicle, and has to be made again."""
 
 
 def test_the_build_gives_the_flown_numbers_to_the_last_bit() -> None:

@@ -1,4 +1,4 @@
-"""A link that loses packets and a sender that mends them, without a program or a clock.
+"""A link that loses packets and a sender that fixes them, without a program or a clock.
 
 Packets, what is asked for, what is sent again and corrections take half a round trip each and are
 lost by the same draws; the ground's reports, one a second, come at once. Time goes on in steps of a

@@ -88,7 +88,7 @@ def test_nothing_received_is_all_lost_only_if_something_was_sent() -> None:
         assert account.add(7, came, 100, second)[1] == 0.0  # all of it gated
     assert account.add(7, came, 101, 4.0)[1] == 0.0  # one: its packets may be on their way
     assert account.add(7, came, 131, 5.0)[1] == 1.0
-    assert account.add(7, came, 5, 6.0)[1] == 0.0  # the payload counts anew
+    assert account.add(7, came, 5, 6.0)[1] == 0.0  # the payload counts again
 
 
 def test_a_new_stream_and_a_new_receiver_count_from_zero() -> None:

@@ -53,7 +53,7 @@ def ground(certificates: Path, foreign: Path) -> None:
 
 
 def listen(certificates: Path, foreign: Path) -> dict[str, object]:
-    """What both heard, and what ours heard after it was started anew on another port."""
+    """What both heard, and what ours heard after it was restarted on another port."""
     said: dict[str, object] = {}
     endpoint, folder = "tls/10.9.0.1:0", certificates / "ground" / "main"
     with (

@@ -34,7 +34,7 @@ def receive(
 ) -> dict[str, Any]:
     """Takes a bundle and switches to it, on trial; gives its `version` and the trial's `id`.
 
-    While the autopilot is armed only with `force`: the firmware is started anew. Raises
+    While the autopilot is armed only with `force`: the firmware is restarted. Raises
     `DeployError` with one line, and the card is as it was.
     """
     with shelf.lock(at):

@@ -33,7 +33,7 @@ class Service:
     """Speaks to systemd; a systemd that does not answer is a service that is not seen."""
 
     def restart(self) -> None:
-        """Starts the firmware anew and forgets how often it was; does not wait for it."""
+        """Starts the firmware again and forgets how often it was; does not wait for it."""
         self._do("reset-failed", UNIT)
         self._do("restart", "--no-block", UNIT)
 

@@ -2,7 +2,7 @@
 
 The base's own sources and keys say where packages come from, as on the board itself: Raspberry Pi
 OS's are the only ones built for ARMv6. Its programs run in a chroot, emulated. Kept is what that
-changed, as a layer (`layer`), so that nothing else of the base is ever written anew.
+changed, as a layer (`layer`), so that nothing else of the base is ever written again.
 """
 
 from __future__ import annotations

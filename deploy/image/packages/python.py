@@ -1,6 +1,6 @@
 """Compiles Python for the card with the card's own Python, emulated: no root, nothing installed.
 
-On a read-only root no byte code can be kept, so each start would compile the firmware anew.
+On a read-only root no byte code can be kept, so each start would compile the firmware again.
 """
 
 from __future__ import annotations

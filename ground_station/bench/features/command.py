@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measures, prints the table; raises `BlimpError` for what a person can mend.
+    """Measures, prints the table; raises `BlimpError` for what a person can fix.
 
     What has no data is left out with a line that names it; asked for by `--only`, it is an error.
     """

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measures, prints the tables; raises `BlimpError` for what a person can mend."""
+    """Measures, prints the tables; raises `BlimpError` for what a person can fix."""
     _check(args)
     if args.study:
         return _study(args)

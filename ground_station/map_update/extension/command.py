@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Extends; raises `BlimpError` for what a person can mend."""
+    """Extends; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import InputError, MapError
     from ground_station.files import write_json
     from ground_station.geometry.camera import load_camera

@@ -1,9 +1,9 @@
 """What a build has made already: features and pairs, by content, in one SQLite file.
 
 A build that was killed, or that is run again with another setting, takes from here what it needs
-and makes only the rest. Everything in here can be made again, so nothing that happens to the file
-stops a build: a damaged entry is made anew, a damaged file is put aside, and where the disk refuses
-the build goes on without; each is said in one line.
+and makes only the rest. Nothing that happens to the file stops a build: a damaged entry is made
+again, a damaged file is put aside, and where the disk refuses the build goes on without; each is
+said in one line.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class Cache:
             found = decode(entry)
         except EntryError as error:
             if not self.figures.damaged:
-                _say(f"cache: an entry of {self._path} is damaged ({error}) and is made anew")
+                _say(f"cache: an entry of {self._path} is damaged ({error}) and is made again")
             self.figures.damaged += 1
             return None
         self._used.add(key)
@@ -262,7 +262,7 @@ class Cache:
             self._inode = self._path.stat().st_ino
 
     def _mend(self, error: sqlite3.Error) -> None:
-        """Begins a damaged file anew; of anything else there is no more cache."""
+        """Begins a damaged file again; of anything else there is no more cache."""
         if self._db is not None:
             with contextlib.suppress(sqlite3.Error):
                 self._db.close()
@@ -273,7 +273,7 @@ class Cache:
             return
         try:
             with _alone(self.folder):
-                # Another build may have begun it anew meanwhile.
+                # Another build may have begun it again meanwhile.
                 if self._path.exists() and self._path.stat().st_ino == self._inode:
                     self._put_aside()
             self._open()
@@ -285,7 +285,7 @@ class Cache:
         self._path.replace(aside)
         for ending in ("-wal", "-shm"):
             self._path.with_name(self._path.name + ending).unlink(missing_ok=True)
-        _say(f"cache: {self._path} is damaged; it is kept as {aside.name} and begun anew")
+        _say(f"cache: {self._path} is damaged; it is kept as {aside.name} and begun again")
 
     def _stop(self, error: OSError | sqlite3.Error) -> None:
         reason = error.strerror if isinstance(error, OSError) else error

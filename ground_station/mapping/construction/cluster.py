@@ -43,7 +43,7 @@ _CONNECT_S, _WORKERS_S = 10, 60
 _LOOK_S = 5.0
 """Nobody waits longer for a result without looking whether there is anyone who could give it."""
 _ALONE_S = 60.0
-"""A cluster without workers is given so long to get one, as when they are all started anew."""
+"""A cluster without workers is given so long to get one, as when they are all restarted."""
 _TRIES = 4
 _PAIRS = 16
 """In one call: what goes with a call is then little beside the work in it."""
@@ -168,7 +168,7 @@ class Cluster:
         )
 
     def _sent(self, value: _Shared) -> Any:
-        # What was shared goes with the worker that had it: Dask makes anew only what it has made.
+        # What was shared goes with the worker that had it: Dask makes again only what it has made.
         if value.future is None or value.future.status != "finished":
             (value.future,) = self._client.scatter([value.get()], hash=False)
         return value.future

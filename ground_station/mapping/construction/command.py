@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep features and pairs there "
         "(default: $BLIMP_CACHE, else $XDG_CACHE_HOME/blimp/mapping)",
     )
-    cache.add_argument("--no-cache", action="store_true", help="keep nothing, and make all anew")
+    cache.add_argument("--no-cache", action="store_true", help="keep nothing, and make all again")
     parser.add_argument(
         "--dask",
         metavar="ADDRESS|N",
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Builds; raises `BlimpError` for what a person can mend."""
+    """Builds; raises `BlimpError` for what a person can fix."""
     from ground_station.map.folder import PICTURE, check_target
     from ground_station.map.picture import from_above
     from ground_station.map.summary import describe

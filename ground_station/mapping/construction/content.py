@@ -43,7 +43,7 @@ class KeyPoints(Protocol):
 
 
 _FEATURES, _PAIR, _STRUCTURE = b"blimp features 2\n", b"blimp pair 1\n", b"blimp structure 3\n"
-"""Counted on when the same input gives another result: what was made before is then made anew."""
+"""Counted on when the same input gives another result: what was made before is then made again."""
 
 
 def extraction(extractor: Extractor, settings: MappingSettings) -> bytes:

@@ -58,7 +58,7 @@ class KeptSide:
 
 
 class Lazily(Sequence[Out]):
-    """`count` values, each got anew when it is asked for."""
+    """`count` values, each got again when it is asked for."""
 
     def __init__(self, count: int, get: Callable[[int], Out]) -> None:
         self._count, self._get = count, get

@@ -2,7 +2,7 @@
 
 Where nobody calibrated the camera, a rough lens is found by how many matches of neighbours agree
 with one geometry; then, as with a calibrated one that misfits, images are placed with what is
-known, the whole lens is adjusted with them, and the images are placed anew, until the lens stands.
+known, the whole lens is adjusted with them, and the images are placed again, until the lens stands.
 A lens is taken from the views only where they decide it.
 """
 
@@ -125,7 +125,7 @@ class SelfCalibration:
         return replace(settings, match=match, sfm=sfm)
 
     def go_on(self, model: Model, images: Images) -> bool:
-        """Whether images have to be placed anew, by another lens, which is `camera` then.
+        """Whether images have to be placed again, by another lens, which is `camera` then.
 
         A calibrated lens of another model than the five-parameter one stays, unjudged. Raises
         `MapError` when nobody calibrated the lens and the views leave it open.
@@ -198,7 +198,7 @@ class SelfCalibration:
         ]
 
     def _give_up(self, reason: str) -> bool:
-        """Back to the calibrated lens, if there is one; whether images are placed anew by it."""
+        """Back to the calibrated lens, if there is one; whether images are placed again by it."""
         if self.known.calibrated:
             self._state, self.camera = "open", self.known.camera
             return True

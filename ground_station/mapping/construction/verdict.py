@@ -67,7 +67,7 @@ def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
             why = "see what is there; film what joins the parts, and build with both"
         return f"next: blimp map view {where} --out {page} --open    ({why})"
     if _open_lens(map_.info.built):
-        return "next: blimp calibrate VIDEO --out camera.toml    (then build anew with --camera)"
+        return "next: blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
     if map_.info.registered:
         return f"next: blimp localize VIDEO --map {where} --out est.txt"
     return f"next: blimp map register {where} --page    (its scale and its place in the building)"

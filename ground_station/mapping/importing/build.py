@@ -42,7 +42,7 @@ def import_model(
     """A map of a model's images in the folder `out`; who kills it leaves the old map there.
 
     `frames` are the images, under the model's names; of `camera` they were taken. Landmarks are
-    made anew, because a localizer needs them with its own descriptors: features of every image,
+    made again, because a localizer needs them with its own descriptors: features of every image,
     matched between images that share points of the model, kept where they fit its poses, and
     triangulated. Coordinates and scale stay the model's, which knows no units, so the map is not
     registered. Raises `InputError` and `MapError` with one line.

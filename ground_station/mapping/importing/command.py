@@ -18,7 +18,7 @@ examples:
   blimp map import outputs/sfm --images walk.mcap --features superpoint --out maps/hall
 
 MODEL is a folder with cameras, images and points3D, binary or text, from COLMAP or hloc, whatever
-its features were. Poses and camera are taken over; landmarks are made anew of the pictures. The
+its features were. Poses and camera are taken over; landmarks are made again of the pictures. The
 map is in the model's coordinates, which have no units: blimp map register follows."""
 
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Imports; raises `BlimpError` for what a person can mend."""
+    """Imports; raises `BlimpError` for what a person can fix."""
     from ground_station.geometry.camera import load_camera
     from ground_station.map.folder import check_target
     from ground_station.map.summary import describe

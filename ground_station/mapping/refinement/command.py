@@ -21,7 +21,7 @@ example:
 Poses and landmarks move together until all observations fit best; the map stays where it is
 registered, and registering it again with the same points takes it nearer still. The old map is kept
 beside the new one, as MAP.before, until you delete it. Without EST the map's own observations are
-adjusted anew, with the rolling shutter taken out."""
+adjusted again, with the rolling shutter taken out."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refines; raises `BlimpError` for what a person can mend."""
+    """Refines; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import InputError, MapError
     from ground_station.files import write_json
     from ground_station.map.observations import load_observations

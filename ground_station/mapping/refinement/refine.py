@@ -45,7 +45,7 @@ def refine_map(
 ) -> tuple[store.Map, Refinement]:
     """Refines a map on disk by what flights saw of it, and writes it to `out` or in its place.
 
-    Without flights the map's own observations are adjusted anew. In place, the old map is kept
+    Without flights the map's own observations are adjusted again. In place, the old map is kept
     beside it (NAME.before); the new one appears when it is whole. Raises `MapError` when the
     observations are those of another map, are in it already or do not fit it, and when the map has
     no observations itself."""

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Registers; raises `BlimpError` for what a person can mend."""
+    """Registers; raises `BlimpError` for what a person can fix."""
     if args.seed < 0:
         raise MapError(f"--seed is {args.seed}; allowed: 0 or more")
     _check(args)

@@ -18,7 +18,7 @@ def reconstruct(database: Path, work: Path, wanted: Wanted) -> list[colmap.Recon
     """The models; none when it fails. What is finished in the folder `work` is not done again.
 
     Pan, Baráth, Pollefeys and Schönberger, "Global structure-from-motion revisited", ECCV 2024
-    (GLOMAP). There is no way to stop in between, so a killed build begins it anew.
+    (GLOMAP). There is no way to stop in between, so a killed build begins it again.
     """
     colmap.quiet()
     finished = Snapshots(work / "models")

@@ -137,7 +137,7 @@ def map_sha256(map_: Map) -> str:
 
 
 def write_outcome(folder: str | Path, outcome: Outcome) -> None:
-    """Writes the folder anew; raises `GroundStationError` when the disk refuses."""
+    """Writes the folder again; raises `GroundStationError` when the disk refuses."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

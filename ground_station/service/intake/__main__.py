@@ -43,7 +43,7 @@ def serve(folder: Path, stop: threading.Event) -> None:
 
 
 def main() -> int:
-    """The exit status: 0 after a signal, 2 for bad input, 3 where a new process may mend it."""
+    """The exit status: 0 after a signal, 2 for bad input, 3 where a new process may fix it."""
     if len(sys.argv) != 2:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2

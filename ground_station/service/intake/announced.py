@@ -33,7 +33,7 @@ class Announced:
                 del self._heard[silent]
                 self._returned_s.pop(silent, None)
             heard = self._heard.setdefault(payload_id, {})
-            # A payload that starts anew takes another SSRC and never its old one again.
+            # A payload that restarts takes another SSRC and never its old one again.
             if ssrc in heard and next(reversed(heard)) != ssrc:
                 self._returned_s[payload_id] = now_s
             heard.pop(ssrc, None)

@@ -28,7 +28,7 @@ _WINDOW_S = 2.0
 _FRESH_S = 3.0
 """A payload whose telemetry is gone lives as long as its frames come."""
 _RESTART_NS = 500_000_000
-"""A payload that starts anew is silent for at least so long."""
+"""A payload that restarts is silent for at least so long."""
 _LATE_NS, _EARLY_NS = 10_000_000_000, 1_000_000_000
 """A capture that would lie so long before its arrival, or after it: a clock was just set."""
 
@@ -49,7 +49,7 @@ class Payload:
         """When it said that a session starts; of this machine's clock."""
         self._say, self._recorder = say, recorder
         self._pictures = PictureWriter(folder, payload_id) if folder is not None else None
-        self._lock = threading.Lock()  # two streams overlap for a moment when it starts anew
+        self._lock = threading.Lock()  # two streams overlap for a moment when it restarts
         self._frame_s = float("-inf")
         self._first: tuple[int, int, int] | None = None
         self._last_sequence, self._last_ns = -1, 0

@@ -8,7 +8,7 @@ from ground_station.localization.localizer import Localizer
 
 WINDOW_S = 2.0
 SKIPPED = 0.05
-"""Of the frames told of: what is borne, as `make limits` says it, is TRACKING in 95 % of them."""
+"""Of the frames told of: what `make limits` calls sustained is TRACKING in 95 % of them."""
 LATE_S = 1.0
 """Features of a frame take a tenth of this where a core is free for them."""
 
@@ -26,7 +26,7 @@ class Overload:
         """
         counts = self._counts
         if counts and taken + skipped < counts[-1][1] + counts[-1][2]:
-            counts.clear()  # counted anew
+            counts.clear()  # counted again
         counts.append((now_s, taken, skipped))
         while len(counts) > 1 and counts[1][0] <= now_s - WINDOW_S:
             counts.popleft()

@@ -82,7 +82,7 @@ class Localizing:
             if note is not None:
                 self._frame(note)
             if self._failed >= _END_AFTER:
-                text = f"{self._failed} frames in a row failed; the localizer starts anew"
+                text = f"{self._failed} frames in a row failed; the localizer restarts"
                 self._event(bus_messages.ALARM, "localizer-failed", text)
                 return RESTART
         return 0
@@ -103,7 +103,7 @@ class Localizing:
         self._localize(self._localizer, note, image)
 
     def _follow_stream(self, localizer: Localizer, note: FrameMessage) -> None:
-        """Begins anew where another stream does: the payload was restarted, or its replay was."""
+        """Begins again where another stream does: the payload was restarted, or its replay was."""
         last, self._stream = self._stream, (note.ssrc, note.time_ns)
         another = last is not None and (note.ssrc != last[0] or note.time_ns < last[1])
         if another or self._forget.is_set():

@@ -240,7 +240,7 @@ def _of_processes(processes: list[Mapping[str, Any]]) -> Iterator[Metric]:
         "blimp_process_silent_seconds", "Since it last said that it lives.", labels=["process"]
     )
     restarts = CounterMetricFamily(
-        "blimp_process_restarts", "Times it was started anew.", labels=["process"]
+        "blimp_process_restarts", "Times it was restarted.", labels=["process"]
     )
     for process in processes:
         name = [str(process["name"])[:64]]

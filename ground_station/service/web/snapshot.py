@@ -115,7 +115,7 @@ class Snapshot:
                     note = bus_messages.decode(EventMessage, line)
                     payload_id = str(json.loads(line)["payload"])
                     self._events.append({**bus_messages.as_document(note), "payload": payload_id})
-        self._kept, self._lines = path, EVENTS  # the first to come writes it anew
+        self._kept, self._lines = path, EVENTS  # the first to come writes it again
 
     def _add(self, event: dict[str, Any]) -> None:
         """Call it with the lock held."""

@@ -14,7 +14,7 @@ def person(tmp_path: Path) -> Person:
 
 @pytest.fixture
 def people(tmp_path: Path) -> Callable[[], Person]:
-    """One card after another, each anew."""
+    """One card after another, each again."""
     count = 0
 
     def make() -> Person:

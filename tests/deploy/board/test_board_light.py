@@ -122,7 +122,7 @@ def test_the_first_start_of_the_firmware_may_take_longer() -> None:
 
 def test_every_fault_has_its_own_number_of_blinks() -> None:
     assert [fault.blinks for fault in faults.ALL] == [2, 3, 4, 5, 6]
-    assert all(fault.mend.endswith(".") for fault in faults.ALL)
+    assert all(fault.fix.endswith(".") for fault in faults.ALL)
 
 
 class Written(FastDisk):
@@ -197,7 +197,7 @@ def test_status_txt_names_everything_and_how_to_mend_it(
     assert "\n" not in "".join(lines)
     assert "State:    FAULT: no network (5 blinks)" in lines
     assert "Reason:   the network refuses the password" in lines
-    assert f"To mend:  {faults.NO_NETWORK.mend}" in lines
+    assert f"To fix:  {faults.NO_NETWORK.fix}" in lines
     assert "Warning:  SSH is not set up: ö" in lines
     assert "Payload:  blimp-1" in lines
     assert "Network:  wlan0 192.0.2.7" in lines
@@ -207,7 +207,7 @@ def test_status_txt_names_everything_and_how_to_mend_it(
 
 def test_a_good_card_says_so(person: Person) -> None:
     text = light.text_of(person.card, None, View(GOOD, firmware=STREAMS, links=UP)).decode()
-    assert "State:    streaming\r\n" in text and "Reason" not in text and "To mend" not in text
+    assert "State:    streaming\r\n" in text and "Reason" not in text and "To fix" not in text
 
 
 REASONS: list[tuple[Fault, View, list[str], str]] = [

@@ -111,7 +111,7 @@ def test_a_written_root_is_told(image: Path, tmp_path: Path) -> None:
 def test_a_data_partition_with_a_fault_beyond_the_journal_is_told(
     image: Path, tmp_path: Path
 ) -> None:
-    """A used block that the bitmap calls free, which no journal mends."""
+    """A used block that the bitmap calls free, which no journal fixes."""
     part = tmp_path / "data"
     cut_out(image, card.partition(image, card.DATA), part)
     subprocess.run(

@@ -264,7 +264,7 @@ def test_a_kill_in_the_middle_leaves_no_table(bench: Bench) -> None:
         program.kill()
         program.communicate(timeout=60)
         assert _is_zero(_sector(bench))
-        # And the next flash mends it.
+        # And the next flash fixes it.
         assert run(bench.command()).returncode == 0
         assert parse(bench.toml()).payload_id == "blimp-1"
         return
@@ -328,7 +328,7 @@ def _until(terminal: int, end: bytes) -> bytes:
 
 
 def test_a_real_device_is_written_and_read_back(bench: Bench) -> None:
-    """A loop device in a card's place: opened exclusively, read directly, table taken anew."""
+    """A loop device in a card's place: opened exclusively, read directly, table taken again."""
     size = bench.card.stat().st_size // 4096 * 4096
     os.truncate(bench.card, size)
     done = subprocess.run(

@@ -46,7 +46,7 @@ class Peer(Step):
             return "nobody came"
         return f"after {peer.acts} times: {peer.failure}" if peer.failure or not peer.acts else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         peer = world.kept.pop(id(self), None)
         if peer is None:
             return
@@ -221,7 +221,7 @@ class SlowViewers(Step):
         came = len(world.kept[id(self)])
         return f"{came} of {self.count} connected" if came < self.count else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         for viewer in world.kept.pop(id(self)):
             with contextlib.suppress(OSError):
                 viewer.socket.close()

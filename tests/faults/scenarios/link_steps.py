@@ -30,7 +30,7 @@ class Impairs(Step):
         grown = getattr(world.link.counts, self.COUNT) > world.kept[id(self)]
         return "" if grown else f"no packet was {self.COUNT}"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.impair(self, None)
 
 
@@ -104,9 +104,9 @@ class Outage(Step):
     def lacking(self, world: World) -> str:
         return "" if world.link.counts.lost > world.kept[id(self)] else "no packet was lost"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         if self.telemetry:
-            world.wire.mend(self)
+            world.wire.fix(self)
 
 
 class Silences(Step):
@@ -119,8 +119,8 @@ class Silences(Step):
         heard_s = world.heard_up_to_s() - world.kept[id(self)]
         return f"{heard_s:.1f} s more of health were heard" if heard_s > self.for_s / 2 else ""
 
-    def mend(self, world: World) -> None:
-        world.wire.mend(self)
+    def fix(self, world: World) -> None:
+        world.wire.fix(self)
 
 
 @dataclass(frozen=True)

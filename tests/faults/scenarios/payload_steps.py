@@ -38,7 +38,7 @@ class PayloadKilled(Step):
     def lacking(self, world: World) -> str:
         return "" if world.run.killed else "it flies on"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.let_payload(self)
 
 
@@ -58,7 +58,7 @@ class PayloadRestarted(Step):
         else:
             world.hold_payload(self)
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         if not self.same_ssrc:
             world.let_payload(self)
 
@@ -74,7 +74,7 @@ class PayloadStopped(Step):
     def lacking(self, world: World) -> str:
         return "" if is_stopped(world.run.process.pid) else "it runs"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         run = world.kept.pop(id(self))
         if run.ended is None:
             run.send(signal.SIGCONT)
@@ -92,7 +92,7 @@ class PayloadClock(Step):
     def lacking(self, world: World) -> str:
         return "" if "stepped_clock" in world.shims else "no shim sets it"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.disturb(self, "stepped_clock", 0)
 
 
@@ -109,7 +109,7 @@ class CameraFault(Step):
     def inject(self, world: World) -> None:
         world.configure(self, {"camera": self.kind})
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.configure(self, None)
 
 
@@ -131,7 +131,7 @@ class GaugeFault(Step):
         options = {"battery.uri": GAUGES[self.kind], "battery.period_s": "0.2"}
         world.configure(self, options)
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.configure(self, None)
 
 
@@ -148,7 +148,7 @@ class EncoderStalls(Step):
         silent_s = time.monotonic() - max(world.run.watch.at_s, default=0.0)
         return "" if silent_s > self.for_s / 2 else f"it gave a frame {silent_s:.1f} s ago"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.disturb(self, "encoder_fault", 0)
 
 
@@ -165,7 +165,7 @@ class CardFull(Step):
         file = note.recording if note is not None else ""
         return f"it records into {file}" if file else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         run, window = world.kept.pop(id(self))
         window[1] = time.monotonic()
         if run.ended is None:

@@ -19,7 +19,7 @@ from scenarios.step import Scenario, Step, as_json
 from scenarios.world import NAME, RATE_HZ, World, tick
 
 RECOVERED_S, STARTED_S = 10.0, 25.0
-"""Bounds for all to be back after the last fault, without and with a process that starts anew.
+"""Bounds for all to be back after the last fault, without and with a process that restarts.
 
 Of a machine without other work; where there is some they are stretched by its burden.
 """
@@ -132,7 +132,7 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
 
 
 def _end(world: World, step: Step, *, alone: bool) -> None:
-    """Mends a step; one whose traces no other blurs must have done what it is for."""
+    """Fixes a step; one whose traces no other blurs must have done what it is for."""
 
     def look(world: World) -> None:
         if lacks := step.lacking(world):
@@ -140,7 +140,7 @@ def _end(world: World, step: Step, *, alone: bool) -> None:
 
     if alone:
         _do(world, "", look)
-    _do(world, f"mended: {type(step).__name__}" if step.for_s else "", step.mend)
+    _do(world, f"mended: {type(step).__name__}" if step.for_s else "", step.fix)
 
 
 def _do(world: World, text: str, what: Callable[[World], None]) -> None:

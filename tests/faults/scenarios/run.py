@@ -205,7 +205,7 @@ def _table(verdicts: Sequence[Verdict]) -> None:
     holding = sum(verdict.holds for verdict in verdicts)
     print(
         f"{holding} of {len(verdicts)} hold; bounds: 0.5 m, back within {RECOVERED_S:g} s, or"
-        f" {STARTED_S:g} s where a process starts anew, times the machine's burden"
+        f" {STARTED_S:g} s where a process restarts, times the machine's burden"
     )
 
 

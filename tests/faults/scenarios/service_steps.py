@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Killed(Step):
-    """SIGKILL for one of the service's processes, which its parent starts anew."""
+    """SIGKILL for one of the service's processes, which its parent restarts."""
 
     process: str = "intake"
     STARTS: ClassVar[bool] = True
@@ -58,7 +58,7 @@ class Stopped(Step):
             return f"no {self.process} to stop"
         return "" if is_stopped(found.pid) or not found.living else "it runs"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         found = world.kept.pop(id(self))
         if found is not None and found.living:
             os.kill(found.pid, signal.SIGCONT)
@@ -76,7 +76,7 @@ class ServiceKilled(Step):
     def lacking(self, world: World) -> str:
         return "it serves" if world.service.process.poll() is None else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.let_service(self)
 
 
@@ -100,7 +100,7 @@ class GroundClock(Step):
     def lacking(self, world: World) -> str:
         return "" if "ground_clock" in world.shims else "no shim sets it"
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         world.disturb(self, "ground_clock", 0)
 
 
@@ -119,7 +119,7 @@ class DiskFull(Step):
     def lacking(self, world: World) -> str:
         return "it records" if world.recording() else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         found, window = world.kept.pop(id(self))
         if world.disk is not None:
             world.disk.free()
@@ -147,7 +147,7 @@ class FolderTaken(Step):
     def lacking(self, world: World) -> str:
         return "it records" if id(self) not in world.kept or world.recording() else ""
 
-    def mend(self, world: World) -> None:
+    def fix(self, world: World) -> None:
         if kept := world.kept.pop(id(self), None):
             away, window = kept
             world.service.recordings.unlink()

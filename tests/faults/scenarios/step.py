@@ -1,4 +1,4 @@
-"""What a fault is: data with a time, that knows how to inject itself and how to mend it again."""
+"""What a fault is: data with a time, that knows how to inject itself and how to fix it again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StepError(Exception):
 class Step:
     """A fault from `at_s` on, seconds after the flight is tracked, for `for_s` seconds.
 
-    `inject` and `mend` are called once each and find whatever other steps have left: a process that
+    `inject` and `fix` are called once each and find whatever other steps have left: a process that
     they want to stop may be gone already.
     """
 
@@ -31,7 +31,7 @@ class Step:
     for_s: float
 
     STARTS: ClassVar[bool] = False
-    """Whether a process starts anew, so that recovery takes its start, too."""
+    """Whether a process restarts, so that recovery takes its start, too."""
 
     def __init_subclass__(cls) -> None:
         KINDS[cls.__name__] = cls
@@ -49,8 +49,8 @@ class Step:
         """What of the fault cannot be seen at its end, before it is mended; '' where it was one."""
         raise NotImplementedError
 
-    def mend(self, world: World) -> None:
-        """Ends it; nothing to do for what mends itself."""
+    def fix(self, world: World) -> None:
+        """Ends it; nothing to do for what fixes itself."""
 
     def __str__(self) -> str:
         own = [
@@ -85,7 +85,7 @@ class Scenario:
 
     @property
     def starts(self) -> bool:
-        """Whether a process starts anew on the way."""
+        """Whether a process restarts on the way."""
         return any(step.STARTS for step in self.steps)
 
 

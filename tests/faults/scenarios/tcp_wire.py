@@ -56,7 +56,7 @@ class TcpWire:
             self._blocking.add(id(who))
             self._open.clear()
 
-    def mend(self, who: object = None) -> None:
+    def fix(self, who: object = None) -> None:
         """Takes back what somebody did."""
         with self._lock:
             self._cutting.discard(id(who))

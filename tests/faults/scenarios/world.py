@@ -32,7 +32,7 @@ SPEED = 0.5
 """Of the recorded flight: a machine that is busy, too, skips frames and still tracks."""
 _TICK_S, _LOOK_S = 0.05, 0.5
 HOPELESS = 3
-"""The payload's exit status by which systemd starts it anew."""
+"""The payload's exit status by which systemd starts it again."""
 _SHIMS = ("stepped_clock", "encoder_fault")
 
 
@@ -77,7 +77,7 @@ class World:
         self._intake: tuple[Process, float] | None = None
         self._looked_s = 0.0
         self.kept: dict[int, Any] = {}
-        """What a step needs to mend itself, by its id()."""
+        """What a step needs to fix itself, by its id()."""
         self.service_runs = 0
         self._rate_hz = rate_hz
         self._draw = random.Random(seed)

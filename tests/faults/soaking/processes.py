@@ -33,7 +33,7 @@ class Watch:
     """Memory and descriptors of named processes over time; `measures` has both of each.
 
     `bounds` is by name; a name that is not there is drawn only, as is what is too young to judge.
-    A process that was started anew under its name is told by `changed`.
+    A process that was restarted under its name is told by `changed`.
     """
 
     def __init__(self, bounds: Mapping[str, Bounds]) -> None:

@@ -60,7 +60,7 @@ def draw(out: Path, measures: Sequence[Measure], settled_s: float, title: str) -
 
 
 def again(out: Path) -> tuple[list[Row], Path]:
-    """The slopes of an earlier run's document judged anew, and its picture drawn anew.
+    """The slopes of an earlier run's document judged again, and its picture drawn again.
 
     Raises `GroundStationError` with one line.
     """

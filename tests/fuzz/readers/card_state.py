@@ -30,7 +30,7 @@ _TOLD = {"release": "1.2", "how": "update", "reason": "", "version": "0.1", "com
 
 
 def fuzz(data: bytes) -> None:
-    """Damaged files are as absent ones: nothing raises, for who should mend it?"""
+    """Damaged files are as absent ones: nothing raises, for who should fix it?"""
     picker = Picker(data)
     for path, like in (
         (_AT.trial, _TRIAL),

@@ -45,7 +45,7 @@ at_start = true
 
 @dataclass
 class Figures:
-    """What the run measured, written anew after each addition."""
+    """What the run measured, written again after each addition."""
 
     path: Path
     values: dict[str, Any] = field(default_factory=dict)

@@ -174,7 +174,7 @@ def test_a_damaged_file_is_put_aside_and_begun_anew(tmp_path, capsys, harm):
         assert found[-1] is None
         cache.keep_features(KEY, _features())
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "begun anew" in lines[0]
+    assert len(lines) == 1 and "begun again" in lines[0]
     # Behind the header, which counts who wrote.
     assert (tmp_path / "mapping-1.damaged").read_bytes()[100:1000] == before[100:1000]
     with Cache(tmp_path) as cache:

@@ -183,7 +183,7 @@ class Page:
 
 
 def test_a_map_is_registered_on_the_page(browser: Any, stand: Stand, tmp_path: Path) -> None:
-    """A person sets the scale, picks, sees residuals, mends a wrong pick, and saves."""
+    """A person sets the scale, picks, sees residuals, fixes a wrong pick, and saves."""
     hand = Page(browser, stand)
     page = hand.page
     assert "no scale" in hand.text("#plan-words") and page.is_disabled("#save")

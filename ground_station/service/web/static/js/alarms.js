@@ -7,7 +7,7 @@ import { Sound } from "./sound.js";
 
 /** @typedef {import("./types.js").Alarm} Alarm */
 
-const OFFLINE_MS = 2000; // a station that is started anew is back before
+const OFFLINE_MS = 2000; // a station that is restarted is back before
 
 export class Alarms {
   /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop */

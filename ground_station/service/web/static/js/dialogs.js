@@ -33,7 +33,7 @@ export class MapDialog {
       /** @type {import("./types.js").MapSummary[]} */
       const maps = await api.get("/api/maps");
       const now = this.store.current?.estimate?.map || this.store.station.map;
-      setText(this.f.note, maps.length ? "The localizer starts anew in the map that is chosen." : "There are no maps. `blimp map build` makes one.");
+      setText(this.f.note, maps.length ? "The localizer restarts in the map that is chosen." : "There are no maps. `blimp map build` makes one.");
       this.f.choices.replaceChildren(...maps.map((map) => this.choice(map, map.name === now)));
     } catch (error) {
       setText(this.f.note, error instanceof Error ? error.message : String(error));

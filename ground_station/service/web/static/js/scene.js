@@ -73,7 +73,7 @@ export class Scene {
     this.resized();
   }
 
-  /** The map's own shapes, anew. */
+  /** The map's own shapes, again. */
   fill() {
     this.trail_drawn = "";
     if (!this.renderer || !this.points || !this.grid) return;
