@@ -11,6 +11,7 @@ import numpy as np
 from ground_station.arrays import F64, U8
 from ground_station.features.extractor import Extractor
 from ground_station.geometry import poses
+from ground_station.localization import sweeping
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Observations, no_observations
 from ground_station.localization.estimator import Estimator
@@ -30,6 +31,19 @@ _ALLOWED = 32.9
 """Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
 _CLOSER = 3
 """Solutions at most that are matched around once more."""
+_NEAR = 0.5
+"""Of the median depth: nearer landmarks tell a turn from a step aside."""
+_FAR = 0.8
+"""Farther ones leave open which of the two it was."""
+_TRIED = 3
+"""Poses along what is open, those with the most near landmarks, that are solved."""
+_OPENS = 3.0
+"""So many times the deviation of a position, without them, is another pose."""
+_OPEN = 0.01
+"""And this much of the near landmarks' depth."""
+_STEP_PX = 5.0
+"""From pose to pose, along what is open, near landmarks move by so much: as far as they are looked
+for."""
 _FOUND_RADIUS_PX = 15.0
 """Around a pose that was found in the whole map: it explains its inliers to a few pixels, and what
 is left is the shear of a shutter whose motion nobody knows yet."""
@@ -126,7 +140,50 @@ class Acquirer:
                 < closer_px
             ):
                 break
-        return found
+        return self._held_by_near(seen, found, expected, estimator, watch)
+
+    def _held_by_near(
+        self,
+        seen: Described,
+        found: Located,
+        expected: Kinematics,
+        estimator: Estimator,
+        watch: Stopwatch,
+    ) -> Located:
+        """What was found; or, where far landmarks leave it open and near ones are not seen from
+        it, the pose along what is open from which they are seen. Where that is none, and other
+        poses show as many as this one, the solution of the far ones, which is as open as they are.
+        """
+        state = found.solution.state
+        if state is None or self._settings.pose.solver != "rolling":
+            return found
+        depth = self.matcher.depth(state.wTc, found.matches.landmark)
+        median = float(np.median(depth))
+        near = _NEAR * median
+        kept = found.matches.where(depth >= _FAR * median)
+        far = self._solved_again(seen, kept, expected, estimator)
+        if far.solution.state is None or not _opens(state, far.solution.state, near):
+            return found
+        least = self._settings.recovery.min_significance
+        support = self.matcher.support(seen, state.wTc, near)
+        if support.significance >= least or support.expected < least:
+            return found
+        step = sweeping.weakest(far.solution.state.covariance[:6, :6], median)
+        moved_px = float(self.matcher.camera.fx_px * np.linalg.norm(step[3:]) / near)
+        swept = sweeping.along(far.solution.state.wTc, step, moved_px, _STEP_PX)
+        here, *held = self.matcher.counts(seen, [state.wTc, *swept], near)
+        if here >= max(held):
+            return found
+        best, most = far, 0.0
+        for k in np.argsort(held)[::-1][:_TRIED].tolist():
+            around = replace(far.solution.state, wTc=swept[k])
+            again = self._locate_once(seen, around, expected, estimator, _FOUND_RADIUS_PX, watch)
+            if again.solution.state is not None:
+                sure = self.matcher.support(seen, again.solution.state.wTc, near).significance
+                if sure >= least and sure > most:
+                    best, most = again, sure
+        watch.lap("verification")
+        return best
 
     def find(
         self,
@@ -298,8 +355,21 @@ class Acquirer:
         watch: Stopwatch,
         chance_share: float | None = None,
     ) -> Located:
-        settings = self._settings.pose
         matches = self.matcher.match(seen, around, radius_px, watch, chance_share)
+        located = self._solved_again(seen, matches, expected, estimator, around)
+        watch.lap("pose")
+        return located
+
+    def _solved_again(
+        self,
+        seen: Described,
+        matches: Matches,
+        expected: Kinematics,
+        estimator: Estimator,
+        around: Kinematics | None = None,
+    ) -> Located:
+        settings = self._settings.pose
+        around = around or expected
         pixel = seen.features.keypoints_px[matches.feature]
         if len(matches) < settings.min_observations:
             solution = no_solution(len(matches), f"{len(matches)} observations")
@@ -308,9 +378,16 @@ class Acquirer:
                 pixel, matches.landmark, settings.sigma_px, around, seen.taken
             )
             solution = believed(estimator.solve(expected, seen_at, settings), self._settings)
-        watch.lap("pose")
         observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)
         return Located(solution, matches, observations, len(seen))
+
+
+def _opens(state: Kinematics, without: Kinematics, near: float) -> bool:
+    """Whether a solution without near landmarks says much less of the place, and too little."""
+    before, after = (
+        float(np.sqrt(np.trace(each.covariance[3:6, 3:6]))) for each in (state, without)
+    )
+    return after > max(_OPENS * before, _OPEN * near)
 
 
 def believed(solution: Solution, settings: LocalizerSettings, least: int | None = None) -> Solution:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.arrays import F32, F64, Indices
+from ground_station.arrays import F32, F64, Bools, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
@@ -19,7 +20,7 @@ from ground_station.localization.chance import count_beyond_chance
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.verification import Witness
+from ground_station.localization.verification import Support, Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.map.modes import described
 from ground_station.map.store import Map
@@ -73,6 +74,15 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.feature)
+
+    def where(self, keep: Bools) -> Matches:
+        """Those of them that are kept, (N,)."""
+        return replace(
+            self,
+            feature=self.feature[keep],
+            landmark=self.landmark[keep],
+            distance=self.distance[keep],
+        )
 
 
 class Matcher:
@@ -191,14 +201,32 @@ class Matcher:
         return float(_REACH * np.sqrt(np.quantile(variance, 0.9)))
 
     def significance(self, seen: Described, wTc: F64) -> float:
-        """By how many standard deviations a pose (4, 4) explains more landmarks than chance does.
+        """By how many standard deviations a pose (4, 4) explains more landmarks than chance."""
+        return self.support(seen, wTc).significance
+
+    def support(self, seen: Described, wTc: F64, nearer_than: float = np.inf) -> Support:
+        """The landmarks of less than a depth that speak for a pose (4, 4).
 
         Near a wrong pose features pair up as well, and agree with each other as far as they were
         looked for. Landmarks shifted aside tell how many do so by chance.
         """
+        return self._witness(seen).support(wTc, self.landmarks, self._among(wTc, nearer_than))
+
+    def counts(self, seen: Described, wTc: Sequence[F64], nearer_than: float) -> list[int]:
+        """How many landmarks of less than a depth are seen from poses (4, 4) that are alike."""
+        witness, among = self._witness(seen), self._among(wTc[0], nearer_than)
+        return [witness.count(each, self.landmarks, among) for each in wTc]
+
+    def _witness(self, seen: Described) -> Witness:
+        return Witness(seen.features, self._lens, self._modes)
+
+    def _among(self, wTc: F64, nearer_than: float) -> Indices:
         among = self._index.near(wTc, self._lens, self.settings.projection)
-        witness = Witness(seen.features, self._lens, self._modes)
-        return witness.support(wTc, self.landmarks, among).significance
+        return among if nearer_than == np.inf else among[self.depth(wTc, among) < nearer_than]
+
+    def depth(self, wTc: F64, landmark: Indices) -> F64:
+        """How far before a camera at `wTc` (4, 4) landmarks (N,) are, (N,)."""
+        return np.asarray((self.landmarks.position_m[landmark] - wTc[:3, 3]) @ wTc[:3, 2])
 
     def observations(
         self,

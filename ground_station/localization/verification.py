@@ -60,19 +60,9 @@ class Witness:
 
     def support(self, wTc: F64, landmarks: Landmarks, index: Indices) -> Support:
         """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
-        cTw = poses.inverse(wTc)
-        points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
-        ahead = points[:, 2] > NEAREST_M
-        index, points = index[ahead], points[ahead]
-        flat = points[:, :2] / points[:, 2:]
-        seen = self.lens.inside(flat)
-        index, flat = index[seen], flat[seen]
-        if len(index):
-            seen = in_cone(landmarks, index, wTc[:3, 3], _CONES)
-            index, flat = index[seen], flat[seen]
+        index, pixel = self._seen(wTc, landmarks, index)
         if not len(index):
             return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
-        pixel = self.lens.camera.distort(flat)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
         feature, distance = self._near(pixel, descriptors, mode)
         found = distance < _MAX_DISTANCE
@@ -87,6 +77,26 @@ class Witness:
         rows = rows[np.argsort(distance[rows], kind="stable")]
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
         return Support(feature[rows], index[rows], len(index), float(found.mean()), float(chance))
+
+    def count(self, wTc: F64, landmarks: Landmarks, index: Indices) -> int:
+        """How many of the landmarks `index` (M,) are found, by chance or not."""
+        index, pixel = self._seen(wTc, landmarks, index)
+        descriptors, mode = described(landmarks.descriptor, self._modes, index)
+        return int((self._near(pixel, descriptors, mode)[1] < _MAX_DISTANCE).sum())
+
+    def _seen(self, wTc: F64, landmarks: Landmarks, index: Indices) -> tuple[Indices, F64]:
+        """Those of the landmarks `index` (M,) that a pose (4, 4) should see, and their pixels."""
+        cTw = poses.inverse(wTc)
+        points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
+        ahead = points[:, 2] > NEAREST_M
+        index, points = index[ahead], points[ahead]
+        flat = points[:, :2] / points[:, 2:]
+        seen = self.lens.inside(flat)
+        index, flat = index[seen], flat[seen]
+        if len(index):
+            seen = in_cone(landmarks, index, wTc[:3, 3], _CONES)
+            index, flat = index[seen], flat[seen]
+        return index, self.lens.camera.distort(flat)
 
     def _near(self, pixel_px: F64, descriptors: F32, mode: Indices | None) -> tuple[Indices, F64]:
         """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).

@@ -1,0 +1,41 @@
+"""Poses along the direction that far landmarks leave open, judged by near ones.
+
+Before a wall far off a turn is hard to tell from a step aside, and the shear of a rolling shutter
+takes up what tells them apart. Such a pose hangs on the few near things in the picture: found where
+they are, they hold it; a few pairs by chance hold a wrong one as well, and it seems sure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ground_station.arrays import F64
+from ground_station.geometry import poses
+
+REACH = 6.0
+"""Standard deviations of the far landmarks' solution that are looked through: a camera that speeds
+up during the readout is further off than its covariance says."""
+_MOST = 60
+"""Poses at most."""
+
+
+def weakest(covariance: F64, depth: float) -> F64:
+    """The tangent step (6,) of one standard deviation in a pose's weakest direction.
+
+    `covariance` (6, 6) of the right tangent; a turn counts as the step aside that it resembles at
+    `depth`.
+    """
+    unit = np.repeat([depth, 1.0], 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(unit, unit))
+    return np.asarray(vectors[:, -1] * np.sqrt(max(values[-1], 0.0)) / unit)
+
+
+def along(wTc: F64, step: F64, moved_px: float, radius_px: float) -> list[F64]:
+    """`wTc` and poses (4, 4) to both its sides, the nearest first.
+
+    `step` (6,) is one standard deviation, by which near landmarks move `moved_px` in the picture;
+    from one pose to the next they move by a radius within which they are looked for.
+    """
+    count = min(int(np.ceil(REACH * moved_px / radius_px)), _MOST // 2)
+    shares = REACH * np.arange(1, count + 1) / max(count, 1)
+    return [wTc, *(wTc @ poses.exp(step * share) for each in shares for share in (each, -each))]
