@@ -35,6 +35,8 @@ _NEAR = 0.5
 """Of the median depth: nearer landmarks tell a turn from a step aside."""
 _FAR = 0.8
 """Farther ones leave open which of the two it was."""
+_MORE = 2.0
+"""Deviations of a count by which another pose must show more of them."""
 _TRIED = 3
 """Poses along what is open, those with the most near landmarks, that are solved."""
 _OPENS = 3.0
@@ -151,8 +153,8 @@ class Acquirer:
         watch: Stopwatch,
     ) -> Located:
         """What was found; or, where far landmarks leave it open and near ones are not seen from
-        it, the pose along what is open from which they are seen. Where that is none, and other
-        poses show as many as this one, the solution of the far ones, which is as open as they are.
+        it, the pose along what is open from which they are. Where another one shows more of them,
+        but too few to be believed, the solution of the far ones, which is as open as they are.
         """
         state = found.solution.state
         if state is None or self._settings.pose.solver != "rolling":
@@ -172,7 +174,7 @@ class Acquirer:
         moved_px = float(self.matcher.camera.fx_px * np.linalg.norm(step[3:]) / near)
         swept = sweeping.along(far.solution.state.wTc, step, moved_px, _STEP_PX)
         here, *held = self.matcher.counts(seen, [state.wTc, *swept], near)
-        if here >= max(held):
+        if max(held) - here < _MORE * np.sqrt(max(held)):
             return found
         best, most = far, 0.0
         for k in np.argsort(held)[::-1][:_TRIED].tolist():

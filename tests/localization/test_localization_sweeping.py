@@ -90,7 +90,7 @@ def test_without_them_a_pose_is_as_open_as_the_wall_leaves_it(hall, extractor, m
 
     def with_more_elsewhere(self, seen, wTc, nearer_than):
         here, _, *others = counts(self, seen, wTc, nearer_than)
-        return [here, here + 1, *others]
+        return [here, 4 * here, *others]
 
     monkeypatch.setattr(Matcher, "counts", with_more_elsewhere)
     off, sigma = located(hall, extractor, np.arange(FAR))

@@ -7,8 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from intake_stand import Stand, eventually
 
+from ground_station.service.intake import payloads
 from ground_station.service.intake.payloads import Payload
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
@@ -34,7 +36,7 @@ def test_a_session_with_the_ssrc_of_the_one_before_counts_from_its_own_beginning
         assert {note.ssrc for note, _ in stand.heard.of("blimp-1")} == {77}
 
 
-def test_its_first_frames_lost_it_is_told_by_its_word() -> None:
+def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = GroundRecorder(RecordingSettings(folder=""), lambda *_: None)
     recorder.close()
     stream = SimpleNamespace(ssrc=77, counters=Counters(), bytes=0)
@@ -46,7 +48,10 @@ def test_its_first_frames_lost_it_is_told_by_its_word() -> None:
         note = payload.note(None, listener, encrypted=False)  # type: ignore[arg-type]
         return note.frames["received"]
 
-    def take(sequence: int, arrival_ns: int) -> None:
+    def take(sequence: int, at_s: float, clock_s: float = 0.0) -> None:
+        """At a time, when this machine's clock was set ahead by `clock_s`."""
+        monkeypatch.setattr(payloads.time, "monotonic", lambda: at_s)
+        arrival_ns = round((at_s + clock_s) * 1e9)
         stream.counters = replace(stream.counters, decoded=stream.counters.decoded + 1)
         payload.take(
             ReceivedFrame(
@@ -64,15 +69,17 @@ def test_its_first_frames_lost_it_is_told_by_its_word() -> None:
             )
         )
 
-    s = 1_000_000_000
     for number in range(5):
-        take(number, 100 * s + number * s // 10)
-    take(5, 103 * s)  # a stutter alone is no new session
+        take(number, 100.0 + number / 10)
+    take(5, 103.0)  # a stutter alone is no new session
     assert received() == 6
-    payload.started_ns = 104 * s
-    take(9, 105 * s)
-    take(10, 105 * s + s // 10)
+    payload.started_s = 104.0
+    take(9, 105.0)
+    take(10, 105.1)
     assert received() == 2
-    payload.started_ns = 105 * s + s // 8  # its word came late
-    take(11, 105 * s + s // 5)
+    payload.started_s = 105.125  # its word came late
+    take(11, 105.2)
     assert received() == 3
+    take(12, 105.3, clock_s=-60.0)  # nor is a clock that is set
+    take(13, 105.4)
+    assert received() == 5

@@ -27,7 +27,7 @@ Say = Callable[[str, str, Message], None]
 _WINDOW_S = 2.0
 _FRESH_S = 3.0
 """A payload whose telemetry is gone lives as long as its frames come."""
-_RESTART_NS = 500_000_000
+_RESTART_S = 0.5
 """A payload that restarts is silent for at least so long."""
 _LATE_NS, _EARLY_NS = 10_000_000_000, 1_000_000_000
 """A capture that would lie so long before its arrival, or after it: a clock was just set."""
@@ -45,14 +45,14 @@ class Payload:
         self.stream: Stream | None = None
         """The newest; it may have ended."""
         self.clock: Callable[[], Offset | None] = lambda: None
-        self.started_ns = 0
-        """When it said that a session starts; of this machine's clock."""
+        self.started_s = float("-inf")
+        """When it said that a session starts; `time.monotonic`, as clocks may be set."""
         self._say, self._recorder = say, recorder
         self._pictures = PictureWriter(folder, payload_id) if folder is not None else None
         self._lock = threading.Lock()  # two streams overlap for a moment when it restarts
         self._frame_s = float("-inf")
         self._first: tuple[int, int, int] | None = None
-        self._last_sequence, self._last_ns = -1, 0
+        self._last_sequence = -1
         self._base = Counters()
         """Of the stream, before the payload's newest session: one may keep its SSRC."""
         self._before: int | None = None
@@ -67,31 +67,32 @@ class Payload:
         if capture_ns is not None and not (-_LATE_NS < capture_ns - frame.arrival_ns < _EARLY_NS):
             capture_ns = None
         with self._lock:
-            self._frame_s, self.seen_ns = time.monotonic(), frame.arrival_ns
+            before_s, self._frame_s = self._frame_s, time.monotonic()
+            self.seen_ns = frame.arrival_ns
             if self._first is None or self._first[0] != frame.ssrc:
                 units = self.stream.counters.access_units if self.stream else 1
                 self._first = (frame.ssrc, frame.sequence, units)
                 self._shown = 0
-            elif self._began_anew(frame) and self.stream is not None:
+            elif self._began_anew(frame, before_s) and self.stream is not None:
                 counters = self.stream.counters
                 self._base = dataclasses.replace(
                     counters, access_units=counters.access_units - 1, decoded=counters.decoded - 1
                 )
                 self._first = (frame.ssrc, frame.sequence, 1)
                 self._before, self._dropped, self._shown = None, 0, 0
-            self._last_sequence, self._last_ns = frame.sequence, frame.arrival_ns
+            self._last_sequence = frame.sequence
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
         self._recorder.frame(self.id, frame, log_ns)
 
-    def _began_anew(self, frame: ReceivedFrame) -> bool:
+    def _began_anew(self, frame: ReceivedFrame, before_s: float) -> bool:
         """Whether a frame is the first of a session.
 
         Its number tells, but where as many were lost at the start as the session before had: there
         its word does, in the silence between the two.
         """
-        silent = frame.arrival_ns - self._last_ns > _RESTART_NS
-        said = silent and self._last_ns < self.started_ns <= frame.arrival_ns
+        silent = self._frame_s - before_s > _RESTART_S
+        said = silent and before_s < self.started_s <= self._frame_s
         return said or frame.sequence <= self._last_sequence
 
     def _show(self, frame: ReceivedFrame, capture_ns: int | None) -> None:
