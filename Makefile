@@ -52,7 +52,7 @@ uninstall-service:  ## Take the service away; configuration and recordings stay
 
 test: setup  ## Run the tests of every room
 	@sh tests/tools.sh
-	@failed=0; export PATH="$(CURDIR)/out/sshd/usr/sbin:$$PATH"; \
+	@failed=0; \
 	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
 	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 3 --dist loadfile tests || failed=1; \
 	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
