@@ -448,13 +448,14 @@ def test_thirty_estimates_a_second_do_not_lay_the_page_out_thirty_times(shown: W
 @pytest.mark.parametrize("size", list(SIZES))
 def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: str) -> None:
     name = "the-very-long-name-of-a-payload-number-17"
+    chip = f'.payload[aria-label^="{name}"]'
     station.payloads[name] = Payload(name, first=80)
-    station.alarm("hot", "warning", name, "the payload's processor has 82 °C")
     width, height = SIZES[size]
     shown.page.set_viewport_size({"width": width, "height": height})
     try:
+        shown.page.wait_for_selector(chip)  # or its alarm is of nobody
+        station.alarm("hot", "warning", name, "the payload's processor has 82 °C")
         shown.page.wait_for_selector(f'[data-id="hot/{name}"]')
-        shown.page.wait_for_selector(f'.payload[aria-label^="{name}"]')
         shown.page.wait_for_timeout(300)
         over = shown.page.evaluate(
             """selectors => {
@@ -485,6 +486,7 @@ def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: 
     finally:
         del station.payloads[name]
         shown.page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
+        shown.page.wait_for_selector(chip, state="detached")
 
 
 def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
