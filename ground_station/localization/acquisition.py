@@ -25,27 +25,13 @@ from ground_station.localization.matching import (
 from ground_station.localization.relocalization import Relocalization, Relocalizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe, spread_out
+from ground_station.localization.verification import RADIUS_PX
 from ground_station.map.store import Map
 
 _ALLOWED = 32.9
 """Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
 _CLOSER = 3
 """Solutions at most that are matched around once more."""
-_NEAR = 0.5
-"""Of the median depth: nearer landmarks tell a turn from a step aside."""
-_FAR = 0.8
-"""Farther ones leave open which of the two it was."""
-_MORE = 2.0
-"""Deviations of a count by which another pose must show more of them."""
-_TRIED = 3
-"""Poses along what is open, those with the most near landmarks, that are solved."""
-_OPENS = 3.0
-"""So many times the deviation of a position, without them, is another pose."""
-_OPEN = 0.01
-"""And this much of the near landmarks' depth."""
-_STEP_PX = 5.0
-"""From pose to pose, along what is open, near landmarks move by so much: as far as they are looked
-for."""
 _FOUND_RADIUS_PX = 15.0
 """Around a pose that was found in the whole map: it explains its inliers to a few pixels, and what
 is left is the shear of a shutter whose motion nobody knows yet."""
@@ -142,7 +128,9 @@ class Acquirer:
                 < closer_px
             ):
                 break
-        return self._held_by_near(seen, found, expected, estimator, watch)
+        held = self._held_by_near(seen, found, expected, estimator, watch)
+        watch.lap("verification")
+        return held
 
     def _held_by_near(
         self,
@@ -161,30 +149,31 @@ class Acquirer:
             return found
         depth = self.matcher.depth(state.wTc, found.matches.landmark)
         median = float(np.median(depth))
-        near = _NEAR * median
-        kept = found.matches.where(depth >= _FAR * median)
-        far = self._solved_again(seen, kept, expected, estimator)
-        if far.solution.state is None or not _opens(state, far.solution.state, near):
+        near = sweeping.NEAR * median
+        kept = found.matches.where(depth >= sweeping.FAR * median)
+        far = self._solve(seen, kept, expected, estimator)
+        other = far.solution.state
+        if other is None or not sweeping.opens(state.covariance, other.covariance, near):
             return found
         least = self._settings.recovery.min_significance
         support = self.matcher.support(seen, state.wTc, near)
+        # Each landmark adds one deviation at most: of too few nothing can be told.
         if support.significance >= least or support.expected < least:
             return found
-        step = sweeping.weakest(far.solution.state.covariance[:6, :6], median)
+        step = sweeping.weakest(other.covariance[:6, :6], median)
         moved_px = float(self.matcher.camera.fx_px * np.linalg.norm(step[3:]) / near)
-        swept = sweeping.along(far.solution.state.wTc, step, moved_px, _STEP_PX)
+        swept = sweeping.along(other.wTc, step, moved_px, RADIUS_PX)
         here, *held = self.matcher.counts(seen, [state.wTc, *swept], near)
-        if max(held) - here < _MORE * np.sqrt(max(held)):
+        if max(held) - here <= sweeping.MORE * np.sqrt(max(held)):
             return found
         best, most = far, 0.0
-        for k in np.argsort(held)[::-1][:_TRIED].tolist():
-            around = replace(far.solution.state, wTc=swept[k])
+        for k in np.argsort(held)[::-1][: sweeping.TRIED].tolist():
+            around = replace(other, wTc=swept[k])
             again = self._locate_once(seen, around, expected, estimator, _FOUND_RADIUS_PX, watch)
             if again.solution.state is not None:
                 sure = self.matcher.support(seen, again.solution.state.wTc, near).significance
                 if sure >= least and sure > most:
                     best, most = again, sure
-        watch.lap("verification")
         return best
 
     def find(
@@ -358,11 +347,11 @@ class Acquirer:
         chance_share: float | None = None,
     ) -> Located:
         matches = self.matcher.match(seen, around, radius_px, watch, chance_share)
-        located = self._solved_again(seen, matches, expected, estimator, around)
+        located = self._solve(seen, matches, expected, estimator, around)
         watch.lap("pose")
         return located
 
-    def _solved_again(
+    def _solve(
         self,
         seen: Described,
         matches: Matches,
@@ -370,6 +359,7 @@ class Acquirer:
         estimator: Estimator,
         around: Kinematics | None = None,
     ) -> Located:
+        """Solves with these matches; they were found `around` another state, where one is given."""
         settings = self._settings.pose
         around = around or expected
         pixel = seen.features.keypoints_px[matches.feature]
@@ -382,14 +372,6 @@ class Acquirer:
             solution = believed(estimator.solve(expected, seen_at, settings), self._settings)
         observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)
         return Located(solution, matches, observations, len(seen))
-
-
-def _opens(state: Kinematics, without: Kinematics, near: float) -> bool:
-    """Whether a solution without near landmarks says much less of the place, and too little."""
-    before, after = (
-        float(np.sqrt(np.trace(each.covariance[3:6, 3:6]))) for each in (state, without)
-    )
-    return after > max(_OPENS * before, _OPEN * near)
 
 
 def believed(solution: Solution, settings: LocalizerSettings, least: int | None = None) -> Solution:

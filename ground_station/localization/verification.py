@@ -16,7 +16,7 @@ from ground_station.localization.settings import ProjectionSettings
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
 
-_RADIUS_PX = 5.0
+RADIUS_PX = 5.0
 """A feature this near to where a landmark should be may be it."""
 _NEIGHBOURS = 4
 """Features that are looked at within the radius."""
@@ -103,7 +103,7 @@ class Witness:
 
         Descriptors are a row each and then one for each pixel of `mode` (Q,), ascending.
         """
-        _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_PX)
+        _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=RADIUS_PX)
         if mode is not None:
             near = np.concatenate([near, near[mode]])
         there = near < len(self.features)

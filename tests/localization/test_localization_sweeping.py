@@ -97,6 +97,12 @@ def test_without_them_a_pose_is_as_open_as_the_wall_leaves_it(hall, extractor, m
     assert sigma > 0.1 and off < 4 * sigma
 
 
+def test_where_no_pose_shows_any_near_landmark_the_find_stays(hall, extractor, monkeypatch):
+    monkeypatch.setattr(Matcher, "counts", lambda self, seen, wTc, near: [0] * len(wTc))
+    off, sigma = located(hall, extractor, np.arange(FAR))
+    assert sigma < 0.05 < off
+
+
 def test_a_turn_counts_as_the_step_aside_that_it_looks_like():
     sigma = np.diag([1e-4, 0.02, 1e-4, 0.01, 0.1, 0.01]) ** 2
     assert sweeping.weakest(sigma, 20.0) == pytest.approx(np.array([0, 0.02, 0, 0, 0, 0]), abs=1e-6)

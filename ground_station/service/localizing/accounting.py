@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ground_station.service.bus_messages import FrameMessage
 from ground_station.service.localizing.derive import Accounts
+from pi_firmware.wire import files
 
 _KEEP_S = 0.25
 
@@ -48,7 +49,6 @@ class Accounting:
         if now_s - self._kept_s < _KEEP_S:
             return
         self._kept_s = now_s
-        part = self._path.with_name(self._path.name + ".part")
+        kept = f"{self._ssrc} {self._shown} {own.processed} {own.localized}"
         with contextlib.suppress(OSError):  # the run's folder is full
-            part.write_text(f"{self._ssrc} {self._shown} {own.processed} {own.localized}")
-            part.replace(self._path)
+            files.write(self._path, kept.encode())
