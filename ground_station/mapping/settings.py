@@ -125,6 +125,9 @@ class MatchSettings:
         return replace(self, ratio=self.ratio_others, similar=self.similar_others)
 
 
+_LEAST_LOSS_PX = 0.1
+
+
 @dataclass(frozen=True)
 class SfmSettings:
     """Structure from motion and what is kept of it."""
@@ -148,8 +151,9 @@ class SfmSettings:
         2.5, "reprojection error of an observation", unit="px", low=0.1, high=20.0
     )
     loss_px: float = config.key(
-        1.0, "scale of the final adjustment's Cauchy loss", unit="px", low=0.1, high=100.0
-    )
+        1.0, "scale of the adjustments' Cauchy loss where the images' noise is not known",
+        unit="px", low=_LEAST_LOSS_PX, high=100.0,
+    )  # fmt: skip
     max_jump: float = config.key(
         4.0, "a frame is dropped when its step is so many times a fast one", low=1.5, high=1000.0
     )
@@ -277,6 +281,16 @@ class MappingSettings:
     refine: RefineSettings = field(default_factory=RefineSettings)
     extend: ExtendSettings = field(default_factory=ExtendSettings)
     importing: ImportSettings = field(default_factory=ImportSettings)
+
+    def with_noise(self, noise_px: float | None) -> MappingSettings:
+        """With the adjustments' loss as wide as a key point's noise, where it is known.
+
+        What misses by more is of little weight then: right matches of real walls have long tails,
+        and along a corridor a few hundred of these bend a map by centimetres.
+        """
+        if noise_px is None:
+            return self
+        return replace(self, sfm=replace(self.sfm, loss_px=max(noise_px, _LEAST_LOSS_PX)))
 
 
 def load_settings(path: str | Path | None = None) -> MappingSettings:

@@ -126,7 +126,7 @@ def build_map(
             "stage_s": {name: round(value, 3) for name, value in stage_s.items()},
             "settings": asdict(settings),
         }
-        map_, sparse = _straightened(map_, structure.reconstruction, settings)
+        map_, sparse = _straightened(map_, structure.reconstruction, limits)
         colmap.write(sparse, folder / "sparse")
         colmap_files.check(folder / "sparse")  # COLMAP does not say when the disk is full
         store.save_tables(folder, map_, quantise=settings.quantise)
@@ -173,10 +173,12 @@ def _colmap_in(work: Path) -> Iterator[None]:
 
 
 def _with_noise(settings: MappingSettings, found: noise.Noise | None) -> MappingSettings:
-    """With a limit in pixels that the images' own noise asks for, where it is larger."""
-    if found is None or found.limit_px <= settings.match.error_px:
+    """With the loss that the images' own noise asks for, and its limit where that is larger."""
+    if found is None:
         return settings
-    return replace(settings, match=replace(settings.match, error_px=found.limit_px))
+    limit_px = max(found.limit_px, settings.match.error_px)
+    settings = replace(settings, match=replace(settings.match, error_px=limit_px))
+    return settings.with_noise(found.sigma_px)
 
 
 def _parts(images: Images, structure: Structure, names: list[str]) -> list[list[str]]:

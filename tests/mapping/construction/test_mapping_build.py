@@ -100,6 +100,21 @@ def test_descriptors_are_unit_means_and_the_quantised_ones_within_a_degree(built
     assert angle.max() < 1
 
 
+def test_the_loss_is_as_wide_as_the_noise_of_the_images(built, use_scene, tmp_path, monkeypatch):
+    use_scene(built.scene)
+    losses, adjust = [], build.adjust_and_filter
+
+    def noted(reconstruction, sfm, threads):
+        losses.append(sfm.loss_px)
+        return adjust(reconstruction, sfm, threads)
+
+    monkeypatch.setattr(build, "adjust_and_filter", noted)
+    map_ = build.build_map(
+        built.scene.frames(), built.scene.camera, built.settings, tmp_path / "map"
+    )
+    assert set(losses) == {max(map_.info.built["noise_px"], 0.1)} != {built.settings.sfm.loss_px}
+
+
 def test_map_toml_says_how_it_was_built(built):
     info = store.load_info(built.folder)
     assert info.frame == "sfm" and info.units == "arbitrary" and not info.registered

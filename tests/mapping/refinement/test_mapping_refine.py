@@ -19,6 +19,7 @@ from ground_station.geometry.alignment import align
 from ground_station.map import colmap, folder, landmarks, store
 from ground_station.map.observations import save_observations
 from ground_station.map.refined import Refined
+from ground_station.mapping.refinement import refine
 from ground_station.mapping.refinement.refine import refine_map
 from ground_station.mapping.settings import RefineSettings
 from ground_station.mapping.sfm import adjustment
@@ -42,6 +43,20 @@ def test_a_flight_makes_landmarks_and_poses_better(world):
     )
     assert len(mine) >= 5 and np.median(now) < 0.6 * np.median(was)
     assert result.report["flights"][0]["frames"] == len(mine)
+
+
+def test_the_loss_is_as_wide_as_the_noise_that_the_build_found(world, monkeypatch):
+    losses, adjust = [], refine.adjust
+
+    def noted(graph, map_, settings, on_round):
+        losses.append(settings.sfm.loss_px)
+        return adjust(graph, map_, settings, on_round)
+
+    monkeypatch.setattr(refine, "adjust", noted)
+    info = dataclasses.replace(world.map.info, built={"images": 8, "noise_px": 0.3})
+    store.save_tables(world.folder, dataclasses.replace(world.map, info=info))
+    refine_map(world.folder, [], SETTINGS)
+    assert losses == [0.3] != [SETTINGS.sfm.loss_px]
 
 
 def test_a_registration_stays_where_it_was(world):
