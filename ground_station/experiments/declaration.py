@@ -69,7 +69,7 @@ class Alteration:
     )
     dark_s: float = config.key(0.0, "for so long; 0: never", unit="s", low=0.0, high=3600)
     landmarks: float = config.key(
-        1.0, "share of the map's landmarks that is there, chosen by coverage", low=0.01, high=1.0
+        1.0, "share of the map's landmarks that is there, drawn at random", low=0.01, high=1.0
     )
 
 

@@ -16,7 +16,7 @@ ROOMS = {
     "run": ("experiments/measure.py", "experiments/alter.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
             "map/accuracy.py", "map/uncertainty.py", "experiments/thinning.py",
-            "experiments/viewpoints.py", "features", "geometry", "recording"),
+            "features", "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""
 

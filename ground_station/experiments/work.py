@@ -70,7 +70,7 @@ def _run(job: RunJob, store: Store, data: Path) -> None:
     flight = flown(job.flight, recording, data)
     map_ = maps.load(store.map(job.map_key))
     if job.alter.landmarks < 1:
-        from ground_station.experiments.thinning import choose, subset
+        from ground_station.experiments.thinning import drawn
 
-        map_ = subset(map_, choose(map_, round(job.alter.landmarks * len(map_.landmarks))))
+        map_ = drawn(map_, job.alter.landmarks, job.seed)
     store.write(job.key, measure(map_, flight, job.alter, job.settings, job.seed))
