@@ -73,11 +73,6 @@ def compensation(image: bytes) -> int:
     return word(image, _CONFIG) >> 8
 
 
-def was_reset(image: bytes) -> bool:
-    """Whether the reset indicator is still set: no driver has set the gauge up."""
-    return bool(word(image, _STATUS) & 0x0100)
-
-
 def write(path: Path, volts: float, percentage: float, rate_per_h: float = 0.0) -> None:
     """Writes a register file again, as if the cell had been taken out and put in again."""
     path.write_bytes(registers(volts, percentage, rate_per_h))

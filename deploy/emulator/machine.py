@@ -11,7 +11,6 @@ QEMU 10's `raspi3b` and what it is missing, as far as it shows here:
 
 from __future__ import annotations
 
-import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -132,23 +131,6 @@ class Machine:
             self._process.kill()
             self._process.wait(_CUT_LIMIT_S)
             self._process = None
-
-    def wait_line(self, pattern: str, limit_s: float) -> str:
-        """The first line of the serial log that `pattern` is found in; see `wait`."""
-        expression = re.compile(pattern)
-
-        def look() -> str | None:
-            return next((line for line in self._lines() if expression.search(line)), None)
-
-        return self.wait(look, limit_s, f"a line with '{pattern}'")
-
-    def wait_off(self, limit_s: float) -> None:
-        """Waits until the board has powered off or asked to be reset."""
-        deadline = time.monotonic() + limit_s
-        while self.running:
-            if time.monotonic() > deadline:
-                raise DeployError(f"the board is still on after {limit_s:g} s{self.tail()}")
-            time.sleep(_POLL_S)
 
     def wait(self, look: Callable[[], T | None], limit_s: float, what: str) -> T:
         """Waits until `look` gives something that is true, and returns it.
