@@ -162,12 +162,12 @@ def budget(args: argparse.Namespace) -> int:
     build = shipped_builds().named(args.build)
     if args.out is not None:
         output.make_folder(args.out)  # refused before anything is reckoned
-    margin = reckon(build, args.samples, args.seed)
+    margin = reckon(build)
     endurance_table, flights = tables.endurance_table(build, Wear())
     text = "\n\n".join([
         f"{build.name}: {build.about}", tables.mass_budget(build, margin).text(),
-        f"90 % of {margin.samples} drawn builds and days (seed {margin.seed}) have"
-        f" {margin.low_g:+.0f} to {margin.high_g:+.0f} g; {100 * margin.positive_share:.1f} % fly",
+        f"90 % of such builds and days have {margin.low_g:+.0f} to {margin.high_g:+.0f} g;"
+        f" {100 * margin.positive_share:.1f} % fly",
         endurance_table.text(), tables.answers(build).text(),
     ])  # fmt: skip
     print(text)

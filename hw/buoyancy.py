@@ -1,12 +1,10 @@
-"""Lift and margin with their uncertainty: linear propagation, and Monte Carlo beside it."""
+"""Lift and margin with their uncertainty, propagated linearly."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-
-import numpy as np
+from statistics import NormalDist
 
 from hw.builds import Build, Conditions
 from hw.quantities import RANGES, checked
@@ -52,7 +50,8 @@ class Margin:
     """A build's margin, g, and how sure it is.
 
     `parts_sigma_g` is what each uncertain input adds to `sigma_g` (their squares sum to its
-    square), largest first. `low_g`, `high_g` hold 90 % of the samples.
+    square), largest first. `low_g`, `high_g` hold 90 % of builds and days, `positive_share` of them
+    fly, if the margin is normal.
     """
 
     gross_g: float
@@ -60,13 +59,9 @@ class Margin:
     margin_g: float
     sigma_g: float
     parts_sigma_g: dict[str, float]
-    sampled_mean_g: float
-    sampled_sigma_g: float
     low_g: float
     high_g: float
     positive_share: float
-    samples: int
-    seed: int
 
 
 def sigmas(build: Build) -> dict[str, float]:
@@ -115,48 +110,12 @@ def _mass_spreads(build: Build) -> dict[str, float]:
     return spreads
 
 
-def sampled_margins_g(build: Build, samples: int, seed: int) -> np.ndarray:
-    """Margins of `samples` days and builds drawn at random (samples,), normal in every input.
-
-    An input is held inside its range, a mass above 0. The seed gives the same draw again.
-    """
-    checked("samples", samples)
-    checked("seed", seed)
-    rng = np.random.default_rng(seed)
-    lift = _sampled_lift(build, samples, rng)
-    mass = np.full(samples, build.mass_g - math.fsum(i.mass_g for i in build.items if i.spread_g))
-    means: dict[str, float] = {}
-    for item in build.items:
-        means[item.name] = means.get(item.name, 0.0) + item.mass_g
-    for name, spread in _mass_spreads(build).items():
-        mass += np.maximum(rng.normal(means[name], spread, samples), 0.0)
-    return np.asarray(lift - mass)
-
-
-def _sampled_lift(build: Build, samples: int, rng: np.random.Generator) -> np.ndarray:
-    hull, day = build.hull, build.conditions
-    if hull.free_lift_g is not None:
-        return rng.normal(hull.free_lift_g, hull.free_lift_spread_g, samples)
-    sigma = hull.volume_sigma_percent / 100
-    volumes = hull.envelope.volume_m3 * np.maximum(rng.normal(1.0, sigma, samples), 1e-3)
-    draws = {
-        name: np.clip(rng.normal(getattr(day, name), day.sigma_of(name), samples), *RANGES[name])
-        for name in _sigmas_that_act(day)
-    }
-    one: Callable[[int], float] = lambda k: lift_in(  # noqa: E731
-        replace(day, **{name: float(values[k]) for name, values in draws.items()}), 1.0
-    )
-    per_m3 = np.array([one(k) for k in range(samples)]) if draws else np.full(samples, one(0))
-    return np.asarray(volumes * per_m3)
-
-
-def reckon(build: Build, samples: int = 2000, seed: int = 0) -> Margin:
-    """Everything about a build's margin; both ways of its uncertainty stand in the result."""
-    parts = sigmas(build)
-    drawn = sampled_margins_g(build, samples, seed)
-    low, high = np.percentile(drawn, [5, 95])
+def reckon(build: Build) -> Margin:
+    """Everything about a build's margin."""
+    parts, margin = sigmas(build), margin_g(build)
+    sigma = math.hypot(*parts.values())
+    spread = NormalDist(margin, max(sigma, 1e-9))
     return Margin(
-        gross_of(build), build.mass_g, margin_g(build), math.hypot(*parts.values()), parts,
-        float(drawn.mean()), float(drawn.std()), float(low), float(high),
-        float((drawn > 0).mean()), samples, seed,
+        gross_of(build), build.mass_g, margin, sigma, parts, spread.inv_cdf(0.05),
+        spread.inv_cdf(0.95), 1 - spread.cdf(0),
     )  # fmt: skip

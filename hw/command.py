@@ -101,8 +101,6 @@ def parser() -> argparse.ArgumentParser:
                   "budget --out out/budget")  # fmt: skip
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder for table, plots and numbers")
     sub.add_argument("--write-readme", action="store_true", help="renew hw/README.md and drawings")
-    sub.add_argument("--samples", dest="samples", type=int, default=2000, help="Monte Carlo's")
-    sub.add_argument("--seed", dest="seed", type=int, default=0, help="Monte Carlo's")
     sub = command("wiring", "the wiring of a build as SVG", "wiring --out out/wiring.svg")
     sub.add_argument("--out", type=Path, metavar="F.svg", help="file (default: standard output)")
     return result

@@ -38,8 +38,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "cutoff_V": (2.5, 4.0),
     "health_percent": (10.0, 100.0),
     "reserve_percent": (0.0, 90.0),
-    "samples": (100, 1_000_000),
-    "seed": (0, 2**63 - 1),
 }
 """Smallest and largest value that is taken, both included."""
 

@@ -63,7 +63,6 @@ def test_the_thesiss_numbers_as_a_user_types_them() -> None:
         ("buoyancy --solve battery --required-g 500", "for the cell; allowed: above 0"),
         ("endurance --health-percent 0", "health_percent is 0; allowed: 10 to 100 %"),
         ("endurance --capacity-mah -1", "capacity_mAh is -1; allowed: 50 to 20000 mAh"),
-        ("budget --samples 3", "samples is 3; allowed: 100 to"),
         ("budget --out /dev/null/none", "/dev/null/none: Not a directory"),
         ("fly", "invalid choice: 'fly'"),
         ("", "required: COMMAND"),
@@ -92,7 +91,7 @@ def test_lift_comes_with_leak_and_margin(
 def test_the_default_budget_is_positive_and_leaves_table_plots_and_numbers(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert main(["budget", "--samples", "100", "--out", str(tmp_path / "budget")]) == 0
+    assert main(["budget", "--out", str(tmp_path / "budget")]) == 0
     out = capsys.readouterr().out
     assert "margin" in out and "stream" in out
     made = sorted(path.name for path in (tmp_path / "budget").iterdir())
@@ -113,7 +112,7 @@ def test_a_build_that_is_too_heavy_ends_with_status_1(
     heavy = tmp_path / "builds.toml"
     heavy.write_text(BUILDS_FILE.read_text().replace("diameter_m = 1.0775", "diameter_m = 0.9"))
     monkeypatch.setattr(answering, "shipped_builds", lambda: load_builds(heavy))
-    assert main(["budget", "--samples", "100"]) == 1
+    assert main(["budget"]) == 1
     out, err = capsys.readouterr()
     assert "does not climb" in out
     assert err.count("\n") == 1 and err.startswith("the margin is -") and "above 0" in err
