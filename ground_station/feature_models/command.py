@@ -31,7 +31,7 @@ torch.save and safetensors. Nothing in a file is executed. Models lie in $BLIMP_
 _QUANTIZE_EXAMPLE = """\
 examples:
   blimp models quantize superpoint --calibrate flight.mcap
-  blimp models quantize superpoint --calibrate frames/ --to fp16 --name superpoint-half
+  blimp models quantize superpoint --calibrate frames/ --name superpoint-small
 
 Of the frames every second calibrates; with the others and warps of them the accuracy is measured:
 the share of mutual nearest matches within 3 px. The new model is another one by name and sha256,
@@ -60,13 +60,14 @@ def add_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     bring.add_argument("weights", metavar="FILE", help=".pth of torch.save, or .safetensors")
     bring.add_argument("--name", help="of the model (default: the network's)")
     bring.add_argument("--licence", help="of the weights (default: the one of those published)")
-    small = add("quantize", "Makes a smaller and faster form of a model.", _QUANTIZE_EXAMPLE)
+    small = add(
+        "quantize", "Makes a model smaller and faster: int8.", _QUANTIZE_EXAMPLE
+    )
     small.add_argument("model", metavar="NAME", help="an fp32 model, see `blimp models list`")
     small.add_argument(
         "--calibrate", required=True, metavar="INPUT", help="recording, video or folder of images"
     )
-    small.add_argument("--to", choices=("int8", "fp16"), default="int8", help="default: int8")
-    small.add_argument("--name", help="of the new model (default: NAME-int8 or NAME-fp16)")
+    small.add_argument("--name", help="of the new model (default: NAME-int8)")
     small.add_argument("--range", metavar="A:B[:S]", help="frames A up to B, every S-th")
     small.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
     small.add_argument("--frames", type=int, default=32, help="taken, evenly over it (default 32)")
@@ -148,17 +149,17 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     ):
         if not low <= value <= high:
             raise FeatureError(f"{option} is {value}; allowed: {low} to {high}")
-    name = args.name or f"{args.model}-{args.to}"
+    name = args.name or f"{args.model}-int8"
     extractors.check_free(name)
     if name in catalogue.names():
         raise FeatureError(f"there is a model '{name}' already; choose another --name")
     reference = catalogue.find(args.model)
-    quantize.check(reference, args.to)
+    quantize.check(reference)
     wanted = parse_range(args.range) if args.range else None
     images = comparison.evenly(open_input(args.calibrate, args.rate_hz, wanted), args.frames)
     if len(images) < 2:
         raise FeatureError(f"{args.calibrate}: {len(images)} frames; at least 2 are needed")
-    data, info = quantize.variant(reference, args.to, images[::2], name)
+    data, info = quantize.int8(reference, images[::2], name)
     made = Model(catalogue.path_for(name), info, data, hashlib.sha256(data).hexdigest())
     result = comparison.compare(reference, made, images[1::2], args.threads, args.seed)
     described = _described(importer.add(data, info))
@@ -195,7 +196,7 @@ def _document(result: Comparison, args: argparse.Namespace) -> dict[str, Any]:
         "time_ratio": result.time_ratio,
     }
     rows = (("fp32", result.reference, result.reference_ms),
-            (args.to, result.variant, result.variant_ms))  # fmt: skip
+            ("int8", result.variant, result.variant_ms))  # fmt: skip
     for key, matching, ms in rows:
         document[key] = {
             "accuracy_3px": matching.accuracy,

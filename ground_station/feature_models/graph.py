@@ -79,9 +79,8 @@ class Graph:
         bias: Array | None = None,
         stride: int = 1,
         padding: int | None = None,
-        groups: int = 1,
     ) -> str:
-        """Cross-correlation with weight (out, in / groups, height, width) and bias (out,).
+        """Cross-correlation with weight (out, in, height, width) and bias (out,).
 
         `padding` is zeros on each side; None keeps the size at stride 1 (odd kernels).
         """
@@ -97,7 +96,6 @@ class Graph:
             kernel_shape=[high, wide],
             strides=[stride, stride],
             pads=pads,
-            group=groups,
         )
 
     def scale_shift(self, x: str, scale: Array, shift: Array) -> str:
@@ -118,15 +116,9 @@ class Graph:
         """1 / (1 + exp(-x))."""
         return self.node("Sigmoid", [x])
 
-    def max_pool(self, x: str, size: int, stride: int | None = None) -> str:
-        """The largest of each window, without padding; windows do not overlap unless `stride`."""
-        stride = stride or size
-        return self.node("MaxPool", [x], kernel_shape=[size] * 2, strides=[stride] * 2)
-
-    def average_pool(self, x: str, size: int, stride: int | None = None) -> str:
-        """The mean of each window, without padding; windows do not overlap unless `stride`."""
-        stride = stride or size
-        return self.node("AveragePool", [x], kernel_shape=[size] * 2, strides=[stride] * 2)
+    def max_pool(self, x: str, size: int) -> str:
+        """The largest of each window, without padding; windows do not overlap."""
+        return self.node("MaxPool", [x], kernel_shape=[size] * 2, strides=[size] * 2)
 
     def add(self, first: str, second: str) -> str:
         """The sum, element by element."""
@@ -146,15 +138,6 @@ class Graph:
             mode="linear",
             coordinate_transformation_mode="align_corners" if align_corners else "half_pixel",
         )
-
-    def space_to_depth(self, x: str, size: int) -> str:
-        """Blocks of size² pixels to channels: pixel (row, column) of input channel c becomes
-        channel (row · size + column) · C + c. With one channel that is torch's pixel_unshuffle."""
-        return self.node("SpaceToDepth", [x], blocksize=size)
-
-    def depth_to_space(self, x: str, size: int) -> str:
-        """Channels to blocks: channel c · size² + row · size + column, as torch's pixel_shuffle."""
-        return self.node("DepthToSpace", [x], blocksize=size, mode="CRD")
 
     def l2_normalize(self, x: str) -> str:
         """Each pixel's vector divided by its length, or by 1e-12 where that is shorter."""

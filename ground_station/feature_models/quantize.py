@@ -1,4 +1,4 @@
-"""Smaller forms of a model: int8, calibrated on pictures of the user's, and fp16 weights."""
+"""A smaller form of a model: int8, calibrated on pictures of the user's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 from onnxruntime.quantization import (
     CalibrationDataReader,
     CalibrationMethod,
@@ -25,38 +25,31 @@ from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model, ModelInfo
 from ground_station.features.padding import padded
 
-KINDS = ("int8", "fp16")
-
 _OPERATORS = ["Conv", "Relu", "Clip", "MaxPool", "AveragePool", "Add", "Concat", "Resize"]
 """Those that onnxruntime's CPU runs on integers; what stands between others stays float."""
 _READY = ("onnx.quant.pre_process", "onnxruntime.quant")
 """Says to the quantizer that nothing is left to fold: our graphs are built folded."""
-_FEW_VALUES = 64
 _LONGEST_ORIGIN = 180
 """Of the characters that `ModelInfo` allows a source."""
 
 
-def variant(model: Model, kind: str, images: Sequence[U8], name: str) -> tuple[bytes, ModelInfo]:
-    """The file of a model in another form, with its own name, and what it is.
+def int8(model: Model, images: Sequence[U8], name: str) -> tuple[bytes, ModelInfo]:
+    """The file of a model in int8, with its own name, and what it is.
 
-    `images` (H, W) uint8 calibrate int8: static, per channel of the weights, unsigned activations,
+    `images` (H, W) uint8 calibrate it: static, per channel of the weights, unsigned activations,
     with the range that each had at most (Jacob et al., CVPR 2018). The last convolutions of the
     detector, and at low resolution of the descriptors, stay float: rounding there makes ties.
-    fp16 halves the file only: the weights are widened when the model is loaded. Raises
-    `FeatureError`.
+    Raises `FeatureError`.
     """
-    proto = check(model, kind)
-    changed = _int8(proto, model.info, images) if kind == "int8" else _fp16(proto, model.info)
+    changed = _int8(check(model), model.info, images)
     origin = model.info.source[:_LONGEST_ORIGIN]
-    source = f"{origin}; {kind} of {model.info.name} {model.sha256[:16]}"
+    source = f"{origin}; int8 of {model.info.name} {model.sha256[:16]}"
     info = replace(model.info, name=name, source=source)
     return serialized(changed, info), info
 
 
-def check(model: Model, kind: str) -> onnx.ModelProto:
-    """The graph of a model that can take this form; raises `FeatureError` for another."""
-    if kind not in KINDS:
-        raise FeatureError(f"there is no form '{kind:.40}' (known: {', '.join(KINDS)})")
+def check(model: Model) -> onnx.ModelProto:
+    """The graph of an fp32 model; raises `FeatureError` for another."""
     proto = onnx.load_model_from_string(model.data)
     if any(node.op_type in ("QuantizeLinear", "Cast") for node in proto.graph.node):
         raise FeatureError(f"{model.path}: the model '{model.info.name}' is no fp32 model")
@@ -120,22 +113,3 @@ def _last(graph: onnx.GraphProto, output: str) -> Iterator[str]:
         yield node.name
         if node.op_type not in ("Conv", "ConvTranspose", "MatMul"):
             open_ends.extend(node.input)
-
-
-def _fp16(proto: onnx.ModelProto, info: ModelInfo) -> onnx.ModelProto:
-    casts = []
-    for tensor in proto.graph.initializer:
-        values = numpy_helper.to_array(tensor)
-        if values.dtype != np.float32 or values.size < _FEW_VALUES:
-            continue
-        if np.abs(values).max() > np.finfo(np.float16).max:
-            raise FeatureError(f"{info.name}: the weights {tensor.name:.40} exceed fp16's range")
-        name = tensor.name
-        tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.fp16"))
-        casts.append(
-            helper.make_node("Cast", [tensor.name], [name], f"{name}.cast", to=TensorProto.FLOAT)
-        )
-    nodes = [*casts, *proto.graph.node]
-    del proto.graph.node[:]
-    proto.graph.node.extend(nodes)
-    return proto

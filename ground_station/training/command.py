@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of the command; imports nothing heavy."""
     parser.epilog = _EXAMPLE
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--size", default="wren", help="wren (default) or superpoint")
+    parser.add_argument("--size", default="wren", help="wren (default)")
     parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")
     parser.add_argument("--resume", action="store_true", help="go on where this folder stands")
     parser.add_argument(

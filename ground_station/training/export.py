@@ -11,7 +11,7 @@ from ground_station.feature_models import scale
 from ground_station.feature_models.graph import Graph, fold_batch_norm
 from ground_station.features.model_info import ModelInfo
 from ground_station.training.errors import TrainingError
-from ground_station.training.topology import LOGITS, Conv, Shape, layers
+from ground_station.training.topology import LOGITS, Conv, Shape
 
 EPSILON = 1e-5
 """Of the batch normalisations, in training and where they are folded."""
@@ -37,19 +37,6 @@ def info(shape: Shape, source: str) -> ModelInfo:
         threshold=THRESHOLD,
         subpixel_px=SUBPIXEL_PX,
     )
-
-
-def folded(shape: Shape, weights: Weights) -> dict[str, F32]:
-    """`LAYER.weight` (out, in, k, k) and `LAYER.bias` (out,) of all layers, in their order.
-
-    Batch normalisations are folded into the convolutions before them: of SuperPoint's size this is
-    Magic Leap's layout. Raises `TrainingError` as `export`.
-    """
-    result: dict[str, F32] = {}
-    for layer in layers(shape):
-        weight, bias = _folded(layer, weights)
-        result |= {f"{layer.name}.weight": weight, f"{layer.name}.bias": bias}
-    return result
 
 
 def _folded(layer: Conv, weights: Weights) -> tuple[F32, F32]:
@@ -89,9 +76,6 @@ class _OnnxOperations:
 
     def concat(self, first: str, second: str) -> str:
         return self._graph.concat([first, second])
-
-    def half(self, x: str) -> str:
-        return self._graph.max_pool(x, 2)
 
     def double(self, x: str) -> str:
         return self._graph.resize_bilinear(x, 2)

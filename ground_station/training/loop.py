@@ -28,9 +28,9 @@ from ground_station.progress import Progress
 from ground_station.training import checkpoint, corpus, curve, teacher, validation
 from ground_station.training.batches import batches
 from ground_station.training.errors import TrainingError
-from ground_station.training.export import export, folded
+from ground_station.training.export import export
 from ground_station.training.losses import Losses
-from ground_station.training.network import FeatureNetwork, write_weights
+from ground_station.training.network import FeatureNetwork
 from ground_station.training.pairs import Pair, PairSource
 from ground_station.training.recipe import Recipe, finite, is_due, pairs_seen
 from ground_station.training.trainer import Trainer
@@ -86,9 +86,8 @@ def train(
 ) -> dict[str, Any]:
     """Runs a recipe in a folder and returns the last figures.
 
-    The folder then holds `checkpoints/`, `log.jsonl`, `curve.png` and the model's file, of
-    SuperPoint's size also its weights in Magic Leap's layout. Raises `TrainingError` where it holds
-    a run already and `resume` is not set, or another recipe's.
+    The folder then holds `checkpoints/`, `log.jsonl`, `curve.png` and the model's file. Raises
+    `TrainingError` where it holds a run already and `resume` is not set, or another recipe's.
     """
     device = machine.chosen()
     torch.set_num_threads(machine.threads)
@@ -241,8 +240,6 @@ class _Run:
         source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs; teacher ALIKE, BSD-3"
         weights, shape = self.trainer.weights(), self.trainer.shape
         export(shape, weights, self.model, source)
-        if shape.importable:
-            write_weights(self.model.with_suffix(".pth"), folded(shape, weights))
         network = Network(model.read(self.model), threads=self.machine.threads)
         self.compare(network)
         extractor = CellFeatures(network, _MOST_POINTS, LearnedSettings())

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import io
-from collections import OrderedDict
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ground_station import files
 from ground_station.training.export import EPSILON, Weights
 from ground_station.training.topology import Conv, Shape, layers
 
@@ -53,9 +49,6 @@ class _TorchOperations:
     def concat(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.cat([first, second], dim=1)
 
-    def half(self, x: Tensor) -> Tensor:
-        return functional.max_pool2d(x, 2)
-
     def double(self, x: Tensor) -> Tensor:
         return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
@@ -93,14 +86,3 @@ def exported(shape: Shape, state: Mapping[str, Tensor]) -> Weights:
             tensor = state[f"{key}.{torchs}"]
             result[f"{layer.name}.{ours}"] = tensor.detach().float().cpu().contiguous().numpy()
     return result
-
-
-def write_weights(path: Path, weights: Weights) -> None:
-    """Arrays by name as torch's format of 2018, in which Magic Leap's file is.
-
-    Raises `GroundStationError` with one line when the disk refuses.
-    """
-    state = OrderedDict((name, torch.from_numpy(array.copy())) for name, array in weights.items())
-    data = io.BytesIO()
-    torch.save(state, data, _use_new_zipfile_serialization=False)
-    files.write_bytes(path, data.getvalue())

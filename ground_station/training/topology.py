@@ -1,4 +1,4 @@
-"""The networks' shapes, written once: torch trains them, ONNX carries them, a counter counts them.
+"""The networks' shapes, written once: torch trains them, ONNX carries them.
 
 Each is a function over some `Operations`, which say what a convolution or a sum is to them.
 """
@@ -46,9 +46,6 @@ class Operations(Protocol):
     def concat(self, first: Any, second: Any) -> Any:
         """Channels after channels."""
 
-    def half(self, x: Any) -> Any:
-        """The largest of each 2x2 pixels."""
-
     def double(self, x: Any) -> Any:
         """Twice the size, bilinear, pixel centres at half numbers."""
 
@@ -64,8 +61,6 @@ class Shape:
     dimension: int
     multiple: int
     build: Callable[[Operations, Any], tuple[Any, Any]]
-    importable: bool = False
-    """Its weights, folded, are what `blimp models import` knows: Magic Leap's names and shapes."""
 
 
 def _wren(o: Operations, image: Any) -> tuple[Any, Any]:
@@ -95,24 +90,8 @@ def _wren(o: Operations, image: Any) -> tuple[Any, Any]:
     return logits, o.conv(Conv("descriptor.out", 128, 64, 1, norm=False), y)
 
 
-def _superpoint(o: Operations, image: Any) -> tuple[Any, Any]:
-    """DeTone et al., "SuperPoint", CVPR-W 2018, section 3; normalised while it is trained."""
-    x, a = image, 1
-    for stage, b in enumerate((64, 64, 128, 128), 1):
-        for half in "ab":
-            x = o.relu(o.conv(Conv(f"conv{stage}{half}", a, b), x))
-            a = b
-        if stage < 4:
-            x = o.half(x)
-    y = o.relu(o.conv(Conv("convPa", 128, 256), x))
-    logits = o.conv(Conv("convPb", 256, LOGITS, 1, norm=False), y)
-    y = o.relu(o.conv(Conv("convDa", 128, 256), x))
-    return logits, o.conv(Conv("convDb", 256, 256, 1, norm=False), y)
-
-
 SHAPES = {
     "wren": Shape("wren", 64, 16, _wren),
-    "superpoint": Shape("wren-superpoint", 256, 8, _superpoint, importable=True),
 }
 
 
@@ -123,45 +102,30 @@ def shape_of(size: str) -> Shape:
     return SHAPES[size]
 
 
-class _Counter:
-    """Operations on (rows, columns) that only remember the layers and count their products."""
+class _Listing:
+    """Operations that only remember the layers."""
 
     def __init__(self) -> None:
         self.layers: list[Conv] = []
-        self.macs = 0
 
-    def conv(self, layer: Conv, x: tuple[int, int]) -> tuple[int, int]:
+    def conv(self, layer: Conv, x: None) -> None:
         self.layers.append(layer)
-        rows, columns = x[0] // layer.stride, x[1] // layer.stride
-        per_pixel = layer.channels_in * layer.channels_out * layer.size**2
-        self.macs += rows * columns * per_pixel
-        return rows, columns
 
-    def relu(self, x: tuple[int, int]) -> tuple[int, int]:
-        return x
+    def relu(self, x: None) -> None:
+        return None
 
-    def add(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
-        return first
+    def add(self, first: None, second: None) -> None:
+        return None
 
-    def concat(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
-        return first
+    def concat(self, first: None, second: None) -> None:
+        return None
 
-    def half(self, x: tuple[int, int]) -> tuple[int, int]:
-        return x[0] // 2, x[1] // 2
-
-    def double(self, x: tuple[int, int]) -> tuple[int, int]:
-        return x[0] * 2, x[1] * 2
+    def double(self, x: None) -> None:
+        return None
 
 
 def layers(shape: Shape) -> tuple[Conv, ...]:
     """The convolutions in the order in which they run."""
-    counter = _Counter()
-    shape.build(counter, (0, 0))
-    return tuple(counter.layers)
-
-
-def multiply_adds(shape: Shape, rows: int, columns: int) -> int:
-    """Products of all convolutions for one picture, biases and sums not counted."""
-    counter = _Counter()
-    shape.build(counter, (rows, columns))
-    return counter.macs
+    listing = _Listing()
+    shape.build(listing, None)
+    return tuple(listing.layers)

@@ -1,23 +1,23 @@
 """The networks' shapes and the file that training leaves: what it costs, and that it runs."""
 
+import cv2
 import numpy as np
 import onnx
 import pytest
-import torch_files
 import training_models
 
-from ground_station.feature_models import images, importer
+from ground_station.feature_models import images
 from ground_station.features import model
 from ground_station.features.cells import CellFeatures
 from ground_station.features.inference import Network
 from ground_station.features.settings import LearnedSettings
 from ground_station.training import export
 from ground_station.training.errors import TrainingError
-from ground_station.training.topology import SHAPES, multiply_adds, shape_of
+from ground_station.training.topology import SHAPES, shape_of
 
 
 def counted(path, rows: int, columns: int) -> int:
-    """Products of the file's convolutions, from its own shapes: another reckoning than ours."""
+    """Products of the file's convolutions, from its own shapes."""
     proto = onnx.load(str(path))
     for axis, size in ((0, 1), (2, rows), (3, columns)):
         proto.graph.input[0].type.tensor_type.shape.dim[axis].dim_value = size
@@ -37,19 +37,13 @@ def counted(path, rows: int, columns: int) -> int:
     return total
 
 
-@pytest.mark.parametrize("size", sorted(SHAPES))
-def test_the_file_costs_what_the_shape_says(tmp_path, size):
-    shape = SHAPES[size]
-    path = tmp_path / f"{size}.onnx"
+def test_what_ships_is_small(tmp_path):
+    shape = SHAPES["wren"]
+    path = tmp_path / "wren.onnx"
     export.export(shape, training_models.weights(shape), path, "a test")
-    macs = multiply_adds(shape, 480, 640)
-    assert counted(path, 480, 640) == macs
-    if size == "wren":  # what ships: the bounds of its issue
-        assert macs <= 1.5e9
-        assert path.stat().st_size <= 2_000_000
-        assert 64 <= shape.dimension <= 128
-    else:  # 26 GMAC, as SuperPoint
-        assert macs == pytest.approx(26e9, rel=0.01)
+    assert 0 < counted(path, 480, 640) <= 1.5e9
+    assert path.stat().st_size <= 2_000_000
+    assert 64 <= shape.dimension <= 128
 
 
 def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
@@ -70,36 +64,19 @@ def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
 
 def test_normalisation_is_folded_into_the_weights(tmp_path):
     """The graph against the network reckoned layer by layer in numpy, on a small picture."""
-    shape = SHAPES["superpoint"]
+    shape = SHAPES["wren"]
     weights = training_models.weights(shape, seed=2)
-    path = tmp_path / "sp.onnx"
+    path = tmp_path / "wren.onnx"
     export.export(shape, weights, path, "a test")
-    picture = np.random.default_rng(0).random((1, 1, 16, 24)).astype(np.float32)
+    picture = np.random.default_rng(0).random((1, 1, 32, 48)).astype(np.float32)
     said = Network(model.read(path)).run(picture)
     logits, descriptors = shape.build(Reference(weights), picture[0].astype(np.float64))
     assert said["logits"][0] == pytest.approx(logits, abs=1e-3)
     assert said["descriptors"][0] == pytest.approx(descriptors, abs=1e-3)
 
 
-def test_superpoints_size_comes_in_again_as_magic_leaps_file(tmp_path, monkeypatch):
-    """Trained and folded, written as torch.save of 2018 did, imported: the network that it was."""
-    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
-    shape = SHAPES["superpoint"]
-    weights = training_models.weights(shape, seed=3)
-    assert [name for name, s in SHAPES.items() if s.importable] == ["superpoint"]
-    export.export(shape, weights, tmp_path / "own.onnx", "a test")
-    (tmp_path / "own.pth").write_bytes(torch_files.legacy_of(export.folded(shape, weights)))
-    brought = importer.import_weights(tmp_path / "own.pth", None)
-    assert brought.info.name == "superpoint"
-    picture = np.random.default_rng(1).random((1, 1, 64, 96)).astype(np.float32)
-    said, own = (Network(m).run(picture) for m in (brought, model.read(tmp_path / "own.onnx")))
-    for name in ("logits", "descriptors"):
-        assert said[name].shape[2:] == (8, 12)
-        assert said[name] == pytest.approx(own[name], abs=1e-5 * float(np.abs(own[name]).max()))
-
-
 class Reference:
-    """The operations that SuperPoint's shape needs, plainly, in float64."""
+    """The operations that the shape needs, plainly, in float64."""
 
     def __init__(self, weights):
         self.weights = weights
@@ -108,6 +85,7 @@ class Reference:
         pad = layer.size // 2
         x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
         windows = np.lib.stride_tricks.sliding_window_view(x, (layer.size,) * 2, axis=(1, 2))
+        windows = windows[:, :: layer.stride, :: layer.stride]
         y = np.einsum("chwij,ocij->ohw", windows, self.weights[f"{layer.name}.weight"])
         if not layer.norm:
             return y + self.weights[f"{layer.name}.bias"][:, None, None]
@@ -120,9 +98,15 @@ class Reference:
     def relu(self, x):
         return np.maximum(x, 0)
 
-    def half(self, x):
-        c, h, w = x.shape
-        return x.reshape(c, h // 2, 2, w // 2, 2).max(axis=(2, 4))
+    def add(self, first, second):
+        return first + second
+
+    def concat(self, first, second):
+        return np.concatenate([first, second])
+
+    def double(self, x):
+        size = (2 * x.shape[2], 2 * x.shape[1])
+        return np.stack([cv2.resize(channel, size) for channel in x])
 
 
 def test_wrong_weights_and_sizes_are_refused_by_name(tmp_path):
@@ -135,5 +119,5 @@ def test_wrong_weights_and_sizes_are_refused_by_name(tmp_path):
     with pytest.raises(TrainingError, match=r"'stem\.1\.weight' is \(16, 1, 2, 3\)"):
         export.export(shape, weights, tmp_path / "x.onnx", "a test")
     assert not (tmp_path / "x.onnx").exists()
-    with pytest.raises(TrainingError, match="size is 'tiny'; there are: wren, superpoint"):
+    with pytest.raises(TrainingError, match="size is 'tiny'; there are: wren"):
         shape_of("tiny")

@@ -62,7 +62,7 @@ def test_the_rate_goes_up_stays_and_ends_at_nought_wherever_it_branches_off():
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"size": "huge"}, "size is 'huge'; there are: wren, superpoint"),
+        ({"size": "huge"}, "size is 'huge'; there are: wren"),
         ({"rate": float("nan")}, "rate is nan; allowed: 1e-07 to 1"),
         ({"batch": 0}, "batch is 0; allowed: 1 to 4096"),
         ({"columns": 100}, "multiples of 16"),
@@ -241,8 +241,7 @@ def test_a_branch_ends_a_run_from_any_checkpoint(made, straight, tmp_path):
     assert log[-1]["rate"] < TINY.rate / 2
 
 
-@pytest.mark.parametrize("size", ["wren", "superpoint"])
-def test_the_file_says_what_torch_says(torch, tmp_path, size):
+def test_the_file_says_what_torch_says(torch, tmp_path):
     from ground_station.features import model
     from ground_station.features.inference import Network
     from ground_station.training import export
@@ -250,41 +249,20 @@ def test_the_file_says_what_torch_says(torch, tmp_path, size):
     from ground_station.training.topology import SHAPES
 
     torch.manual_seed(1)
-    network = FeatureNetwork(SHAPES[size])
+    network = FeatureNetwork(SHAPES["wren"])
     image = torch.rand(2, 1, 64, 96)
     for _ in range(3):  # so that the normalisations have seen something
         network(image)
     network.eval()
     path = tmp_path / "x.onnx"
-    export.export(SHAPES[size], exported(SHAPES[size], network.state_dict()), path, "a test")
+    shape = SHAPES["wren"]
+    export.export(shape, exported(shape, network.state_dict()), path, "a test")
     said = Network(model.read(path)).run(image.numpy())
     with torch.no_grad():
         wanted = network(image)
     for name, ours in zip(("logits", "descriptors"), wanted, strict=True):
         scale = max(1.0, float(ours.abs().max()))
         assert np.abs(said[name] - ours.numpy()).max() <= 1e-4 * scale
-
-
-def test_weights_of_superpoints_size_are_a_file_that_the_import_takes(
-    torch, made, tmp_path, monkeypatch
-):
-    """torch writes it, our own reader of torch's files brings it in, and it is the same network."""
-    from ground_station.feature_models import importer
-    from ground_station.features import model
-    from ground_station.features.inference import Network
-
-    monkeypatch.setenv("BLIMP_MODELS", str(tmp_path / "models"))
-    run = tmp_path / "run"
-    train(made, run, replace(TINY, size="superpoint", steps=2, warm_up=0, decay=1))
-    own, brought = (
-        Network(m).run(np.full((1, 1, 32, 48), 0.5, np.float32))
-        for m in (
-            model.read(run / "wren-superpoint.onnx"),
-            importer.import_weights(run / "wren-superpoint.pth", None),
-        )
-    )
-    for name, value in own.items():
-        assert value == pytest.approx(brought[name], abs=1e-5 * float(np.abs(value).max()))
 
 
 def test_the_losses_are_least_where_they_should_be(torch):
