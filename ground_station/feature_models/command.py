@@ -60,9 +60,7 @@ def add_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     bring.add_argument("weights", metavar="FILE", help=".pth of torch.save, or .safetensors")
     bring.add_argument("--name", help="of the model (default: the network's)")
     bring.add_argument("--licence", help="of the weights (default: the one of those published)")
-    small = add(
-        "quantize", "Makes a model smaller and faster: int8.", _QUANTIZE_EXAMPLE
-    )
+    small = add("quantize", "Makes a model smaller and faster: int8.", _QUANTIZE_EXAMPLE)
     small.add_argument("model", metavar="NAME", help="an fp32 model, see `blimp models list`")
     small.add_argument(
         "--calibrate", required=True, metavar="INPUT", help="recording, video or folder of images"

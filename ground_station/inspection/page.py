@@ -16,14 +16,13 @@ from markupsafe import Markup
 from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.inspection import scripts, tables
-from ground_station.inspection.comparison import Comparison
 from ground_station.inspection.localizability import LocalizabilityMap
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.store import Map
 from ground_station.map.summary import describe, figures, sigma
 from ground_station.presentation.pages import data_uri, write_page
 
-MOST_POINTS, MOST_CAMERAS, MOST_FLIGHT = 150_000, 4_000, 4_000
+MOST_POINTS, MOST_CAMERAS = 150_000, 4_000
 """Of more, one in so many is drawn: a browser's graphics memory, and the file's size."""
 
 _TEMPLATE = Path(__file__).parent / "web" / "map.html"
@@ -52,13 +51,7 @@ class Array:
         return cls(name, kind, Markup(base64.b64encode(data).decode("ascii")))
 
 
-def write(
-    path: str | Path,
-    map_: Map,
-    plan: FloorPlan | None,
-    found: LocalizabilityMap,
-    compared: Comparison | None = None,
-) -> None:
+def write(path: str | Path, map_: Map, plan: FloorPlan | None, found: LocalizabilityMap) -> None:
     """Writes the page of a map whose z is up; raises `GroundStationError` when the disk refuses."""
     document = describe(map_)
     step = {
@@ -77,13 +70,12 @@ def write(
         script=Markup(script),
         policy=scripts.policy(script),
         figures=_figures(map_, plan, found, bounds, scale),
-        arrays=_arrays(map_, found, compared, step, scale),
+        arrays=_arrays(map_, found, step, scale),
         plan_picture=_picture(plan) if plan is not None else None,
         headings=[round(value) for value in found.heading_deg.tolist()],
         thinned=tables.thinned(step),
         found=found,
         lost=tables.lost(found, map_.info.registered),
-        compared=tables.compared(compared),
         structure=tables.structure(figures(map_), map_.info.registered),
         about=tables.about(document, map_),
         registration=tables.registration(map_.info),
@@ -180,13 +172,7 @@ def _picture(plan: FloorPlan) -> str:
     return data_uri("png", cv2.imencode(".png", image)[1].tobytes())
 
 
-def _arrays(
-    map_: Map,
-    found: LocalizabilityMap,
-    compared: Comparison | None,
-    step: dict[str, int],
-    scale: float,
-) -> list[Array]:
+def _arrays(map_: Map, found: LocalizabilityMap, step: dict[str, int], scale: float) -> list[Array]:
     lm = map_.landmarks
     wTc = map_.keyframes.wTc[:: step["keyframes"]]
     some = slice(None, None, step["landmarks"])
@@ -204,8 +190,4 @@ def _arrays(
         "cell-sigma": scale * p.sigma_m,
         "cell-turn": p.sigma_deg,
     }
-    if compared is not None:
-        part = slice(None, None, _step(len(compared.error_m), MOST_FLIGHT))
-        arrays["flight-place"] = scale * compared.truth.position_m[part]
-        arrays["flight-error"] = scale * compared.error_m[part]
     return [Array.of(name, values) for name, values in arrays.items()]

@@ -61,19 +61,11 @@ class Predictor:
         self._root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
         """Of each landmark's covariance (M, 3, 3): it times its transpose."""
 
-    def poses(self, wTc: npt.ArrayLike) -> Prediction:
-        """Of cameras at N poses (N, 4, 4)."""
-        T = np.asarray(wTc, np.float64).reshape(-1, 4, 4)
-        rows = [self._at(pose[:3, 3], pose[None, :3, :3]) for pose in T]
-        return self._prediction(np.array(rows).reshape(-1, 3))
-
     def places(self, position_m: npt.ArrayLike, wRc: npt.ArrayLike) -> Prediction:
         """Of cameras at N places (N, 3), each turned to H rotations (H, 3, 3): arrays (N, H)."""
         places, R = np.asarray(position_m, np.float64).reshape(-1, 3), np.asarray(wRc, np.float64)
         rows = [self._at(place, R) for place in places]
-        return self._prediction(np.array(rows).reshape(len(places), len(R), 3))
-
-    def _prediction(self, table: F64) -> Prediction:
+        table = np.array(rows).reshape(len(places), len(R), 3)
         return Prediction(table[..., 0], table[..., 1], table[..., 2], self.needs)
 
     def _at(self, position_m: F64, wRc: F64) -> F64:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ground_station.arrays import F64
-from ground_station.inspection.comparison import Comparison
 from ground_station.inspection.localizability import LocalizabilityMap
 from ground_station.map.store import Map, MapInfo
+from ground_station.presentation.text import flat
 
 Rows = list[tuple[str, str]]
 
@@ -120,15 +120,7 @@ def _list(table: dict[str, Any], name: str) -> list[Any]:
 
 def built(info: MapInfo) -> Rows:
     """Inputs, times and settings of the build, nested names joined by dots."""
-    return list(_flat(info.built, ""))
-
-
-def _flat(table: dict[str, Any], above: str) -> Any:
-    for name, value in table.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}", _plain(value)
+    return [(name, _plain(value)) for name, value in flat(info.built).items()]
 
 
 def _plain(value: Any) -> str:
@@ -160,24 +152,4 @@ def lost(found: LocalizabilityMap, registered: bool) -> Rows:
         ("places lost in some heading", f"{100 * s['places_lost_in_some_heading']:.1f} %"),
         ("places lost in every heading", f"{100 * s['places_lost_in_every_heading']:.1f} %"),
         ("standard deviation elsewhere, median", elsewhere),
-    ]
-
-
-def compared(comparison: Comparison | None) -> Rows:
-    """How well prediction and flight agree."""
-    if comparison is None:
-        return []
-    s = comparison.summary()
-    return [
-        ("frames", f"{s['frames']}, {s['localized']} of them localized"),
-        ("lost, of which predicted", f"{s['frames'] - s['localized']}, {s['lost_and_predicted']}"),
-        ("predicted lost", f"{s['predicted_lost']}"),
-        *(
-            (words, "–" if s[name] is None else f"{s[name]:.2f}")
-            for name, words in (
-                ("rank_correlation", "rank correlation of prediction and error"),
-                ("rank_correlation_of_localized", "of frames that were localized only"),
-                ("rank_correlation_per_second", "of each second's medians"),
-            )
-        ),
     ]

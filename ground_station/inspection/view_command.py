@@ -10,7 +10,6 @@ from ground_station.files import write_json
 from ground_station.map.table import print_table
 
 if TYPE_CHECKING:
-    from ground_station.geometry.trajectory import Trajectory
     from ground_station.map.store import Map
 
 HELP = "Shows a map, and how well a camera is placed where in it, on one HTML page."
@@ -19,11 +18,9 @@ EXAMPLE = """\
 examples:
   blimp map view maps/atrium --out out/atrium.html --open
   blimp map view maps/atrium --out out/atrium.html --cell-m 0.5 --headings 12 --height-m 2.5
-  blimp map view maps/atrium --out out/flight.html --compare est.txt truth.txt --json out/rank.json
 
 The page needs no network and no server. Its localizability map says, for a grid of places and
-headings, how many landmarks a camera is expected to find and how well they fix its pose.
---compare EST TRUTH also draws a flight and says how well prediction and error agree in rank."""
+headings, how many landmarks a camera is expected to find and how well they fix its pose."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,10 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--headings", type=int, default=8, metavar="N", help="at each place, 1 to 36 (default 8)"
     )
-    parser.add_argument(
-        "--compare", nargs=2, metavar=("EST", "TRUTH"),
-        help="a flight: its estimated poses and a true one for each frame; TUM text, or recordings",
-    )  # fmt: skip
     parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
 
 
@@ -51,7 +44,6 @@ def run(args: argparse.Namespace) -> int:
     """Writes the page; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import InputError
     from ground_station.inspection import page
-    from ground_station.inspection.comparison import compare
     from ground_station.inspection.localizability import localizability, plan_of
     from ground_station.map.levelling import levelled
     from ground_station.map.store import load
@@ -64,20 +56,13 @@ def run(args: argparse.Namespace) -> int:
     found = localizability(
         upright, plan, cell_m=args.cell_m, height_m=args.height_m, headings=args.headings
     )
-    compared = None
-    if args.compare:
-        estimate, truth = (_trajectory(Path(p), k == 1) for k, p in enumerate(args.compare))
-        compared = compare(map_, estimate, truth)
-    page.write(args.out, upright, plan, found, compared)
-    document = {"localizability": found.summary()}
-    if compared is not None:
-        document["compared"] = compared.summary()
-    document = {name: _own_lengths(table, map_) for name, table in document.items()}
-    print_table(document["localizability"] | document.get("compared", {}))
+    page.write(args.out, upright, plan, found)
+    figures = _own_lengths(found.summary(), map_)
+    print_table(figures)
     if map_.info.units != "m":
         print("lengths are in the map's own units: it has no metres before blimp map register")
     if args.json:
-        write_json(args.json, document)
+        write_json(args.json, {"localizability": figures})
     print(args.out)
     if args.open:
         import webbrowser
@@ -91,13 +76,3 @@ def _own_lengths(table: dict[str, Any], map_: Map) -> dict[str, Any]:
     if map_.info.units == "m":
         return table
     return {name.removesuffix("_m"): value for name, value in table.items()}
-
-
-def _trajectory(path: Path, is_truth: bool) -> Trajectory:
-    from ground_station.geometry.trajectory import read_tum
-    from ground_station.recording.flight import trajectory_of
-    from pi_firmware.wire.recording import ESTIMATE_TOPIC, TRUTH_TOPIC
-
-    if path.suffix.lower() != ".mcap":
-        return read_tum(path)
-    return trajectory_of(path, TRUTH_TOPIC if is_truth else ESTIMATE_TOPIC)

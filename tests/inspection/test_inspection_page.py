@@ -10,12 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rooms_map import looking, two_rooms
+from rooms_map import two_rooms
 
 from ground_station.errors import GroundStationError
-from ground_station.geometry.trajectory import Trajectory
 from ground_station.inspection import page, scripts, view_command
-from ground_station.inspection.comparison import compare
 from ground_station.inspection.localizability import localizability
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
@@ -32,7 +30,7 @@ OF_THE_BROWSER = ("GL Driver Message", "willReadFrequently", "GPU stall")
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A registered map with plan and flight, and one without a world; names are hostile."""
+    """A registered map with a plan, and one without a world; names are hostile."""
     folder = tmp_path_factory.mktemp("pages")
     map_ = two_rooms()
     map_.info.name = HOSTILE
@@ -41,11 +39,7 @@ def pages(tmp_path_factory):
     image = np.full((60, 120), 254, np.uint8)
     image[:3] = image[-3:] = image[:, 58:62] = 0
     plan = FloorPlan(image, 0.1, (0.0, 0.0, 0.0))
-    wTc = np.array([looking([1 + 0.1 * k, 3.0, 1.5], 3.0 * k) for k in range(40)])
-    truth = Trajectory.from_poses(np.arange(40) * 33_000_000, wTc)
-    estimate = Trajectory.from_poses(truth.time_ns[:20], wTc[:20])
-    flown = compare(map_, estimate, truth)
-    page.write(folder / "world.html", map_, plan, localizability(map_, plan), flown)
+    page.write(folder / "world.html", map_, plan, localizability(map_, plan))
     loose = two_rooms(registered=False)
     loose.landmarks.position_m *= 1e-3  # any scale is a map's right before it is registered
     loose.keyframes.wTc[:, :3, 3] *= 1e-3
@@ -194,8 +188,3 @@ def test_the_command_writes_page_and_figures(built, tmp_path, capsys):
     assert not [name for name in figures if name.endswith("_m")] and "_m " not in said
     with pytest.raises(GroundStationError, match="its folder does not exist"):
         view_command.run(parser.parse_args([shown[0], "--out", str(tmp_path / "a" / "b.html")]))
-    flight = ["--compare", str(tmp_path / "est.txt"), str(tmp_path / "truth.txt")]
-    (tmp_path / "est.txt").write_text("0 0 0 0 0 0 0 1\n")
-    (tmp_path / "truth.txt").write_text("0 0 0 0 0 0 0 1\n")
-    with pytest.raises(GroundStationError, match="is not registered"):
-        view_command.run(parser.parse_args([*shown, *flight]))

@@ -1,5 +1,5 @@
 // @ts-check
-/** The map from above: floor plan, localizability, landmarks, keyframes and a flight. */
+/** The map from above: floor plan, localizability, landmarks and keyframes. */
 import { colourAt, css, length } from "./colours.js";
 import { canvasById, fitCanvas, watchBox } from "./dom.js";
 import { listen } from "./gestures.js";
@@ -23,10 +23,9 @@ export class TopView {
     this.points = array("point");
     this.place = array("camera-place");
     this.turn = array("camera-heading");
-    this.flight = { place: array("flight-place"), error: array("flight-error") };
     this.name = "sigma";
     this.choice = "worst";
-    this.shows = { layer: true, landmarks: true, keyframes: true, flight: true };
+    this.shows = { layer: true, landmarks: true, keyframes: true };
     this.is_fitted = true;
     this.asked = false;
     /** @type {HTMLCanvasElement|null} */
@@ -91,7 +90,6 @@ export class TopView {
     if (this.shows.layer) this.drawLayer(c);
     if (this.shows.landmarks) this.drawLandmarks(c);
     if (this.shows.keyframes) this.drawKeyframes(c);
-    if (this.shows.flight) this.drawFlight(c);
     this.drawScale(c);
   }
 
@@ -178,29 +176,6 @@ export class TopView {
     }
     this.label(c, at[0], "first");
     if (count > 1) this.label(c, at[count - 1], "last");
-  }
-
-  /** @param {CanvasRenderingContext2D} c */
-  drawFlight(c) {
-    const { place, error } = this.flight;
-    const { theme, view } = this;
-    for (let k = 0; k < error.length; k += 1) {
-      const [x, y] = view.toScreen(place[3 * k], place[3 * k + 1]);
-      const is_lost = !Number.isFinite(error[k]);
-      c.strokeStyle = c.fillStyle = theme.colour(is_lost ? "lost" : "ink");
-      c.lineWidth = 1.5;
-      c.beginPath();
-      if (is_lost) {
-        c.moveTo(x - 3, y - 3);
-        c.lineTo(x + 3, y + 3);
-        c.moveTo(x + 3, y - 3);
-        c.lineTo(x - 3, y + 3);
-        c.stroke();
-      } else {
-        c.arc(x, y, 1.8, 0, 2 * Math.PI);
-        c.fill();
-      }
-    }
   }
 
   /** @param {CanvasRenderingContext2D} c @param {number[]} at @param {string} words */
