@@ -9,18 +9,24 @@ import dataclasses
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
 
 from deploy.errors import DeployError
 
 BOARDS_FOLDER = Path(__file__).parents[1] / "boards"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9+.-]*")
+_KEYS = ConfigDict(extra="forbid")
+
+Text = Annotated[str, Field(min_length=1)]
+Texts = Annotated[tuple[Text, ...], Field(min_length=1)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_KEYS)
 class Archive:
     """A signed archive of packages.
 
@@ -33,27 +39,27 @@ class Archive:
         only: name patterns of the packages that may come from it, which it then wins; empty: any.
     """
 
-    name: str
+    name: Text
     url: str
-    suites: tuple[str, ...]
-    components: tuple[str, ...]
-    keyring: str
-    origin: str
-    only: tuple[str, ...] = ()
+    suites: Texts
+    components: Texts
+    keyring: Text
+    origin: Text
+    only: tuple[Text, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_KEYS)
 class Group:
     """Packages, or patterns of paths, that stand there for one reason.
 
     Of path patterns, one that starts with `!` takes back what one before it left out.
     """
 
-    reason: str
-    names: tuple[str, ...]
+    reason: Text
+    names: Texts
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_KEYS)
 class KernelChoice:
     """The kernel's packages and what of them goes onto the card.
 
@@ -65,15 +71,15 @@ class KernelChoice:
         modules: names of the modules to take, with what they depend on; empty: all.
     """
 
-    package: str
-    image: str
-    firmware: tuple[str, ...]
-    dtbs: tuple[str, ...]
-    overlays: tuple[str, ...]
-    modules: tuple[str, ...]
+    package: Text
+    image: Text
+    dtbs: Texts
+    firmware: tuple[Text, ...] = ()
+    overlays: tuple[Text, ...] = ()
+    modules: tuple[Text, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_KEYS)
 class Wheel:
     """A distribution of `requirements.lock` that Debian has no package of.
 
@@ -83,12 +89,12 @@ class Wheel:
         portable: only its pure Python is taken, from a wheel of whatever platform.
     """
 
-    name: str
-    keep: tuple[str, ...] = ()
+    name: Text
+    keep: tuple[Text, ...] = ()
     portable: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_KEYS)
 class Board:
     """A board and everything of others that its card holds.
 
@@ -108,19 +114,29 @@ class Board:
         wheels: what is taken from the lock.
     """
 
-    name: str
-    title: str
-    architecture: str
-    machine: str
-    suite: str
-    python: str
-    base: str
-    archives: tuple[Archive, ...]
-    packages: tuple[Group, ...]
-    left_out: tuple[Group, ...]
-    kernel: KernelChoice | None
-    platforms: tuple[str, ...]
-    wheels: tuple[Wheel, ...]
+    name: Text
+    title: Text
+    architecture: Text
+    machine: Text
+    suite: Text
+    python: Text
+    platforms: Texts
+    base: str = ""
+    archives: tuple[Archive, ...] = ()
+    packages: tuple[Group, ...] = ()
+    left_out: tuple[Group, ...] = ()
+    kernel: KernelChoice | None = None
+    wheels: tuple[Wheel, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.kernel is None) == (not self.base):
+            raise ValueError("'kernel' stands exactly where no base image brings one")
+        for name in self.package_names:
+            if not _NAME.fullmatch(name):
+                raise ValueError(f"{name!r} is no package's name")
+        for name in (name for group in self.left_out for name in group.names):
+            if not name.removeprefix("!").startswith("/"):
+                raise ValueError(f"{name!r} is no absolute path")
 
     @property
     def package_names(self) -> tuple[str, ...]:
@@ -147,7 +163,10 @@ def load_board(name: str | Path) -> Board:
     for part in parts:
         for key, items in _document(path.parent / part).items():
             document[key] = [*items, *document.get(key, [])]
-    return _Reader(path, document).board()
+    try:
+        return Board(**document, name=path.stem)
+    except (ValidationError, TypeError) as error:
+        raise DeployError(f"{path}: {_first(error)}") from None
 
 
 def with_archives(board: Board, changes: Mapping[str, Mapping[str, str]]) -> Board:
@@ -184,109 +203,10 @@ def _document(path: Path) -> dict[str, Any]:
         raise DeployError(f"{path}: {error}") from None
 
 
-class _Reader:
-    """Turns a board's document into its record, and names what is wrong in it."""
-
-    def __init__(self, path: Path, document: dict[str, Any]) -> None:
-        self._path, self._document = path, document
-
-    def board(self) -> Board:
-        top = self._table(
-            self._document,
-            "",
-            texts=("title", "architecture", "machine", "suite", "python"),
-            optional_texts=("base",),
-            lists=("platforms",),
-            tables=("archives", "packages", "left_out", "kernel", "wheels"),
-        )
-        kernel = self._document.get("kernel")
-        if (kernel is None) == (not top["base"]):
-            raise self._wrong("kernel", "stands exactly where no base image brings one")
-        return Board(
-            name=self._path.stem,
-            archives=tuple(self._archive(*item) for item in self._items("archives")),
-            packages=tuple(self._group(*item, package=True) for item in self._items("packages")),
-            left_out=tuple(self._group(*item, package=False) for item in self._items("left_out")),
-            kernel=None if kernel is None else self._kernel(kernel),
-            wheels=tuple(self._wheel(*item) for item in self._items("wheels")),
-            **top,
-        )
-
-    def _archive(self, item: Any, where: str) -> Archive:
-        texts = ("name", "keyring", "origin")
-        return Archive(
-            **self._table(
-                item,
-                where,
-                texts=texts,
-                optional_texts=("url",),
-                lists=("suites", "components"),
-                optional_lists=("only",),
-            )
-        )
-
-    def _group(self, item: Any, where: str, *, package: bool) -> Group:
-        group = Group(**self._table(item, where, texts=("reason",), lists=("names",)))
-        for name in group.names:
-            if package and not _NAME.fullmatch(name):
-                raise self._wrong(f"{where}.names", f"{name!r} is no package's name")
-            if not package and not name.removeprefix("!").startswith("/"):
-                raise self._wrong(f"{where}.names", f"{name!r} is no absolute path")
-        return group
-
-    def _kernel(self, item: Any) -> KernelChoice:
-        lists = ("dtbs",)
-        optional = ("firmware", "overlays", "modules")
-        texts = ("package", "image")
-        return KernelChoice(
-            **self._table(item, "kernel", texts=texts, lists=lists, optional_lists=optional)
-        )
-
-    def _wheel(self, item: Any, where: str) -> Wheel:
-        portable = item.pop("portable", False) if isinstance(item, dict) else False
-        if not isinstance(portable, bool):
-            raise self._wrong(f"{where}.portable", "is true or false")
-        values = self._table(item, where, texts=("name",), optional_lists=("keep",))
-        return Wheel(portable=portable, **values)
-
-    def _items(self, key: str) -> list[tuple[Any, str]]:
-        items = self._document.get(key, [])
-        if not isinstance(items, list):
-            raise self._wrong(key, f"is written as [[{key}]]")
-        return [(item, f"{key}[{index}]") for index, item in enumerate(items)]
-
-    def _table(
-        self,
-        item: Any,
-        where: str,
-        *,
-        texts: tuple[str, ...] = (),
-        optional_texts: tuple[str, ...] = (),
-        lists: tuple[str, ...] = (),
-        optional_lists: tuple[str, ...] = (),
-        tables: tuple[str, ...] = (),
-    ) -> dict[str, Any]:
-        if not isinstance(item, dict):
-            raise self._wrong(where, "is a table")
-        prefix = f"{where}." if where else ""
-        known = (*texts, *optional_texts, *lists, *optional_lists)
-        for key in item:
-            if key not in (*known, *tables):
-                raise self._wrong(f"{prefix}{key}", f"unknown; there are {', '.join(known)}")
-        values: dict[str, Any] = {}
-        for key in (*texts, *optional_texts):
-            value = item.get(key, "" if key in optional_texts else None)
-            if not isinstance(value, str) or (key in texts and not value):
-                raise self._wrong(f"{prefix}{key}", "is a text")
-            values[key] = value
-        for key in (*lists, *optional_lists):
-            value = item.get(key, [] if key in optional_lists else None)
-            if not isinstance(value, list) or not all(isinstance(v, str) and v for v in value):
-                raise self._wrong(f"{prefix}{key}", "is a list of texts")
-            if key in lists and not value:
-                raise self._wrong(f"{prefix}{key}", "is empty")
-            values[key] = tuple(value)
-        return values
-
-    def _wrong(self, key: str, what: str) -> DeployError:
-        return DeployError(f"{self._path}: {key}: {what}")
+def _first(error: ValidationError | TypeError) -> str:
+    """The first thing that is wrong, with its key."""
+    if isinstance(error, TypeError):
+        return str(error)
+    first = error.errors()[0]
+    key = ".".join(map(str, first["loc"]))
+    return f"{key}: {first['msg']}" if key else first["msg"].removeprefix("Value error, ")
