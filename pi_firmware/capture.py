@@ -97,7 +97,7 @@ class Capture:
         media = self._media
         if media is None:
             return self._bitrate_kbps or self._settings.encoder.bitrate_kbps
-        return media.bitrate_kbps
+        return media.encoder.bitrate_kbps
 
     @property
     def cut_reason(self) -> str:
@@ -163,13 +163,13 @@ class Capture:
         """Makes the next frame an IDR."""
         media = self._media
         if media is not None:
-            media.force_idr()
+            media.encoder.force_idr()
 
     def set_bitrate(self, kbps: int) -> int:
         """Asks for a bit rate within the configured bounds; returns the one asked for."""
         media = self._media
         if media is not None:
-            return media.set_bitrate(kbps)
+            return media.encoder.set_bitrate(kbps)
         self._bitrate_kbps = kbps
         return kbps
 
@@ -177,13 +177,13 @@ class Capture:
         """Never more than this from now on, after restarts too; returns the one asked for now."""
         self._ceiling_kbps = kbps
         media = self._media
-        return media.limit_bitrate(kbps) if media is not None else kbps
+        return media.encoder.limit_bitrate(kbps) if media is not None else kbps
 
     def link_report(self, report: messages.LinkReport, corrections: float = 0.0) -> None:
         """What the ground saw of the link of late."""
         media = self._media
         if media is not None:
-            media.link_report(report, corrections)
+            media.encoder.link_report(report, corrections)
 
     def answered(self, sequence: int) -> None:
         """The ground is done with this frame and all before it."""
@@ -250,9 +250,9 @@ class Capture:
             raise
         self._source, self._media = source, media
         if self._ceiling_kbps is not None:
-            media.limit_bitrate(self._ceiling_kbps)
+            media.encoder.limit_bitrate(self._ceiling_kbps)
         if self._bitrate_kbps is not None:
-            media.set_bitrate(self._bitrate_kbps)
+            media.encoder.set_bitrate(self._bitrate_kbps)
 
     def _reopen(self) -> None:
         self._due_s = None
@@ -269,7 +269,7 @@ class Capture:
         if media is not None:
             stopped = media.stop()
             self._before += media.encoded
-            self._bitrate_kbps = media.bitrate_kbps
+            self._bitrate_kbps = media.encoder.bitrate_kbps
         if not stopped:
             raise UnrecoverableError("the video pipeline hangs and cannot be stopped")
         if source is not None:

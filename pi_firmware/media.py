@@ -21,7 +21,6 @@ from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
 from pi_firmware.wire import annexb, sei
 from pi_firmware.wire.errors import StreamError
-from pi_firmware.wire.messages import LinkReport
 from pi_firmware.wire.video import MAX_IDR_INTERVAL_NS
 
 _START_LIMIT_NS = 5_000_000_000
@@ -69,9 +68,10 @@ Leave = Callable[[Unit], bool]
 class Media:
     """Camera and encoder from their start to their end: `play`, look at `error` and `bus`, `stop`.
 
-    `decided` is called with each captured frame and the gate's verdict, on the camera's thread;
-    `leave` with each finished one, on the encoder's, and says whether it was sent. `counters` may
-    go on from an earlier one's. Raises `BlimpError` with one line for what cannot be built.
+    Bit rate and IDRs are the `encoder`'s. `decided` is called with each captured frame and the
+    gate's verdict, on the camera's thread; `leave` with each finished one, on the encoder's, and
+    says whether it was sent. `counters` may go on from an earlier one's. Raises `BlimpError` with
+    one line for what cannot be built.
     """
 
     def __init__(
@@ -153,27 +153,6 @@ class Media:
             if taken is not None:
                 self._discard(taken[0].sequence)
 
-    def set_bitrate(self, kbps: int) -> int:
-        """Asks the encoder for this bit rate, within the configured bounds; returns the one set."""
-        return self._encoder.set_bitrate(kbps)
-
-    def limit_bitrate(self, kbps: int) -> int:
-        """Holds the encoder to this bit rate from now on; returns the one now set."""
-        return self._encoder.limit_bitrate(kbps)
-
-    @property
-    def bitrate_kbps(self) -> int:
-        """The bit rate last asked for."""
-        return self._encoder.bitrate_kbps
-
-    def force_idr(self) -> None:
-        """Makes the next frame an IDR."""
-        self._encoder.force_idr()
-
-    def link_report(self, report: LinkReport, corrections: float = 0.0) -> None:
-        """What the ground saw of the link of late."""
-        self._encoder.link_report(report, corrections)
-
     def _build(self) -> Any:
         settings, source = self._settings, self._source
         encoding = encoder.description(
@@ -185,7 +164,7 @@ class Media:
             "! appsink name=encoded emit-signals=true sync=false async=false"
         )
         element = pipeline.get_by_name("encoder")
-        self._encoder = encoder.Encoder(element, settings.encoder, source.rate_hz)
+        self.encoder = encoder.Encoder(element, settings.encoder, source.rate_hz)
         luma = measuring.attach(pipeline, settings.camera, self._on_luma)
         pad, sink = element.get_static_pad("sink"), pipeline.get_by_name("encoded")
         probe = pad.add_probe(self._gst.PadProbeType.BUFFER, self._on_frame)
@@ -250,8 +229,8 @@ class Media:
         self._last_passed_ns = running_ns
         after_gap = gap_ns > max(1e9 * self._settings.gate.idr_after_s, 1.5 * period_ns)
         late = running_ns - self._last_idr_ns + period_ns / 2 > MAX_IDR_INTERVAL_NS
-        if self._encoder.next_is_due() or after_gap or late:
-            self._encoder.force_idr()
+        if self.encoder.next_is_due() or after_gap or late:
+            self.encoder.force_idr()
 
     def _on_encoded(self, sink: Any) -> Any:
         """On the encoder's thread: puts the frame's numbers into its access unit and sends it."""
@@ -265,7 +244,7 @@ class Media:
             idr = annexb.is_idr(access_unit)
             if idr:
                 self._last_idr_ns = running_ns
-                self._encoder.saw_idr()
+                self.encoder.saw_idr()
             for earlier in [ns for ns in list(self._in_encoder) if ns < running_ns]:
                 dropped, _ = self._in_encoder.pop(earlier)  # the encoder keeps the order
                 self._discard(dropped.sequence)
@@ -273,7 +252,7 @@ class Media:
             stamped = annexb.insert_before_slice(access_unit, sei.encode(info))
             self.encoded += 1
             clock_ns = self._pipeline.get_base_time() + running_ns
-            self._encoder.gave(clock_ns)
+            self.encoder.gave(clock_ns)
             if self._leave(Unit(info, stamped, clock_ns, idr)):
                 self.counters.sent += 1
             else:

@@ -195,11 +195,11 @@ class Payload:
 
     def _tell_battery(self, message: messages.Battery) -> None:
         self._supervision.table.beat(BATTERY)
-        self._telemetry.battery(message)
+        self._telemetry.publish(message)
 
     def _tell_autopilot(self, message: messages.Autopilot) -> None:
         self._supervision.table.beat(AUTOPILOT)
-        self._telemetry.autopilot(message)
+        self._telemetry.publish(message)
 
     def _on_pose(self, message: messages.Pose) -> None:
         self._capture.answered(message.sequence)

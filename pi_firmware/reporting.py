@@ -26,7 +26,7 @@ class Reporter:
     def gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
         """The gate's decision on a frame."""
         counters = self.counters
-        self._telemetry.gate(
+        self._telemetry.publish(
             messages.Gate(
                 time_ns=time.time_ns(),
                 capture_ns=info.time_ns,
@@ -59,6 +59,6 @@ class Reporter:
             "sent": counters.sent,
             "discarded": counters.discarded,
         }
-        self._telemetry.event(
+        self._telemetry.publish(
             messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values),
         )

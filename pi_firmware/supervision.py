@@ -103,7 +103,7 @@ class Supervision:
 
         def publish() -> None:
             self.wifi.step()
-            telemetry.health(self.health(capture, ground, recorder))
+            telemetry.publish(self.health(capture, ground, recorder))
             heard = TELEMETRY_DOWN if ground.seen is None else TELEMETRY_UP
             self._tell_systemd(f"{heard}; {ARMED}" if autopilot.armed else heard)
 

@@ -17,6 +17,13 @@ from pi_firmware.wire.telemetry import Session, open_session
 
 M = TypeVar("M", bound=messages.Message)
 _REFUSALS_LIMIT_S = 5.0
+_KINDS = {
+    messages.Battery: keys.BATTERY,
+    messages.Gate: keys.GATE,
+    messages.Event: keys.EVENT,
+    messages.Autopilot: keys.AUTOPILOT,
+    messages.Health: keys.HEALTH,
+}
 _HOST = re.compile(r"^[a-z]+/(\[[^\]]+\]|[^/:]+):\d+")
 
 Tap = Callable[[str, messages.Message], None]
@@ -65,7 +72,7 @@ class Telemetry:
             scout=settings.discover,
         )
         session = self._session.zenoh
-        for kind in (keys.BATTERY, keys.GATE, keys.EVENT, keys.AUTOPILOT, keys.HEALTH):
+        for kind in _KINDS.values():
             # Events are rare and must arrive; of the others a newer one follows at once.
             control = zenoh.CongestionControl
             self._publishers[kind] = session.declare_publisher(
@@ -85,25 +92,12 @@ class Telemetry:
         """Whether only a new session finds the ground station; see `Session.outdated`."""
         return self._session is not None and self._session.outdated
 
-    def battery(self, message: messages.Battery) -> None:
-        """Publishes a gauge's reading."""
-        self._put(keys.BATTERY, message)
-
-    def gate(self, message: messages.Gate) -> None:
-        """Publishes the gate's decision on one frame."""
-        self._put(keys.GATE, message)
-
-    def event(self, message: messages.Event) -> None:
-        """Publishes an event."""
-        self._put(keys.EVENT, message)
-
-    def autopilot(self, message: messages.Autopilot) -> None:
-        """Publishes the autopilot's state."""
-        self._put(keys.AUTOPILOT, message)
-
-    def health(self, message: messages.Health) -> None:
-        """Publishes how payload and board are."""
-        self._put(keys.HEALTH, message)
+    def publish(self, message: messages.Message) -> None:
+        """Publishes a message of one of the kinds that a payload tells."""
+        kind = _KINDS[type(message)]
+        self._tap(kind, message)
+        if self._session is not None:
+            self._publishers[kind].put(messages.encode(message))
 
     def on_pose(self, take: Callable[[messages.Pose], None]) -> None:
         """Calls `take` with each pose of this payload that the ground station publishes."""
@@ -202,8 +196,3 @@ class Telemetry:
                 self._commands.undeclare()
             self._session.close()
             self._session = None
-
-    def _put(self, kind: str, message: messages.Message) -> None:
-        self._tap(kind, message)
-        if self._session is not None:
-            self._publishers[kind].put(messages.encode(message))

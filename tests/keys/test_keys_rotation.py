@@ -39,7 +39,7 @@ def is_heard(listener: TelemetryListener, telemetry: Telemetry, voltage: float) 
     """Whether something that is said now arrives; it is said again until then."""
     deadline = time.monotonic() + LIMIT_S
     while time.monotonic() < deadline:
-        telemetry.battery(messages.Battery(time_ns=1, voltage=voltage))
+        telemetry.publish(messages.Battery(time_ns=1, voltage=voltage))
         if listener.wait(
             "blimp-1", lambda s: s.battery is not None and s.battery.voltage == voltage, 0.1
         ):

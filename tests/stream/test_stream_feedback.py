@@ -155,7 +155,7 @@ def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener
         "two": Video(5602, 99, Counters(packets=50)),  # a stream that is not the one of `two`
     }
     for name, ssrc in (("one", 11), ("two", 22), ("elsewhere", 33)):
-        ears[name].telemetry.gate(gate(10, ssrc))
+        ears[name].telemetry.publish(gate(10, ssrc))
         assert listener.wait(name, lambda s: s.alive and s.ssrc is not None, LIMIT_S)
     with Feedback(listener, videos.get, period_s=0.05):
         one = ears["one"].wait(lambda r: r.round_trip_s is not None)
@@ -167,7 +167,7 @@ def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener
         assert one.round_trip_s is not None and 0 <= one.round_trip_s < LIMIT_S
         assert abs(one.time_ns - time.time_ns()) < 60 * 10**9
         assert (two.video_port, two.ssrc, two.packets, two.lost) == (5602, None, 0, 0.0)
-        ears["two"].telemetry.gate(gate(11, 99))
+        ears["two"].telemetry.publish(gate(11, 99))
         assert ears["two"].wait(lambda r: r.ssrc == 99 and r.packets == 50)
     assert ears["elsewhere"].reports == []
     for ear in ears.values():
@@ -182,7 +182,7 @@ def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_men
         packets=92, packets_lost=1, packets_mended=4, packets_corrected=3, retransmissions=6
     )
     video = Video(5601, 11, counters, Flow(900.0, 0.0, 0.05, 40.0, 1.5))
-    ear.telemetry.gate(gate(10, 11))
+    ear.telemetry.publish(gate(10, 11))
     assert listener.wait("one", lambda s: s.alive and s.ssrc is not None, LIMIT_S)
     with Feedback(listener, lambda _: video, period_s=0.05):
         told = ear.wait(lambda report: report.packets_mended == 4)
@@ -191,7 +191,7 @@ def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_men
         assert told.corrects and (told.packets_corrected, told.answered, told.burst) == (3, 6, 1.5)
         # An older payload says nothing of it.
         assert video.told[0] is None and video.correction_ssrc is None
-        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=4711, correction_ssrc=4712))
+        ear.telemetry.publish(messages.Health(1, 1.0, rtx_ssrc=4711, correction_ssrc=4712))
         assert until(lambda: video.told[0] == 4711 and video.correction_ssrc == 4712)
         assert until(lambda: video.told[1] is not None)
         video.ssrc = 12  # a stream that is not the payload's own
@@ -301,8 +301,8 @@ def test_an_idr_is_asked_for_when_mending_failed_and_not_before(
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
         Feedback(listener, receiver.stream_of, period_s=0.05),
     ):
-        ear.telemetry.gate(gate(10, 5))
-        ear.telemetry.health(messages.Health(1, 1.0, rtx_ssrc=99))
+        ear.telemetry.publish(gate(10, 5))
+        ear.telemetry.publish(messages.Health(1, 1.0, rtx_ssrc=99))
         whole = len(packets([stamped(encoded(12)[0], 0)]))
         for number, datagram in enumerate(datagrams[: whole + 2]):
             sender.sendto(datagram, ("127.0.0.1", receiver.port))
@@ -330,7 +330,7 @@ def test_a_queue_is_told_at_once_to_who_takes_it_and_once_a_second_to_who_does_n
     ears = {name: Ear(listener, name) for name in ("newer", "older")}
     videos = {name: Video(ssrc=5, seen=Flow(900.0, 0.01, 0.0)) for name in ears}
     for name, ear in ears.items():
-        ear.telemetry.health(messages.Health(1, 1.0, early_reports=name == "newer"))
+        ear.telemetry.publish(messages.Health(1, 1.0, early_reports=name == "newer"))
         assert listener.wait(name, lambda s: s.alive and s.health is not None, LIMIT_S)
     with Feedback(listener, videos.get, period_s=1000.0):
         time.sleep(0.3)

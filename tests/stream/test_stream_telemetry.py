@@ -48,8 +48,8 @@ def test_a_payload_lives_from_its_start_to_its_end(listener: TelemetryListener) 
 
 def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
     one, two = payload(listener, "one"), payload(listener, "two")
-    one.battery(messages.Battery(time_ns=1, voltage=3.5))
-    two.battery(messages.Battery(time_ns=2, voltage=4.1))
+    one.publish(messages.Battery(time_ns=1, voltage=3.5))
+    two.publish(messages.Battery(time_ns=2, voltage=4.1))
     for payload_id, voltage in (("one", 3.5), ("two", 4.1)):
         state = listener.wait(payload_id, lambda s: s.battery is not None, LIMIT_S)
         assert state is not None and state.battery is not None
@@ -62,7 +62,7 @@ def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
 def test_an_autopilots_state_is_kept(listener: TelemetryListener) -> None:
     telemetry = payload(listener)
     sent = messages.Autopilot(time_ns=3, connected=True, armed=False, battery_V=3.9)
-    telemetry.autopilot(sent)
+    telemetry.publish(sent)
     state = listener.wait("blimp-1", lambda s: s.autopilot is not None, LIMIT_S)
     assert state is not None and state.autopilot == sent
     telemetry.close()
@@ -96,7 +96,7 @@ def test_discarded_frames_are_counted_and_none_of_an_older_payload() -> None:
 def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryListener) -> None:
     telemetry = payload(listener)
     for sequence in range(50):
-        telemetry.gate(gate(sequence, gated=sequence // 10))
+        telemetry.publish(gate(sequence, gated=sequence // 10))
     state = listener.wait("blimp-1", lambda s: len(s.decisions) == 50, LIMIT_S)
     assert state is not None
     assert state.frames == FrameCounts(captured=50, gated=4, heartbeats=0, sent=49)
@@ -106,8 +106,8 @@ def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryLi
 
 def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
     telemetry = payload(listener)
-    telemetry.gate(gate(5))
-    telemetry.event(messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again"))
+    telemetry.publish(gate(5))
+    telemetry.publish(messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again"))
     assert listener.wait_for_event("blimp-1", messages.EVENT_STARTED, LIMIT_S)
     state = listener.state("blimp-1")
     assert state is not None and state.decisions == {} and state.frames is None
@@ -119,7 +119,7 @@ def test_the_last_event_arrives_although_the_payload_ends_at_once(
 ) -> None:
     for number in range(8):
         telemetry = payload(listener, f"p{number}")
-        telemetry.event(messages.Event(time_ns=1, name=messages.EVENT_END_OF_STREAM, text=""))
+        telemetry.publish(messages.Event(time_ns=1, name=messages.EVENT_END_OF_STREAM, text=""))
         telemetry.close()
     for number in range(8):
         assert listener.wait_for_event(f"p{number}", messages.EVENT_END_OF_STREAM, LIMIT_S), number
@@ -188,7 +188,7 @@ def test_events_are_handed_on_as_they_come() -> None:
         on_event=lambda payload_id, event: heard.append((payload_id, event.name)),
     ) as listener:
         telemetry = payload(listener)
-        telemetry.event(messages.Event(time_ns=1, name="hello", text=""))
+        telemetry.publish(messages.Event(time_ns=1, name="hello", text=""))
         assert listener.wait_for_event("blimp-1", "hello", LIMIT_S)
         telemetry.close()
     assert heard == [("blimp-1", "hello")]

@@ -63,7 +63,7 @@ def test_a_payload_with_its_certificate_is_heard(authority: Authority) -> None:
         )
         telemetry = Telemetry("blimp-1", settings)
         assert listener.wait("blimp-1", lambda s: s.alive, LIMIT_S)
-        telemetry.battery(messages.Battery(time_ns=1, voltage=3.5))
+        telemetry.publish(messages.Battery(time_ns=1, voltage=3.5))
         assert listener.wait("blimp-1", lambda s: s.battery is not None, LIMIT_S)
         telemetry.close()
         assert listener.wait("blimp-1", lambda s: not s.alive, LIMIT_S)
