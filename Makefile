@@ -66,7 +66,7 @@ check: setup  ## Lint, formatting, types, and which room may import which
 
 hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="loss outage"
 	@if [ "$(PAYLOAD)" = image ]; then \
-	  sh deploy/packages.sh deploy/image/apt-packages.txt && sh deploy/emulator/tools.sh; fi
+	  sh deploy/packages.sh deploy/image/apt-packages.txt && sh tests/hil/image/tools.sh; fi
 	@.venv/bin/python tests/hil/suite.py $(CASES) --payload "$(or $(PAYLOAD),process)" $(OPTIONS)
 
 bench: setup  ## Measure localizer, payload and features: costs in ratios of one run, and errors

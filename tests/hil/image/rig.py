@@ -18,10 +18,11 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "stream"))
 
+import emulator_card as card
+import emulator_gauge as gauge
+from emulator_machine import HOST, Machine
 from receiving import Receiver
 
-from deploy.emulator import card, gauge
-from deploy.emulator.machine import HOST, Machine
 from deploy.errors import DeployError
 from deploy.run import run
 from ground_station.stream.assembly import ReceivedFrame

@@ -21,9 +21,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import emulator_card as card
+import emulator_gauge as gauge
 from rig import CHECKOUT, PAYLOAD, Figures, Rig, Up, program
 
-from deploy.emulator import card, gauge
 from deploy.run import need, run
 from ground_station.stream.telemetry import PayloadState
 from pi_firmware.wire.messages import Health
@@ -87,7 +88,7 @@ def image(figures: Figures) -> Path:
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory, image: Path, figures: Figures) -> Iterator[Rig]:
-    run(["sh", CHECKOUT / "deploy/emulator/tools.sh"], cwd=CHECKOUT)
+    run(["sh", CHECKOUT / "tests/hil/image/tools.sh"], cwd=CHECKOUT)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

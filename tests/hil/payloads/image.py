@@ -51,7 +51,7 @@ class ImagePayload:
         if not image.is_file():
             raise InputError(f"{image}: not there; `make image BOARD=qemu` builds it")
         if not EMULATOR.is_file():
-            raise InputError(f"{EMULATOR}: not there; `sh deploy/emulator/tools.sh` makes it")
+            raise InputError(f"{EMULATOR}: not there; `sh tests/hil/image/tools.sh` makes it")
         self._image, self._cache = image, cache
         self._stack = contextlib.ExitStack()
         self._ssh: SshPayload | None = None

@@ -1,6 +1,8 @@
 """A Raspberry Pi 3 in QEMU: power on, its serial line, power cut, power on again.
 
-QEMU 10's `raspi3b` and what it is missing, as far as it shows here:
+It is not the Pi's boot ROM and firmware (the kernel is handed over from the card's own boot
+partition), its encoder, its radio, its hardware watchdog, or its pace. QEMU 10's `raspi3b` and what
+it is missing, as far as it shows here:
 - its power controller answers no requests: the driver for it stays out, the one for watchdog and
   reset, which hangs on the same device, stays in, so that the board can reboot and power off;
 - its watchdog resets the board in the moment it is armed: systemd gets none to arm;
@@ -17,13 +19,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from deploy.emulator import gauge
-from deploy.emulator.card import Boot
+import emulator_gauge as gauge
+from emulator_card import Boot
+
 from deploy.errors import DeployError
 
 HOST = "10.0.2.2"
 """Where the board finds this computer."""
-QEMU = Path(__file__).resolve().parents[2] / "out/emulator/qemu-system-aarch64"
+QEMU = Path(__file__).resolve().parents[3] / "out/emulator/qemu-system-aarch64"
 _WORDS = "initcall_blacklist=bcm2835_power_driver_init systemd.watchdog_device=/dev/none panic=-1"
 _CONSOLE = "ttyAMA0,115200"
 # Named, QEMU puts no hub between, whose enumeration sometimes fails ("dwc2: Not connected").
@@ -42,7 +45,7 @@ class Machine:
         card: the card's image, its size a power of two; written to.
         boot: what its boot partition holds.
         folder: where the logs go: `serial-N.log` and `qemu-N.log` for the N-th power-on.
-        gauge_file: the gauge's registers (`deploy.emulator.gauge`); none: no gauge on the bus.
+        gauge_file: the gauge's registers (`emulator_gauge`); none: no gauge on the bus.
         forward: ports of this computer's loopback by the board's port they lead to, TCP.
         words: more for the kernel line.
         qemu: the program.
@@ -77,7 +80,7 @@ class Machine:
         if self.running:
             raise DeployError("the machine is on already")
         if not self._qemu.is_file():
-            raise DeployError(f"{self._qemu}: not there; `sh deploy/emulator/tools.sh` makes it")
+            raise DeployError(f"{self._qemu}: not there; `sh tests/hil/image/tools.sh` makes it")
         self.folder.mkdir(parents=True, exist_ok=True)
         self.power_ons += 1
         self.log.unlink(missing_ok=True)

@@ -4,9 +4,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import emulator_card as card
 import pytest
 
-from deploy.emulator import card
 from deploy.errors import DeployError
 from deploy.image.sparse import cut_out
 from deploy.run import find, run

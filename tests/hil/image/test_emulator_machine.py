@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from emulator_card import Boot
+from emulator_machine import Machine
 
-from deploy.emulator.card import Boot
-from deploy.emulator.machine import Machine
 from deploy.errors import DeployError
 
 BOARD = """#!/bin/sh

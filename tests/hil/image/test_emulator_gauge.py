@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+import emulator_gauge as gauge
 import pytest
 
-from deploy.emulator import gauge
 from deploy.errors import DeployError
 from pi_firmware.battery.bus import Counts, WordBus
 from pi_firmware.battery.chips.max17048 import Max17048

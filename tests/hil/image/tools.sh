@@ -2,12 +2,12 @@
 # Takes QEMU 10 of Debian 13 into out/emulator (earlier ones time out on the Pi's I2C), unpacked and
 # not installed: nothing of the system changes. Runs again in no time when nothing changed.
 set -eu
-cd "$(dirname "$0")/../.."
+cd "$(dirname "$0")/../../.."
 room=out/emulator
 say() { printf 'emulator: %s\n' "$*"; }
 die() { printf 'emulator: %s\n' "$*" >&2; exit 2; }
 
-stamp=$(sha256sum deploy/emulator/tools.sh | cut -d' ' -f1)
+stamp=$(sha256sum tests/hil/image/tools.sh | cut -d' ' -f1)
 if [ "$(cat "$room/.stamp" 2>/dev/null || true)" = "$stamp" ]; then exit 0; fi
 command -v mmdebstrap >/dev/null || die "needs mmdebstrap: sudo apt-get install mmdebstrap"
 
