@@ -182,7 +182,7 @@ def _flown(case: Any, payload: Any, out: Path) -> Any:
         counts = done.outcome.run.link_counts
         print("  packets: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
     for row in done.missed:
-        from ground_station.replay.cases.junit import told
+        from junit import told
 
         print(f"  MISSED {told(row)}")
     print(f"  {_state(done)}", flush=True)
@@ -201,7 +201,9 @@ def _state(done: Any) -> str:
 
 def _write(args: argparse.Namespace, done: list[Any], began: str, payload: str) -> None:
     """JUnit, JSON, the page and the table; runs of `--against` are shown beside."""
-    from ground_station.replay.cases import junit, page
+    import junit
+
+    from ground_station.replay.cases import page
     from ground_station.replay.cases.compare import compare
     from ground_station.replay.cases.outcome import read_outcome
     from pi_firmware.wire.errors import BlimpError

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
-import cases_stand as stand
+import junit
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_station.replay.cases import judge, junit
+from ground_station.replay.cases import judge
 from ground_station.replay.cases.judge import Judged
 from ground_station.replay.cases.limits import Limits
+
+sys.path.append(str(Path(__file__).parents[1] / "replay"))
+
+import cases_stand as stand
 
 BEGAN = "2026-03-14T10:00:00+00:00"
 
