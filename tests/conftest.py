@@ -16,6 +16,7 @@ from hypothesis import settings
 # As every program sets it: BLAS's own threads would spin against those of the tests beside them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.append(str(Path(__file__).with_name("stream")))  # for `receiving`, which many rooms need
+sys.path.append(str(Path(__file__).with_name("i2c")))  # for `simulated_gauges`
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")

@@ -1,6 +1,6 @@
 """I2C with bounded retries and counted errors: what the gauges' drivers speak through.
 
-The drivers use the calls of `smbus2.SMBus`, so that register-exact fakes can stand behind them.
+The drivers use the calls of `smbus2.SMBus`, so that a test's chips can stand behind them.
 Re-opening fixes a stale file handle and a driver that was bound again. Clocking a slave free that
 holds SDA low is the kernel's business (its bus recovery), not possible from here.
 """

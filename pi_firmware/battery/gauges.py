@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
-import time
 from collections.abc import Callable
 
 from pi_firmware import uri
-from pi_firmware.battery import chips, simulated
+from pi_firmware.battery import chips
 from pi_firmware.battery.bus import Counts, Smbus, WordBus
 from pi_firmware.battery.cell import Cell
 from pi_firmware.battery.chip import Chip, Gauge, Shunt
@@ -17,9 +16,8 @@ from pi_firmware.battery.fake import FakeGauge
 from pi_firmware.settings import BatterySettings
 
 WHAT = "battery.uri"
-_PATH = re.compile(r"([a-z0-9]+)@(\d{1,3}|fake):(0x[0-9a-fA-F]{1,2})")
+_PATH = re.compile(r"([a-z0-9]+)@(\d{1,3}):(0x[0-9a-fA-F]{1,2})")
 _SHUNT = ("shunt_ohm", "max_A", "discharge")
-_FAULTS = ("percentage", "load_A", "absent", "fail_every", "nonsense_every", "nonsense")
 
 
 def chips_known() -> dict[str, Chip]:
@@ -59,21 +57,17 @@ def _open_i2c(parsed: uri.Uri, settings: BatterySettings) -> Gauge:
         raise parsed.fail(
             f"expected i2c:CHIP@BUS:ADDRESS as i2c:ina219@1:0x40 (chips: {', '.join(known)})"
         )
-    name, bus, address = match[1], match[2], int(match[3], 16)
+    name, bus, address = match[1], int(match[2]), int(match[3], 16)
     chip = known[name]
     allowed = chip.addresses
     if address not in allowed:
         raise parsed.fail(
             f"address {address:#04x}; allowed for {name}: {allowed[0]:#04x} to {allowed[-1]:#04x}"
         )
-    parsed.only(*(_SHUNT if chip.shunt else ()), *(_FAULTS if bus == "fake" else ()))
+    parsed.only(*(_SHUNT if chip.shunt else ()))
     shunt = chip.shunt(parsed) if chip.shunt else Shunt()
     counts = Counts()
-    if bus == "fake":
-        fake = _fake_bus(parsed, name, address, shunt, cell_of(settings))
-        words = WordBus(lambda: fake, address, name, counts)
-    else:
-        words = WordBus(_opener(parsed, int(bus)), address, f"{name} on i2c-{bus}", counts)
+    words = WordBus(_opener(parsed, bus), address, f"{name} on i2c-{bus}", counts)
     try:
         return chip.open(words, shunt, counts, settings)
     except ValueError as error:
@@ -87,23 +81,3 @@ def _opener(parsed: uri.Uri, number: int) -> Callable[[], Smbus]:
     except ImportError:
         raise parsed.fail("needs the Python package smbus2, which is not installed") from None
     return lambda: smbus2.SMBus(number)
-
-
-def _fake_bus(
-    parsed: uri.Uri, chip: str, address: int, shunt: Shunt, cell: Cell
-) -> simulated.FlyingBus:
-    faults = simulated.Faults(
-        absent=bool(parsed.number("absent", 0, 0, 1)),
-        fail_every=int(parsed.number("fail_every", 0, 0, 1e6)),
-        nonsense_every=int(parsed.number("nonsense_every", 0, 0, 1e6)),
-        nonsense=int(parsed.number("nonsense", 0xFFFF, 0, 0xFFFF)),
-    )
-    return simulated.FlyingBus(
-        simulated.CHIPS[chip](),
-        address,
-        faults,
-        cell=simulated.SimulatedCell(cell, parsed.number("percentage", 1.0, 0.0, 1.0)),
-        discharge_a=parsed.number("load_A", 0.5 * cell.capacity_ah, 0.0, 100.0),
-        shunt=shunt,
-        clock=time.monotonic,
-    )

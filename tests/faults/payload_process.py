@@ -15,6 +15,7 @@ from pathlib import Path
 
 LIMIT_S = 30.0
 STOP_S = 5.0
+_I2C = Path(__file__).parents[1] / "i2c"
 _COUNTS = re.compile(r"(\d+) (captured|gated|sent|discarded)")
 
 
@@ -57,6 +58,7 @@ class PayloadProcess:
     """`python -m pi_firmware` with `--set` for each setting; a context manager that kills it.
 
     What it writes goes to files in `folder`, so that a talkative one never waits for a reader.
+    Gauges on I2C are those of `tests/i2c/smbus2.py`.
     `env` is added to the environment (LD_PRELOAD of a shim), `prefix` goes before the command
     (`unshare`, `nice`).
     """
@@ -80,7 +82,7 @@ class PayloadProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
-                env={**os.environ, **(env or {})},
+                env={**os.environ, "PYTHONPATH": str(_I2C), **(env or {})},
             )
 
     def __enter__(self) -> PayloadProcess:

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from flight import Account, Flight
 from ground import Ground
+from simulated_gauges import SimulatedCell
 
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.battery.gauges import cell_of
-from pi_firmware.battery.simulated import SimulatedCell
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages
 
@@ -21,15 +21,15 @@ PERIOD_S, FLIGHT_S = 0.1, 5.0
 READS = 5  # registers that an INA219 is asked for each time, after one at the start
 SMALL = ("camera.width_px=160", "camera.height_px=120", "camera.rate_hz=10")
 SETTINGS = BatterySettings()
-LOAD_A = 0.5 * SETTINGS.capacity_mAh / 1000  # the simulated chip's default
+LOAD_A = 0.5 * SETTINGS.capacity_mAh / 1000  # of each of the simulated buses
 GAUGES = {
-    "good": "i2c:ina219@fake:0x40",
-    "absent": "i2c:ina219@fake:0x40?absent=1",
-    "failing": "i2c:ina219@fake:0x40?fail_every=3",
-    "ina219-nonsense": "i2c:ina219@fake:0x40?nonsense_every=7&nonsense=65535",
-    "ina219-zeros": "i2c:ina219@fake:0x40?nonsense_every=9&nonsense=0",
-    "ina226-nonsense": "i2c:ina226@fake:0x40?nonsense_every=11&nonsense=65535",
-    "max17048-nonsense": "i2c:max17048@fake:0x36?nonsense_every=5&nonsense=65535",
+    "good": "i2c:ina219@90:0x40",
+    "absent": "i2c:ina219@91:0x40",
+    "failing": "i2c:ina219@92:0x40",
+    "ina219-nonsense": "i2c:ina219@94:0x40",
+    "ina219-zeros": "i2c:ina219@95:0x40",
+    "ina226-nonsense": "i2c:ina226@96:0x40",
+    "max17048-nonsense": "i2c:max17048@97:0x36",
 }
 
 

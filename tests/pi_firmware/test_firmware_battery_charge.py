@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import simulated_gauges as simulated
 
-from pi_firmware.battery import simulated
 from pi_firmware.battery.bus import Counts, WordBus
 from pi_firmware.battery.cell import Cell, Polarization
 from pi_firmware.battery.charge import ChargeFilter

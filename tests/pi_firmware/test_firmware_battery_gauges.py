@@ -4,11 +4,12 @@ import errno
 from collections.abc import Callable
 
 import pytest
+import simulated_gauges as simulated
 
 from pi_firmware import battery
-from pi_firmware.battery import simulated
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed, swap
 from pi_firmware.battery.chips import ina, max17048
+from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire.errors import SourceError
 
@@ -207,9 +208,10 @@ def test_another_chip_at_the_address_is_named() -> None:
         ("i2c:max17048@1:0x40", "allowed for max17048: 0x36 to 0x36"),
         ("i2c:max17048@1:0x36?shunt_ohm=0.1", "unknown option 'shunt_ohm'"),
         ("i2c:ina219@1:0x40?percentage=0.5", "unknown option 'percentage'"),
-        ("i2c:ina219@fake:0x40?shunt_ohm=0", "shunt_ohm is '0'"),
-        ("i2c:ina226@fake:0x40?max_A=2", "2 A through 0.1 ohm are 0.2 V; the chip measures up to"),
-        ("i2c:ina219@fake:0x40?discharge=up", "allowed: positive, negative"),
+        ("i2c:ina219@fake:0x40", "expected i2c:CHIP@BUS:ADDRESS"),
+        ("i2c:ina219@1:0x40?shunt_ohm=0", "shunt_ohm is '0'"),
+        ("i2c:ina226@1:0x40?max_A=2", "2 A through 0.1 ohm are 0.2 V; the chip measures up to"),
+        ("i2c:ina219@1:0x40?discharge=up", "allowed: positive, negative"),
     ],
 )
 def test_a_wrong_gauge_is_refused_in_one_line(text: str, named: str) -> None:
@@ -218,10 +220,19 @@ def test_a_wrong_gauge_is_refused_in_one_line(text: str, named: str) -> None:
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("chip", ["ina219@fake:0x40", "ina226@fake:0x41", "max17048@fake:0x36"])
-def test_the_drivers_run_on_a_simulated_cell_by_uri(chip: str) -> None:
-    gauge = battery.open_gauge(f"i2c:{chip}?percentage=0.5", BatterySettings(capacity_mAh=800))
+@pytest.mark.parametrize(
+    ("name", "address"), [("ina219", 0x40), ("ina226", 0x41), ("max17048", 0x36)]
+)
+def test_the_drivers_run_on_the_bus_that_the_uri_names(
+    name: str, address: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = BatterySettings(capacity_mAh=800)
+    flying = simulated.flying_bus(name, address, cell_of(settings), charge=0.5, load_a=0.4)
+    asked = []
+    monkeypatch.setattr("smbus2.SMBus", lambda number: asked.append(number) or flying)
+    gauge = battery.open_gauge(f"i2c:{name}@7:{address:#x}", settings)
     reading = gauge.read(NOW)
+    assert asked == [7]
     assert 3.5 < reading.voltage < 3.9
     assert reading.percentage == pytest.approx(0.5, abs=0.01) or reading.current == pytest.approx(
         -0.4, abs=0.001

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import simulated_gauges as simulated
 
 from pi_firmware import battery
 from pi_firmware.battery.bus import Counts, GaugeError
+from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings, EncoderSettings, load
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import ConfigError
@@ -85,7 +87,6 @@ def test_a_sag_of_a_moment_is_no_alarm_and_a_lasting_one_ends_the_flight_above_3
 
 
 def test_shutdown_comes_before_3_2_volts_under_load() -> None:
-    from pi_firmware.battery import simulated
     from pi_firmware.battery.bus import WordBus
     from pi_firmware.battery.cell import Cell
     from pi_firmware.battery.chips import ina
@@ -159,15 +160,27 @@ def test_charge_and_time_left_come_from_voltage_and_current() -> None:
     assert last.time_left_s is not None and 1500 < last.time_left_s < 5000
 
 
-@pytest.mark.parametrize("fault", ["fail_every=3", "nonsense_every=7", "absent=1"])
-def test_a_faulty_gauge_by_uri_never_lies(fault: str) -> None:
-    settings = BatterySettings(uri=f"i2c:ina219@fake:0x40?percentage=0.6&load_A=0.3&{fault}")
+@pytest.mark.parametrize(
+    "fault",
+    [
+        simulated.Faults(fail_every=3),
+        simulated.Faults(nonsense_every=7),
+        simulated.Faults(absent=True),
+    ],
+)
+def test_a_faulty_gauge_by_uri_never_lies(
+    fault: simulated.Faults, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = BatterySettings(uri="i2c:ina219@1:0x40")
+    cell = cell_of(settings)
+    flying = simulated.flying_bus("ina219", 0x40, cell, charge=0.6, load_a=0.3, faults=fault)
+    monkeypatch.setattr("smbus2.SMBus", lambda number: flying)
     watched = Watched(battery.open_gauge(settings.uri, settings), settings)
     watched.steps(30)
     assert all(3.6 < r.voltage < 3.9 and 0.4 < r.percentage < 0.8 for r in watched.said)
-    if fault.startswith("fail"):
+    if fault.fail_every:
         assert len(watched.said) == 30 and watched.said[-1].read_errors > 10
-    elif fault.startswith("nonsense"):
+    elif fault.nonsense_every:
         assert watched.said and watched.counts.refused > 0
     else:
         assert not watched.said and watched.events == [messages.EVENT_GAUGE_FAILED]
@@ -246,7 +259,7 @@ def test_a_payload_with_an_empty_battery_ends_in_order_and_then_runs_the_command
     settings = {
         "telemetry.enabled": "false",
         "camera.uri": "test:?pattern=ball",
-        "battery.uri": "i2c:ina219@fake:0x40?percentage=0.03",
+        "battery.uri": "fake:?percentage=0.03",
         "battery.period_s": "0.1",
         "battery.shutdown_command": str(command),
     }

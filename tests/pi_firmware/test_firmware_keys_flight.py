@@ -167,7 +167,7 @@ def test_an_empty_battery_ends_the_flight_and_then_the_board(tmp_path: Path) -> 
     flown = fly(
         {
             "camera.uri": "test:?duration_s=20",
-            "battery.uri": "i2c:ina219@fake:0x40?percentage=0.3",
+            "battery.uri": "fake:?percentage=0.3",
             "battery.period_s": 0.1,
             "battery.low_percentage": 0.45,
             "battery.critical_percentage": 0.4,

@@ -47,7 +47,7 @@ CONFIGURED: dict[str, object] = {
     "link.ssrc": 4242,
     "link.mtu_bytes": 300,
     "link.history_s": 0.6,
-    "battery.uri": "i2c:ina219@fake:0x40?percentage=0.5&load_A=0.2",
+    "battery.uri": "fake:?percentage=0.5&minutes=180",
     "battery.period_s": 0.2,
     "battery.low_percentage": 0.7,
     "battery.low_bitrate_kbps": 700,
@@ -265,7 +265,7 @@ def test_what_was_sent_of_late_and_nothing_older_is_sent_again(live: Live) -> No
 
 def test_the_battery_is_the_gauges_and_is_read_so_often(live: Live) -> None:
     readings = live.heard.of(keys.BATTERY)
-    assert "percentage=0.5&load_A=0.2" in str(live.asked["battery.uri"])
+    assert "percentage=0.5&minutes=180" in str(live.asked["battery.uri"])  # of 0.6 Ah
     assert readings[0].percentage == pytest.approx(0.5, abs=0.15)
     assert readings[0].current == pytest.approx(-0.2, abs=0.01)
     assert period_s(readings) < 2.5 * float(str(live.asked["battery.period_s"]))

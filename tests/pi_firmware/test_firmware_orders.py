@@ -176,7 +176,7 @@ def test_a_critical_battery_ends_recording_and_flight_and_then_the_board(
     command = ["sh", "-c", f"ls {card} > {mark}"]
     flying.start(
         "camera.uri=test:",
-        "battery.uri=i2c:ina219@fake:0x40?percentage=0.02",
+        "battery.uri=fake:?percentage=0.02",
         "battery.period_s=0.5",
         f"battery.shutdown_command={json.dumps(command)}",
         f"recording.folder={card}",
@@ -213,7 +213,7 @@ def test_what_ended_the_flight_is_told_before_its_end(monkeypatch: pytest.Monkey
                 [
                     "camera.uri=test:",
                     f"telemetry.connect={json.dumps(listener.endpoints)}",
-                    "battery.uri=i2c:ina219@fake:0x40?percentage=0.02",
+                    "battery.uri=fake:?percentage=0.02",
                     "battery.period_s=0.1",
                     "battery.shutdown_command=[]",
                 ],

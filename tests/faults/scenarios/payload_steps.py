@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 NAME = "blimp-1"
 
 GAUGES = {
-    "absent": "i2c:ina219@fake:0x40?absent=1",
-    "failing": "i2c:ina219@fake:0x40?fail_every=3",
-    "nonsense": "i2c:ina219@fake:0x40?nonsense_every=3&nonsense=65535",
-    "none": "i2c:max17048@fake:0x36?nonsense_every=2&nonsense=65535",
+    "absent": "i2c:ina219@91:0x40",
+    "failing": "i2c:ina219@92:0x40",
+    "nonsense": "i2c:ina219@93:0x40",
+    "none": "i2c:max17048@98:0x36",
 }
 _ENCODER_GIVES_NONE = 1
 

@@ -1,12 +1,14 @@
 """Register-exact gauges on a simulated cell, behind the calls of `smbus2.SMBus`.
 
 What runs on top of them is the driver that flies. Registers, resets and conversions are those of
-the datasheets named in `ina` and `max17048`; words come as SMBus gives them, low byte first.
+the datasheets named in the firmware's `ina` and `max17048`; words come as SMBus gives them, low
+byte first.
 """
 
 from __future__ import annotations
 
 import errno
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -248,6 +250,27 @@ CHIPS: dict[str, Callable[[], Ina219Chip | Ina226Chip | Max17048Chip]] = {
     "ina226": Ina226Chip,
     "max17048": Max17048Chip,
 }
+
+
+def flying_bus(
+    name: str,
+    address: int,
+    cell: Cell,
+    *,
+    charge: float = 1.0,
+    load_a: float,
+    faults: Faults | None = None,
+) -> FlyingBus:
+    """A bus with the chip of this name, on a cell that discharges from now on."""
+    return FlyingBus(
+        CHIPS[name](),
+        address,
+        faults or Faults(),
+        cell=SimulatedCell(cell, charge),
+        discharge_a=load_a,
+        shunt=Shunt(),
+        clock=time.monotonic,
+    )
 
 
 def _clip(value: int, low: int, high: int) -> int:
