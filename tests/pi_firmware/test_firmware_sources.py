@@ -7,10 +7,19 @@ import sys
 import numpy as np
 import pytest
 from receiving import Receiver
+from schemes import clock
 
 from pi_firmware.settings import CameraSettings, load
-from pi_firmware.sources import clock
 from pi_firmware.sources.schemes import v4l2
+
+WITH_CLOCK = f"""
+import sys
+from pi_firmware.__main__ import main
+from pi_firmware.sources import schemes
+schemes.__path__.append({clock.__file__.rpartition("/")[0]!r})
+sys.exit(main())
+"""
+"""The firmware with one more camera, which is one more file."""
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (64, 64)])
@@ -25,8 +34,8 @@ def test_capture_time_at_the_receiver_is_that_of_the_picture_within_a_millisecon
     with Receiver(0, queue_frames=200) as receiver:
         process = subprocess.Popen(
             [
-                sys.executable, "-m", "pi_firmware",
-                "--set", "camera.uri=test:?pattern=clock&duration_s=3",
+                sys.executable, "-c", WITH_CLOCK,
+                "--set", "camera.uri=clock:?duration_s=3",
                 "--set", f"link.port={receiver.port}",
                 "--set", "telemetry.enabled=false",
                 "--set", "encoder.bitrate_kbps=4000",

@@ -1,22 +1,19 @@
-"""`test:?pattern=clock`, pictures that show when they were taken: what measures the others' times.
+"""`clock:`, pictures that show when they were taken: a camera in a file of its own.
 
-The only source that paints in Python; it stands in for a camera, and none flies with it.
+It is put beside those that ship in `pi_firmware.sources.schemes`.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.faults import OPTIONS, Faults
-from pi_firmware.sources.live import LiveSource, caps, check_exposure
-from pi_firmware.sources.pattern import PATTERNS
+from pi_firmware.sources.live import LiveSource, caps
 from pi_firmware.uri import Uri
 
 BITS = 64
@@ -56,12 +53,7 @@ class ClockSource(LiveSource):
     """
 
     def __init__(self, uri: Uri, camera: CameraSettings) -> None:
-        uri.only("pattern", "duration_s", *OPTIONS)
-        uri.choice("pattern", "clock", PATTERNS)
-        duration_s = uri.number("duration_s", 0.0, 0.0, 86_400.0)
-        check_exposure(uri, camera)
-        self._faults = Faults(uri)
-        self._frames = self._faults.frames(duration_s, camera.rate_hz)
+        self._frames = round(uri.number("duration_s", 1.0, 0.1, 60.0) * camera.rate_hz)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
         super().__init__(
@@ -69,13 +61,6 @@ class ClockSource(LiveSource):
             "appsrc name=source is-live=true format=time block=true max-bytes=0 max-buffers=2 "
             f'caps="{caps(camera, "I420")}"',
         )
-
-    def attach(self, pipeline: Any) -> None:
-        super().attach(pipeline)
-        self._faults.attach(pipeline)
-
-    def told(self) -> tuple[float | None, float | None]:
-        return self._camera.exposure_s or None, self._camera.gain or None
 
     def start(self) -> None:
         self._thread.start()
@@ -99,8 +84,7 @@ class ClockSource(LiveSource):
         rows[:, :width] = np.linspace(20, 235, width).astype(np.uint8)
         clock, base_ns = self._pipeline.get_clock(), self._pipeline.get_base_time()
         start_ns = clock.get_time()
-        count = 0
-        while count != self._frames:
+        for count in range(self._frames):
             wait_ns = start_ns + int(count * 1e9 / self.rate_hz) - clock.get_time()
             if self._stopping.wait(max(0, wait_ns) / 1e9):
                 break
@@ -112,5 +96,7 @@ class ClockSource(LiveSource):
             buffer.pts = instant_ns - base_ns
             if source.emit("push-buffer", buffer) != gst.FlowReturn.OK:
                 break
-            count += 1
         source.emit("end-of-stream")
+
+
+SOURCE = ClockSource
