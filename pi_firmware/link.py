@@ -186,11 +186,6 @@ class Link:
         buffer.pts = clock_ns - self._first_ns
         return bool(self._source.emit("push-buffer", buffer) == self._gst.FlowReturn.OK)
 
-    @property
-    def waits_for_idr(self) -> bool:
-        """Whether frames were held back, so that only an IDR is of use now."""
-        return self._waits_for_idr
-
     def failure(self) -> str | None:
         """What ended the pipeline, in GStreamer's words; None while it lives."""
         message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)

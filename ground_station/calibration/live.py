@@ -16,7 +16,6 @@ from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.newest import Newest
 from pi_firmware.wire.video import PORT
 
-SCHEME = "udp:"
 _QUEUE_FRAMES = 4
 _URI = re.compile(r"udp:(?://(?P<host>\[[0-9A-Fa-f:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)?/?")
 

@@ -8,7 +8,6 @@ lines, letters, walls of the simulator's materials. Grey, (H, W) uint8.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from ground_station.arrays import F32, U8
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
 Rng = np.random.Generator
-Painter = Callable[[TextureBank, tuple[int, int], Rng], F32]
 
 _PER_BANK = 40
 """Pictures that share a bank of fields: a bank takes as long as several pictures."""

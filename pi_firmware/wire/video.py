@@ -18,8 +18,5 @@ CORRECTION_PAYLOAD_TYPE = 98
 PAYLOAD_TYPES = (PAYLOAD_TYPE, RTX_PAYLOAD_TYPE, CORRECTION_PAYLOAD_TYPE)
 """All that come at the video's port."""
 
-CLOCK_RATE_HZ = 90_000
-"""RTP clock of H.264 (RFC 6184, 8.2.1)."""
-
 MAX_IDR_INTERVAL_NS = 1_000_000_000
 """Two IDR pictures are at most this far apart, so that a receiver recovers from a loss."""
