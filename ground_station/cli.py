@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from ground_station import __version__
+from ground_station import __version__, next_command
 from pi_firmware.wire.errors import BlimpError
 
 _COMMANDS = (
@@ -31,6 +31,7 @@ _COMMANDS = (
     ("export", "ground_station.recording.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),
     ("experiments", "ground_station.experiments.command", "fly the thesis's experiments again"),
+    ("init", "ground_station.service.init_command", "from a payload to a flight: what is next"),
     ("keys", "ground_station.keys.command", "certificates and keys of payloads and stations"),
     ("bench", "ground_station.bench.command", "measure what each step costs"),
 )
@@ -64,7 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # this once, when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        return int(importlib.import_module(args.module).run(args))
+        args.next = next_command.of(args)
+        status = int(importlib.import_module(args.module).run(args))
+        if args.next:
+            print(f"next: {args.next}")
+        return status
     except BlimpError as error:
         print(f"blimp {args.command}: {error}", file=sys.stderr)
         return 2

@@ -240,7 +240,8 @@ def _done(options: argparse.Namespace, content: Content) -> None:
         keys.remember(options.keys or wishes.default_keys(), provisioning.payload_id, held)
         if "ground.main" not in held.peers:
             serve += f" --set name={held.peers[0].partition('.')[2]}"
-    print(f"next, on the ground station and in the same network: {serve}")
+    print("put it into the payload, whose ground station is in the same network")
+    print(f"next: {serve}")
 
 
 @contextlib.contextmanager

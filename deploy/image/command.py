@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -83,6 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("deploy.image: interrupted; no image was made", file=sys.stderr)
         return 130
     print(image)
+    flash = f"make flash DEVICE=/dev/sdX IMAGE={shlex.quote(str(image))} PAYLOAD=blimp-1 WIFI=SSID"
+    print(f"next: {flash} COUNTRY=DE", file=sys.stderr)  # programs read where the image is
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments; imports nothing heavy."""
     parser.description = "Prints a ChArUco board, and calibrates a camera from views of it."
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp map build FLIGHT.mcap --camera {out} --out maps/NAME")
     parser.add_argument(
         "inputs", nargs="+", metavar="INPUT",
         help="'board' to print one; or recordings, videos, folders, udp://HOST:PORT",
@@ -105,6 +107,11 @@ def _print(args: argparse.Namespace) -> int:
         f"{board.name}, {board.square_mm:g} mm -> {args.out}, {description}\n"
         f"Print {args.out.name} on {size} at 100 %, and measure the line of "
         f"{paper.RULER_MM:g} mm on it."
+    )
+    board_file = shlex.quote(str(description))
+    args.next = (
+        f"blimp calibrate RECORDING.mcap --board {board_file} --out camera.toml"
+        "    (a recording of the board before the camera)"
     )
     return 0
 

@@ -25,6 +25,7 @@ The exit status is 0 when nothing hinders the service, 1 when there is a problem
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp init    (which step from payload to flight is next)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file (default: defaults)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
@@ -59,7 +60,10 @@ def run(args: argparse.Namespace) -> int:
     print(findings.text(found, colour=colour))
     if args.json is not None:
         write_json(args.json, findings.document(found))
-    return 1 if findings.count(found, findings.PROBLEM) else 0
+    if not findings.count(found, findings.PROBLEM):
+        return 0
+    args.next = "blimp doctor    (again, once that is fixed)"
+    return 1
 
 
 def of_machine() -> list[Check]:

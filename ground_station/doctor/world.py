@@ -11,12 +11,12 @@ from pathlib import Path
 from ground_station import user_folders
 from ground_station.doctor.findings import Finding, ok, problem, warning
 from ground_station.errors import GroundStationError
+from ground_station.service import lan
 from ground_station.service.settings import MapSettings, StationSettings
 from ground_station.service.web.access import is_loopback
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
 
-_FLASHED = "flashed.json"  # deploy/flash/keys.py writes it
 _SOON = datetime.timedelta(days=30)
 
 
@@ -137,7 +137,7 @@ def cards(settings: StationSettings) -> Iterator[Finding]:
         return
     # The folder may be a copy, as an installed service's is; notes are where the keys were made.
     for keys in dict.fromkeys((user_folders.data() / "keys", Path(text).resolve().parent.parent)):
-        for path in sorted(keys.glob(f"{credentials.PAYLOAD}/*/{_FLASHED}")):
+        for path in sorted(keys.glob(f"{credentials.PAYLOAD}/*/{lan.CARD_NOTE}")):
             yield _card(path, f"{credentials.GROUND}.{settings.name}")
 
 

@@ -26,6 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.description = "Compares an estimated trajectory with the true one."
     parser.epilog = _EPILOG
+    parser.set_defaults(
+        next="blimp map view maps/NAME --out map.html --compare {estimate} {truth}"
+        "    (where in the building it errs)"
+    )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("estimate", metavar="EST.txt", type=Path, help="TUM text, or a recording")
     parser.add_argument(

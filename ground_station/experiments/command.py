@@ -21,6 +21,7 @@ after a change only what it touches is made again."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EXAMPLE
+    parser.set_defaults(next="blimp experiments --list    (what else there is)")
     add = parser.add_argument
     add("names", nargs="*", metavar="NAME", help="experiments (default: all)")
     add("--list", action="store_true", help="say which there are, and nothing else")

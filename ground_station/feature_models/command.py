@@ -44,7 +44,7 @@ example:
 def add_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the sub-commands to those of `blimp models`."""
 
-    def add(name: str, text: str, epilog: str) -> argparse.ArgumentParser:
+    def add(name: str, text: str, epilog: str, after: str) -> argparse.ArgumentParser:
         made = commands.add_parser(
             name,
             help=text[0].lower() + text[1:].rstrip("."),
@@ -52,15 +52,19 @@ def add_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser])
             epilog=epilog,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        made.set_defaults(next=after)
         made.add_argument("--json", type=Path, metavar="FILE", help="write the result as JSON, too")
         return made
 
-    add("list", "Lists the models that there are.", _LIST_EXAMPLE)
-    bring = add("import", "Turns weights into a model.", _IMPORT_EXAMPLE)
+    add("list", "Lists the models that there are.", _LIST_EXAMPLE, "blimp models info NAME")
+    bring = add("import", "Turns weights into a model.", _IMPORT_EXAMPLE, "blimp models list")
     bring.add_argument("weights", metavar="FILE", help=".pth of torch.save, or .safetensors")
     bring.add_argument("--name", help="of the model (default: the network's)")
     bring.add_argument("--licence", help="of the weights (default: the one of those published)")
-    small = add("quantize", "Makes a model smaller and faster: int8.", _QUANTIZE_EXAMPLE)
+    small = add(
+        "quantize", "Makes a model smaller and faster: int8.", _QUANTIZE_EXAMPLE,
+        "blimp bench features",
+    )  # fmt: skip
     small.add_argument("model", metavar="NAME", help="an fp32 model, see `blimp models list`")
     small.add_argument(
         "--calibrate", required=True, metavar="INPUT", help="recording, video or folder of images"
@@ -71,7 +75,12 @@ def add_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     small.add_argument("--frames", type=int, default=32, help="taken, evenly over it (default 32)")
     small.add_argument("--threads", type=int, default=1, help="for the time (default 1)")
     small.add_argument("--seed", type=int, default=1, help="of the warps (default 1)")
-    info = add("info", "Tells what a model is.", _INFO_EXAMPLE)
+    info = add(
+        "info",
+        "Tells what a model is.",
+        _INFO_EXAMPLE,
+        "blimp map build INPUT --features {model} --out maps/NAME",
+    )
     info.add_argument("model", metavar="NAME", help="see `blimp models list`")
 
 

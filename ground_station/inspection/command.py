@@ -20,6 +20,7 @@ its 5th, 50th and 95th percentile; lengths are in the map's units."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map info`."""
+    parser.set_defaults(next="blimp map view {map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument(
         "--localizability", action="store_true",

@@ -22,6 +22,7 @@ COLMAP model, which COLMAP's tools open as it is."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map export`."""
+    parser.set_defaults(next="blimp map view {map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument("--ply", metavar="FILE", help="PLY file to write")
     parser.add_argument("--png", metavar="FILE", help="picture from above to write")

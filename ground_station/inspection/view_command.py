@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ headings, how many landmarks a camera is expected to find and how well they fix 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map view`."""
+    parser.set_defaults(next="blimp localize VIDEO --map {map} --out est.txt")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument("--out", required=True, metavar="FILE.html", help="page to write")
     parser.add_argument("--open", action="store_true", help="open it in the browser")
@@ -61,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     print_table(figures)
     if map_.info.units != "m":
         print("lengths are in the map's own units: it has no metres before blimp map register")
+        args.next = f"blimp map register {shlex.quote(args.map)} --page"
     if args.json:
         write_json(args.json, {"localizability": figures})
     print(args.out)

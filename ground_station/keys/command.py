@@ -29,21 +29,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--folder", type=Path, help="the authority's folder (default: ~/.local/share/blimp/keys)"
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    actions.add_parser("init", help="make a new authority")
-    for verb, name, what in (
-        ("payload", "1 to 32 of a-z, 0-9, - and _", "make the certificate and keys of a payload"),
-        ("ground", "as a payload's", "make the certificate and keys of a ground station"),
-        ("renew", "payload.ID or ground.NAME", "give a member a new certificate"),
-    ):
-        signed = actions.add_parser(verb, help=what)
+
+    def add(name: str, what: str, after: str) -> argparse.ArgumentParser:
+        made = actions.add_parser(name, help=what)
+        made.set_defaults(next=after)
+        return made
+
+    add("init", "make a new authority", "blimp keys ground main")
+    for verb, name, what, after in (
+        ("payload", "1 to 32 of a-z, 0-9, - and _", "make the certificate and keys of a payload",
+         "make flash DEVICE=/dev/sdX IMAGE=FILE PAYLOAD={name} WIFI=SSID COUNTRY=DE"),
+        ("ground", "as a payload's", "make the certificate and keys of a ground station",
+         "blimp keys payload blimp-1"),
+        ("renew", "payload.ID or ground.NAME", "give a member a new certificate",
+         "blimp keys check"),
+    ):  # fmt: skip
+        signed = add(verb, what, after)
         signed.add_argument("name", help=name)
         signed.add_argument("--days", type=int, default=730, help="valid for, days, 1 to 3650")
-    actions.add_parser("list", help="who has a certificate, and until when")
-    actions.add_parser("release", help="name the key that signs releases; makes a missing one")
-    revoke = actions.add_parser("revoke", help="take a name out of everyone's access list")
+    add("list", "who has a certificate, and until when", "blimp keys check")
+    add("release", "name the key that signs releases; makes a missing one", "")  # programs read it
+    revoke = add("revoke", "take a name out of everyone's access list", "blimp keys list")
     revoke.add_argument("name", help="payload.ID or ground.NAME")
-    actions.add_parser("rotate", help="go one step of the three that replace the authority")
-    actions.add_parser("check", help="say what is wrong or ends within 30 days; status 1 if any")
+    add("rotate", "go one step of the three that replace the authority", "blimp keys check")
+    add("check", "say what is wrong or ends within 30 days; status 1 if any", "blimp serve --lan")
 
 
 def run(arguments: argparse.Namespace) -> int:

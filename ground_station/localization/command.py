@@ -20,6 +20,7 @@ _FAR_INIT_S = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments; imports nothing heavy."""
+    parser.set_defaults(next="blimp evaluate {out} TRUTH.txt    (where you have the truth)")
     parser.add_argument("input", metavar="INPUT", help="recording, video file or image folder")
     parser.add_argument("--map", required=True, metavar="MAP", help="folder of the map")
     parser.add_argument("--out", required=True, metavar="EST.txt", help="trajectory, TUM format")

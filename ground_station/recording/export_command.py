@@ -18,6 +18,7 @@ Times are the camera's. With several payloads in a recording, --topic says whose
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp evaluate {out} TRUTH.txt    (where you have the truth)")
     parser.add_argument("recording", type=Path, metavar="RECORDING", help="an .mcap file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="what to write")
     parser.add_argument(

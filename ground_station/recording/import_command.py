@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -23,6 +24,7 @@ _MOST_PX = (1920, 1088)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp replay {out} --map maps/NAME")
     parser.add_argument("input", metavar="INPUT", help="video file or folder of images")
     parser.add_argument("--camera", required=True, metavar="CAMERA.toml", help="its calibration")
     parser.add_argument("--out", type=Path, required=True, metavar="F.mcap", help="what to write")
@@ -62,8 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if camera.width_px > _MOST_PX[0] or camera.height_px > _MOST_PX[1]:
         most = "x".join(map(str, _MOST_PX))
         _say(f"the payload's firmware takes {most} at most: to replay it, import a smaller video")
-    else:
-        print(f"next: blimp replay {args.out} --map maps/NAME")
+        args.next = f"blimp map build {shlex.quote(str(args.out))} --out maps/NAME"
     return 0
 
 

@@ -26,6 +26,9 @@ OUTCOME = "outcome"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(
+        next="blimp replay --make-case {recording} --map {map} --out CASE.toml    (it as a test)"
+    )
     parser.add_argument(
         "recording", nargs="?", type=Path, metavar="RECORDING", help="an .mcap file"
     )
@@ -74,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.errors import InputError
 
     if mode := cases.mode_of(args):
+        args.next = "make hil"
         return cases.run(mode, args)
     args.out = args.out or Path("out/replay")
     if args.demo:
@@ -81,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("--demo brings its own recording, map and pace")
         from ground_station.replay import demo
 
+        args.next = "blimp serve --demo    (the same flight on the dashboard)"
         return demo.run(args.out, preset=args.preset, init=args.init, rate_hz=args.rate_hz)
     if args.recording is None or args.map is None:
         raise InputError("a RECORDING and --map are needed (or --demo)")

@@ -22,6 +22,8 @@ from pi_firmware.wire import credentials, scouting
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import PORT, check_endpoint
 
+CARD_NOTE = "flashed.json"
+"""Beside a payload's keys: which stations its card was told of. deploy/flash/keys.py writes it."""
 EVERYWHERE = "0.0.0.0"  # addresses come and go; who may speak is for the certificates to decide
 _SIOCGIFFLAGS = 0x8913  # Linux, not in Python's modules
 _WANTED, _UNWANTED = 0x1 | 0x40 | 0x1000, 0x8 | 0x10
@@ -106,7 +108,7 @@ def told(settings: StationSettings) -> str:
     )
 
 
-def _authority() -> Path:
+def authority() -> Path:
     """Where `blimp keys` made the keys: of the person at the keyboard, also under sudo."""
     if os.geteuid() == 0 and (person := os.environ.get("SUDO_USER")):
         with contextlib.suppress(KeyError):
@@ -118,12 +120,12 @@ def _authority() -> Path:
 
 def _certificates(settings: StationSettings) -> credentials.Credentials:
     """This station's; raises `InputError` that names the command which makes them."""
-    authority = _authority()
-    stations = authority / credentials.GROUND
+    keys = authority()
+    stations = keys / credentials.GROUND
     folder = Path(settings.telemetry.certificates or stations / settings.name)
     if not folder.is_dir():
         make = f"blimp keys ground {settings.name}"
-        if not authority.is_dir():
+        if not keys.is_dir():
             make = f"blimp keys init && {make} && blimp keys payload blimp-1"
         others = sorted(path.name for path in stations.glob("*") if path.is_dir())
         hint = f" (keys are here of: {', '.join(others)}; --set name=NAME)" if others else ""

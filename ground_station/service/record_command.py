@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import shlex
 import signal
 import threading
 import time
@@ -32,6 +33,7 @@ _STEP_S = 0.1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp doctor --lan    (nothing was recorded)")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the recordings (recording.folder)"
     )
@@ -69,11 +71,14 @@ def run(args: argparse.Namespace) -> int:
         signal.signal(number, lambda *_: stop.set())
     report = _Report()
     with Intake(loaded, report.take, camera=camera) as intake:
-        intake.recorder.start()
+        first = intake.recorder.start()
         until_s = math.inf if args.seconds is None else time.monotonic() + args.seconds
         while not stop.wait(_STEP_S) and time.monotonic() < until_s and intake.recorder.file:
             intake.step()
     state = intake.recorder.state()
+    if report.frames:
+        made = shlex.quote(str(Path(loaded.recording.folder) / first))
+        args.next = f"blimp map build {made} --out maps/NAME"
     for payload_id, frames in sorted(report.frames.items()):
         print(f"{payload_id}: " + ", ".join(f"{n} {name}" for name, n in sorted(frames.items())))
     return 1 if state.problem or not report.frames else 0

@@ -19,6 +19,7 @@ The dashboard is at http://127.0.0.1:8080/ then; service/station.toml names ever
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp init    (which step from payload to flight is next)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file (default: defaults)")
     parser.add_argument("--map", type=Path, metavar="MAP", help="folder of a registered map")
     parser.add_argument(

@@ -20,6 +20,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `blimp simulate`."""
     parser.epilog = EXAMPLE
+    parser.set_defaults(next="blimp map build {out} --out maps/NAME")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add(

@@ -28,6 +28,7 @@ The status is 0 when it was done, 1 when the payload refused, 2 when nobody answ
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
+    parser.set_defaults(next="blimp serve --lan    (its page has these commands as buttons)")
     parser.add_argument("payload", metavar="PAYLOAD", help="its id, as blimp-1")
     parser.add_argument("name", metavar="NAME", choices=NAMES, help=", ".join(NAMES))
     parser.add_argument(

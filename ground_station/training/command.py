@@ -25,6 +25,7 @@ code. A killed run goes on with --resume where its last checkpoint stands. Torch
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of the command; imports nothing heavy."""
     parser.epilog = _EXAMPLE
+    parser.set_defaults(next="blimp models list")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--size", default="wren", help="wren (default)")
     parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")

@@ -64,7 +64,9 @@ def test_a_flights_poses_are_read_back_exactly(tmp_path: Path) -> None:
     done = blimp(FLIGHT, "--topic", TRUTH_TOPIC, "--out", out)
     assert done.returncode == 0 and done.stderr == ""
     truth, read = trajectory_of(FLIGHT), read_tum(out)
-    assert done.stdout == f"{len(truth)} poses of /truth/pose -> {out}\n"
+    said = f"{len(truth)} poses of /truth/pose -> {out}"
+    after = f"next: blimp evaluate {out} TRUTH.txt    (where you have the truth)"
+    assert done.stdout.splitlines() == [said, after]
     assert (read.time_ns == truth.time_ns).all()
     assert np.abs(read.position_m - truth.position_m).max() < 1e-9
     assert np.abs(read.quaternion_xyzw - truth.quaternion_xyzw).max() < 1e-8

@@ -23,6 +23,7 @@ MAP.before, until you delete it. To let poses and landmarks move, too, see 'blim
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map extend`."""
+    parser.set_defaults(next="blimp map view {out|map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
     parser.add_argument("--camera", metavar="TOML", help="default: the input's own, else the map's")

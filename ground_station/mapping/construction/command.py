@@ -33,6 +33,7 @@ tls:// and certificates in Dask's configuration where others share it."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map build`."""
+    parser.set_defaults(next="")  # the map says
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
     parser.add_argument(
         "--camera", metavar="TOML",
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     for line in found.lines:
         print(line)
     print(f"picture: {picture}")
-    print(next_step(found, map_, args.out))
+    args.next = next_step(found, map_, args.out)
     if args.json:
         seen = {"verdict": found.word, "said": found.lines, "picture": str(picture)}
         write_json(args.json, seen | describe(map_))

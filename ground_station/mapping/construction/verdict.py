@@ -36,11 +36,10 @@ def verdict(map_: Map) -> Verdict:
     built, names = map_.info.built, map_.keyframes.names
     images, registered = int(built.get("images", len(names))), len(names)
     parts = [list(part) for part in built.get("parts", [])][1:]
-    sizes = [len(part) for part in parts] or [int(n) for n in built.get("model_sizes", [])][1:]
     doubts = [str(doubt) for doubt in built.get("doubts", [])]
     reasons = _left_out(built)
     apart = {name for part in parts for name in part} - set(names)
-    word, first = _first(images, registered, sizes, doubts)
+    word, first = _first(images, registered, _other_sizes(built), doubts)
     every = sorted({*names, *reasons, *apart})
     lines = [first]
     lines += _few([f"doubt: {doubt}" for doubt in doubts], "doubts")
@@ -57,20 +56,27 @@ def verdict(map_: Map) -> Verdict:
     return Verdict(word, lines, [name for name in every if name not in set(names)])
 
 
+def first_line(built: Mapping[str, Any]) -> str:
+    """The first of the lines, by what the build wrote alone: no map needs to be read for it."""
+    registered = int(built.get("registered", 0))
+    images = int(built.get("images", registered))
+    return _first(images, registered, _other_sizes(built), built.get("doubts", []))[1]
+
+
 def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
-    """The command to give next, and why."""
+    """The command to give next, and why, as `next_command` has it."""
     where = shlex.quote(str(folder))
     if found.word in ("doubtful", "in parts"):
         page = shlex.quote(f"{Path(folder).name}.html")
         why = "look at it before it is trusted"
         if found.word == "in parts":
             why = "see what is there; film what joins the parts, and build with both"
-        return f"next: blimp map view {where} --out {page} --open    ({why})"
+        return f"blimp map view {where} --out {page} --open    ({why})"
     if _open_lens(map_.info.built):
-        return "next: blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
+        return "blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
     if map_.info.registered:
-        return f"next: blimp localize VIDEO --map {where} --out est.txt"
-    return f"next: blimp map register {where} --page    (its scale and its place in the building)"
+        return f"blimp localize VIDEO --map {where} --out est.txt"
+    return f"blimp map register {where} --page    (its scale and its place in the building)"
 
 
 def _first(
@@ -96,6 +102,12 @@ def _first(
             "out"
         )
     return "whole", f"WHOLE: all {images} images stand in this map, in one piece"
+
+
+def _other_sizes(built: Mapping[str, Any]) -> list[int]:
+    """How many images each of the other parts has."""
+    sizes = [len(part) for part in built.get("parts", [])][1:]
+    return sizes or [int(n) for n in built.get("model_sizes", [])][1:]
 
 
 def _left_out(built: Mapping[str, Any]) -> dict[str, str]:

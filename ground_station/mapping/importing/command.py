@@ -24,6 +24,7 @@ map is in the model's coordinates, which have no units: blimp map register follo
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map import`."""
+    parser.set_defaults(next="blimp map view {out} --out map.html --open")
     parser.add_argument("model", metavar="MODEL", help="folder of the COLMAP model")
     parser.add_argument(
         "--images", required=True, metavar="INPUT",

@@ -26,6 +26,7 @@ adjusted again, with the rolling shutter taken out."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map refine`."""
+    parser.set_defaults(next="blimp map view {out|map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument(
         "observations",

@@ -36,6 +36,7 @@ images an end. They give the scale and no more: alone, the map is in metres and 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map register`."""
+    parser.set_defaults(next="blimp serve --lan --map {map}")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--page", action="store_true", help="pick places in a browser")
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         )
         if found is None:
             print("nothing was saved")
+            args.next = ""
             return 0
     else:
         found = _register(args)

@@ -21,7 +21,17 @@ from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.settings import Run
-from ground_station.service.web import control, live, maps, pages, problems, recordings, state
+from ground_station.service.web import (
+    control,
+    guide,
+    jobs,
+    live,
+    maps,
+    pages,
+    problems,
+    recordings,
+    state,
+)
 from ground_station.service.web.access import Access
 from ground_station.service.web.guard import Guard
 from ground_station.service.web.metrics import Metrics
@@ -73,6 +83,8 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     settings = run.station
     snapshot = Snapshot(run, __version__)
     snapshot.keep_events(folder / "events.jsonl")
+    job = jobs.Jobs(folder)
+    snapshot.job = job.state
     metrics = Metrics(snapshot)
     access = Access(settings.http, token)
 
@@ -105,6 +117,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
         finally:
             ticking.cancel()
             video.close()
+            job.close()
 
     app = FastAPI(
         title="Blimp ground station",
@@ -126,6 +139,9 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     app.include_router(maps.router(shelf))
     app.include_router(control.router(control.Control(bus, snapshot), shelf))
     app.include_router(recordings.router(recorded))
+    app.include_router(
+        jobs.router(guide.Guide(settings, shelf, recorded), job, shelf, recorded, snapshot)
+    )
     app.include_router(live.router(viewers, access.sessions.holds))
     app.include_router(pages.router(access, settings.name))
     app.include_router(pages.docs_router(app))

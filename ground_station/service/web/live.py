@@ -74,6 +74,7 @@ class Live:
         self._viewers: set[_Viewer] = set()
         self._alarms: dict[str, alarms.Standing] = {}
         self._alive: frozenset[str] = frozenset()
+        self._job_ran = False
         self._say: Callable[[str, EventMessage], None] = lambda *_: None
 
     # What the bus says
@@ -158,6 +159,7 @@ class Live:
             self._alarm(self._alarms[name].alarm, active=True)
         for name in before.keys() - self._alarms.keys():
             self._alarm(before[name].alarm, active=False)
+        self._follow_job(state["job"])
         alive = frozenset(name for name, item in state["payloads"].items() if item["alive"])
         for payload_id in self._alive - alive:
             self._tell(_text("gone", payload=payload_id))
@@ -177,6 +179,16 @@ class Live:
         name = "alarm-begins" if active else "alarm-over"
         with contextlib.suppress(Exception):  # the bus may be what fails
             self._say(alarm.payload, EventMessage(time.time_ns(), "web", level, name, text))
+
+    def _follow_job(self, job: dict[str, Any] | None) -> None:
+        runs = bool(job and job["running"])
+        if job and self._job_ran and not runs:
+            level = bus_messages.INFO if job["status"] == 0 else bus_messages.WARNING
+            text = f"{job['command']}: {job['line'] or 'ended'}"
+            with contextlib.suppress(Exception):  # the bus may be what fails
+                note = EventMessage(time.time_ns(), "web", level, "job-ended", text)
+                self._say(bus_messages.STATION, note)
+        self._job_ran = runs
 
     def _tell(self, text: str) -> None:
         for viewer in self._viewers:

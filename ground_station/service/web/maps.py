@@ -10,7 +10,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from fastapi import APIRouter, Request, Response
@@ -20,6 +20,9 @@ from ground_station.service.settings import MapSettings
 from ground_station.service.web.models import MAP_PATTERN, MapDetailsModel, MapModel, MapName
 from ground_station.service.web.problems import NotFound, problems
 from pi_firmware.wire.errors import BlimpError
+
+if TYPE_CHECKING:
+    from ground_station.map.store import MapInfo
 
 LANDMARKS = 20_000
 _KEPT = 16
@@ -69,7 +72,7 @@ class Maps:
 
     def details(self, name: str) -> dict[str, Any]:
         """One map; raises `NotFound`, or `MapError` for one that cannot be read."""
-        folder = self._folder(name)
+        folder = self.folder(name)
 
         def read() -> dict[str, Any]:
             from ground_station.map import store
@@ -99,6 +102,12 @@ class Maps:
         details = self._once(name, "details", ("map.toml", "landmarks.safetensors"), read)
         return {**details, "floorplan": self._plan(name)}
 
+    def info(self, name: str) -> MapInfo:
+        """What a map says of itself; raises `NotFound`, or `MapError` where it cannot be read."""
+        from ground_station.map import store
+
+        return self._once(name, "info", ("map.toml",), lambda: store.load_info(self.folder(name)))
+
     def floorplan(self, name: str) -> bytes:
         """The floor plan as PNG, of exactly the size that `details` tells."""
         plan = self._drawn(name)
@@ -108,7 +117,7 @@ class Maps:
 
     def landmarks(self, name: str) -> bytes:
         """x, y, z of at most `LANDMARKS` landmarks, float32, little-endian, evenly drawn."""
-        folder = self._folder(name)
+        folder = self.folder(name)
 
         def read() -> bytes:
             from ground_station.map import store
@@ -128,7 +137,7 @@ class Maps:
         return None if plan is None else plan[0]
 
     def _drawn(self, name: str) -> tuple[dict[str, Any], bytes] | None:
-        folder = self._folder(name)
+        folder = self.folder(name)
         path = folder / "floorplan.yaml"
         if not path.is_file():
             return None
@@ -154,8 +163,11 @@ class Maps:
 
         return self._once(name, "floorplan", ("floorplan.yaml", "floorplan.png"), read)
 
-    def _folder(self, name: str) -> Path:
-        """The same rule as the localizer's: a name on the shelf, or the configured map's."""
+    def folder(self, name: str) -> Path:
+        """Where a map lies; raises `NotFound`.
+
+        The same rule as the localizer's: a name on the shelf, or the configured map's.
+        """
         if _NAME.fullmatch(name):
             folder = self._shelf / name
             inside = folder.is_dir() and folder.resolve().parent == self._shelf.resolve()
@@ -170,7 +182,7 @@ class Maps:
         identity: tuple[int, ...] = ()
         for file in files:
             try:
-                found = (self._folder(name) / file).stat()
+                found = (self.folder(name) / file).stat()
                 identity += (found.st_ino, found.st_mtime_ns, found.st_size)
             except OSError:
                 identity += (0, 0, 0)

@@ -31,6 +31,53 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+class JobRequest(_Model):
+    """A long job: the step that it is of, with its recording, or the name of its map."""
+
+    step: Literal["calibrate", "build", "register"]
+    recording: Annotated[str, StringConstraints(pattern=FILE_PATTERN)] | None = None
+    map: Annotated[str, StringConstraints(pattern=MAP_PATTERN)] | None = None
+
+
+class WayModel(BaseModel):
+    """A command that goes on, and when it is the one; none where it is done by hand."""
+
+    text: str
+    command: str
+
+
+class StepModel(BaseModel):
+    """A step from payload to flight; `choices` are what a job of it may be given."""
+
+    name: str
+    title: str
+    state: Literal["done", "ready", "waiting"]
+    found: str
+    check: str
+    ways: list[WayModel]
+    choices: list[str]
+
+
+class GuideModel(BaseModel):
+    """The six steps as the station sees them from the folder that its commands are given in."""
+
+    folder: str
+    steps: list[StepModel]
+
+
+class JobModel(BaseModel):
+    """The job of now or the last: its last line, how far it is, the page that it opened."""
+
+    step: str
+    command: str
+    started_ns: int
+    running: bool
+    status: int | None
+    line: str
+    share: float | None
+    page: str
+
+
 class Problem(BaseModel):
     """Why a request was not carried out, in one line."""
 
@@ -145,6 +192,7 @@ class StateModel(BaseModel):
     recording_age_s: float | None
     events: list[EventModel]
     alarms: list[AlarmModel]
+    job: JobModel | None
 
 
 class FloorPlanModel(BaseModel):

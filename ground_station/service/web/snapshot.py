@@ -96,6 +96,7 @@ class Snapshot:
         self._recording: RecordingMessage | None = None
         self._recording_ns = 0
         self._alarms: list[dict[str, Any]] = []
+        self.job: Callable[[], dict[str, Any] | None] = lambda: None
         self._evicted: Callable[[str], None] = lambda _: None
 
     def listen(self, bus: Bus) -> None:
@@ -261,6 +262,7 @@ class Snapshot:
 
     def document(self, *, full: bool = True) -> dict[str, Any]:
         """The whole state as plain JSON values; short of trails, points and events if not full."""
+        job = self.job()
         with self._lock:
             now_ns = self._clock_ns()
             station = self.run.station
@@ -295,6 +297,7 @@ class Snapshot:
                 "recording": None if recording is None else bus_messages.as_document(recording),
                 "recording_age_s": _age_s(now_ns, self._recording_ns if recording else None),
                 "alarms": list(self._alarms),
+                "job": job,
             }
             if full:
                 result["events"] = list(self._events)[-EVENTS_SHOWN:]

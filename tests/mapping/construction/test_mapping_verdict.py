@@ -111,13 +111,13 @@ def test_a_guessed_lens_that_nothing_refined_is_said_to_be() -> None:
 @pytest.mark.parametrize(
     ("built", "command"),
     [
-        ({}, "next: blimp map register 'maps/a b' --page "),
-        ({"lens_prior": GUESSED}, "next: blimp calibrate "),
-        ({"lens_prior": GUESSED, "lens": {"refused": True}}, "next: blimp calibrate "),
-        ({"lens_prior": GUESSED, "lens": {"said": "f"}}, "next: blimp map register "),
-        ({"lens_prior": MEASURED, "lens": {"refused": True}}, "next: blimp map register "),
-        ({"doubts": ["d"]}, "next: blimp map view 'maps/a b' --out 'a b.html' --open "),
-        ({"model_sizes": [40, 9]}, "next: blimp map view "),
+        ({}, "blimp map register 'maps/a b' --page "),
+        ({"lens_prior": GUESSED}, "blimp calibrate "),
+        ({"lens_prior": GUESSED, "lens": {"refused": True}}, "blimp calibrate "),
+        ({"lens_prior": GUESSED, "lens": {"said": "f"}}, "blimp map register "),
+        ({"lens_prior": MEASURED, "lens": {"refused": True}}, "blimp map register "),
+        ({"doubts": ["d"]}, "blimp map view 'maps/a b' --out 'a b.html' --open "),
+        ({"model_sizes": [40, 9]}, "blimp map view "),
     ],
 )
 def test_the_next_command_follows_from_the_verdict(built: dict[str, Any], command: str) -> None:
@@ -130,4 +130,4 @@ def test_a_registered_map_is_ready_to_localize() -> None:
     map_.info.frame, map_.info.units = "world", "m"
     found = verdict(map_)
     assert found.lines[-1] == "scale: metres, in the world's frame"
-    assert next_step(found, map_, "maps/a").startswith("next: blimp localize ")
+    assert next_step(found, map_, "maps/a").startswith("blimp localize ")
