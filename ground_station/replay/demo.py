@@ -18,7 +18,7 @@ from ground_station.mapping.registration.register import register_map
 from ground_station.mapping.settings import load_settings
 from ground_station.replay import flight_report
 from ground_station.replay.replay import replay, settings_for
-from ground_station.service.serve import SAMPLE
+from ground_station.service.settings import SAMPLE
 from pi_firmware.wire.recording import RecordingReader
 
 LIMITS = {

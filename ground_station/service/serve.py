@@ -19,12 +19,16 @@ from ground_station.service import bus_messages, processes
 from ground_station.service.bus import Bus, Router
 from ground_station.service.bus_messages import EventMessage, PayloadMessage, ProcessMessage
 from ground_station.service.processes import Children
-from ground_station.service.settings import RUN_FILE, Run, StationSettings, write_run
+from ground_station.service.settings import (
+    DEMO_PAYLOAD,
+    RUN_FILE,
+    Run,
+    StationSettings,
+    write_run,
+)
 from pi_firmware.wire import config, scouting
 from pi_firmware.wire.systemd import Notifier
 
-DEMO_PAYLOAD = "demo"
-SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 _STEP_S = 0.1
 _GONE_S = 60.0
 _FEED_S = 2.0

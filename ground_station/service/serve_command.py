@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.service import lan, settings
     from ground_station.service.ending import ending
     from ground_station.service.processes import ServiceError
-    from ground_station.service.serve import SAMPLE, check, serve
+    from ground_station.service.serve import check, serve
 
     loaded = settings.load(args.config, args.set)
     if args.map is not None:
@@ -55,14 +55,16 @@ def run(args: argparse.Namespace) -> int:
         loaded = lan.on(loaded, args.lan)
         print(lan.told(loaded), flush=True)
     if args.demo and args.map is None and args.config is None:
-        shelf = dataclasses.replace(loaded.map, folder=str(SAMPLE), shelf=str(SAMPLE.parent))
+        shelf = dataclasses.replace(
+            loaded.map, folder=str(settings.SAMPLE), shelf=str(settings.SAMPLE.parent)
+        )
         loaded = dataclasses.replace(loaded, map=shelf)
     if args.check:
         check(loaded)
         print("configuration is good")
         return 0
     try:
-        serve(loaded, ending(None), demo=SAMPLE / "flight.mcap" if args.demo else None)
+        serve(loaded, ending(None), demo=settings.SAMPLE / "flight.mcap" if args.demo else None)
     except ServiceError:  # the process that could not start has said why
         return 2
     return 0

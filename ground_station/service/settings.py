@@ -21,6 +21,9 @@ from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, check_endpoint
 
 SHIPPED = Path(__file__).with_name("station.toml")
+SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
+"""The map that ships, with the flight that `--demo` plays as the payload `DEMO_PAYLOAD`."""
+DEMO_PAYLOAD = "demo"
 RUN_FILE = "station.json"
 
 

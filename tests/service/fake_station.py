@@ -45,6 +45,16 @@ LATENCY_S = 0.04
 _PLAN = {"resolution_m": 0.025, "origin": [-0.75, -0.75, 0.0], "width_px": 1020, "height_px": 700}
 _SHAPE = np.array([1.0, 0.4, 0.0, 0.4, 0.5, 0.0, 0.0, 0.0, 0.2])
 _FOCAL_PX, _CENTRE_PX = 503.0, (312.5, 241.2)
+STEPS = [
+    {"name": "payload", "title": "A payload is heard", "state": "done", "check": "blimp doctor",
+     "found": "blimp-1: 30 frames a second", "ways": [], "choices": []},
+    {"name": "build", "title": "A map is built", "state": "ready", "check": "blimp map view x",
+     "found": "no map of <b>your own</b> yet", "choices": ["a.mcap", "b.mcap"],
+     "ways": [{"text": "of a video", "command": "blimp map build 'a b.mp4' --out maps/NAME"},
+              {"text": "or film it again", "command": ""}]},
+    {"name": "fly", "title": "The payload flies in it", "state": "waiting", "check": "look",
+     "found": "needs a map", "ways": [], "choices": []},
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -121,6 +131,7 @@ class FakeStation:
     recording: bool = False
     recording_ns: int = 0
     recordings: list[dict[str, Any]] = field(default_factory=list)
+    job: dict[str, Any] | None = None
     demo: bool = True
     map: str = "atrium"
     floorplan: bool = True
@@ -185,6 +196,7 @@ class FakeStation:
                 one.id: self._payload(one, now_ns, full) for one in self.payloads.values()
             },
             "alarms": list(self.alarms),
+            "job": self.job,
         }
         if full:
             document["events"] = self.events[-200:]
@@ -376,6 +388,18 @@ def make_app(station: FakeStation) -> FastAPI:
     def landmarks(name: str) -> Response:
         data = sample_flight().landmarks_m.astype("<f4").tobytes()
         return Response(data, media_type="application/octet-stream")
+
+    @app.get("/api/guide")
+    def guide() -> dict[str, Any]:
+        return {"folder": "/srv/blimp", "steps": STEPS}
+
+    @app.post("/api/job")
+    async def start(request: Request) -> dict[str, Any]:
+        return await answer("job", await request.json())
+
+    @app.delete("/api/job")
+    async def stop() -> dict[str, Any]:
+        return await answer("job", None)
 
     @app.get("/api/recordings")
     def recordings() -> list[dict[str, Any]]:

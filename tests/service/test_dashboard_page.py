@@ -319,6 +319,51 @@ def test_a_recording_starts_and_stops(shown: Watched, station: FakeStation) -> N
     assert station.asked[1:] == [("recording", {"active": False})]
 
 
+def test_the_steps_lead_on_and_start_a_job(shown: Watched, station: FakeStation) -> None:
+    shown.page.keyboard.press("n")
+    shown.page.wait_for_selector("#steps-dialog .step")
+    rows = shown.page.locator("#steps-dialog .step").all_text_contents()
+    assert len(rows) == 3 and "done" in rows[0] and "to do" in rows[1] and "later" in rows[2]
+    assert "no map of <b>your own</b> yet" in rows[1]
+    assert "/srv/blimp" in shown.text("#steps-dialog [data-f=note]")
+    commands = shown.page.locator("#steps-dialog code").all_text_contents()
+    assert commands == ["blimp map build 'a b.mp4' --out maps/NAME"]
+    build = shown.page.locator("#steps-dialog .step[data-state=ready]")
+    build.locator("select").select_option("b.mcap")
+    build.locator("input").fill(" hall ")
+    station.refuse = "another job runs"
+    build.get_by_role("button", name="Start").click()
+    shown.until("document.querySelector('.step-outcome').textContent === 'another job runs'")
+    station.refuse = ""
+    build.get_by_role("button", name="Start").click()
+    shown.until("document.querySelector('.step-outcome').textContent.startsWith('It runs')")
+    asked = ("job", {"step": "build", "recording": "b.mcap", "map": "hall"})
+    assert station.asked == [asked, asked]
+    shown.page.keyboard.press("Escape")
+
+
+def test_a_job_is_shown_with_its_progress_and_its_end(shown: Watched, station: FakeStation) -> None:
+    """Also one that another page started."""
+    assert shown.page.locator("#job").is_hidden()
+    job = {"step": "build", "command": "blimp map build a.mcap", "started_ns": 1, "running": True}
+    job |= {"status": None, "line": "pairs: 3 of 4", "share": 0.75, "page": ""}
+    station.job = job
+    shown.until("document.querySelector('#job progress').value === 0.75")
+    assert "75 % · pairs: 3 of 4" in shown.text("#job")
+    assert shown.page.locator("#job a").is_hidden()
+    shown.page.click("#job button")
+    eventually(lambda: ("job", None) in station.asked)
+    station.job = job | {"share": None, "page": "http://127.0.0.1:4321/x/"}
+    shown.until("document.querySelector('#job a').href === 'http://127.0.0.1:4321/x/'")
+    for status, word in ((0, "is done"), (2, "failed"), (None, "was stopped")):
+        station.job = job
+        shown.until("document.querySelector('#job').dataset.phase === 'working'")
+        station.job = job | {"running": False, "status": status, "share": None}
+        shown.until(f"document.querySelector('#job').textContent.includes({word!r})")
+    shown.page.click("#job button")
+    shown.until("document.querySelector('#job').hidden")
+
+
 def test_recordings_are_listed_and_deleted_by_a_second_press(
     shown: Watched, station: FakeStation
 ) -> None:

@@ -19,8 +19,7 @@ from ground_station.geometry.camera import load_camera
 from ground_station.map.store import MapInfo
 from ground_station.mapping.construction.verdict import first_line
 from ground_station.service import lan
-from ground_station.service.serve import DEMO_PAYLOAD, SAMPLE
-from ground_station.service.settings import StationSettings
+from ground_station.service.settings import DEMO_PAYLOAD, SAMPLE, StationSettings
 from ground_station.service.web.maps import Maps
 from ground_station.service.web.recordings import Recordings
 from pi_firmware.wire.errors import BlimpError
@@ -91,8 +90,8 @@ class Guide:
             return Step("payload", title, "ready", found, check, [way])
         if recordings:
             found = f"none now; the newest recording is of {_day(recordings[0])}"
-            way = Way("to hear it again", "blimp serve --lan")
-            return Step("payload", title, "done", found, check, [way])
+            way = Way("power it, and listen on its network", "blimp serve --lan")
+            return Step("payload", title, "ready", found, check, [way])
         found, way = self._towards_a_payload(station)
         return Step("payload", title, "ready", found, check, [way])
 
@@ -272,8 +271,10 @@ class Guide:
 
 
 def first_way(steps: list[Step]) -> str:
-    """The command of the first step that can be gone now; "" where all is done."""
-    ready = (way.command for step in steps if step.state == "ready" for way in step.ways)
+    """The command to go on with, after what is done last; "" where all is done."""
+    last = max((k for k, step in enumerate(steps) if step.state == "done"), default=-1)
+    onwards = [*steps[last + 1 :], *steps[: last + 1]]
+    ready = (way.command for step in onwards if step.state == "ready" for way in step.ways)
     return next((command for command in ready if command), "")
 
 

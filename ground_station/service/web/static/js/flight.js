@@ -7,6 +7,7 @@ import { lookOf } from "./states.js";
 
 const TEXT_MS = 150; // numbers that change faster cannot be read
 const LOOPBACK = "this station listens on its own computer only; for the network: blimp serve --lan";
+const STEPS = "N, or the list above, shows the steps from payload to flight";
 const HAND_STEP_DEG = 1;
 
 export class Flight {
@@ -66,6 +67,7 @@ export class Flight {
   /** @param {import("./store.js").Payload|null} payload @param {string} state */
   reason(payload, state) {
     if (state === "NONE" && this.store.station.loopback) return `${lookOf(state).meaning}: ${LOOPBACK}`;
+    if (state === "NONE") return `${lookOf(state).meaning}: ${STEPS}`;
     if (["GONE", "OFFLINE", "STALE"].includes(state) || !payload?.estimate) return lookOf(state).meaning;
     const estimate = payload.estimate;
     if (estimate.reason) return estimate.reason;

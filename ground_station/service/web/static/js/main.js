@@ -18,6 +18,7 @@ import { Plan } from "./plan.js";
 import { body } from "./protocol.js";
 import { RecordingsDialog } from "./recordings.js";
 import { Scene } from "./scene.js";
+import { Steps } from "./steps.js";
 import { Status } from "./status.js";
 import { Store } from "./store.js";
 import { Theme } from "./theme.js";
@@ -58,6 +59,7 @@ const alarms = new Alarms(store, loop);
 const mapDialog = new MapDialog(store);
 const powerDialog = new PowerDialog(store);
 const recordings = new RecordingsDialog();
+const steps = new Steps(store, loop);
 const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
 new Layout(() => {
   theme.read();
@@ -132,6 +134,7 @@ new Keyboard(
     { key: "p", does: "Start or stop recording on the payload", act: () => actions.buttons["payload-record"].node.click() },
     { key: "l", does: "Relocalize", act: () => actions.buttons.relocalize.node.click() },
     { key: "m", does: "Choose a map", act: () => actions.buttons.map.node.click() },
+    { key: "n", does: "Steps from payload to flight", act: () => steps.open() },
     { key: "g", does: "Recordings", act: () => recordings.open() },
     { key: "i", does: "Refresh the picture (key frame)", act: () => actions.buttons.idr.node.click() },
     { key: "a", does: "Acknowledge all alarms", act: () => alarms.acknowledgeAll() },

@@ -81,6 +81,8 @@ export class Store {
     this.alarms = [];
     /** @type {import("./types.js").RecordingNote|null} */
     this.recording = null;
+    /** @type {import("./types.js").Job|null} */
+    this.job = null;
     /** @type {any[]} */
     this.processes = [];
     /** @type {import("./connection.js").Status} */
@@ -123,6 +125,10 @@ export class Store {
       this.forget(snapshot.payloads);
       for (const topic of ["payload", "estimate", "trail"]) this.changed(topic);
       if (!this.selected) this.select(this.firstId());
+    }
+    if (snapshot.job !== undefined) {
+      this.job = snapshot.job;
+      this.changed("job");
     }
     if (snapshot.processes) this.processes = snapshot.processes;
     if (snapshot.events) this.takeEvents(snapshot.events);

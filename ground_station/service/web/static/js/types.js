@@ -94,6 +94,7 @@
  * @property {RecordingNote|null} [recording]
  * @property {Event[]} [events]
  * @property {Alarm[]} [alarms]
+ * @property {Job|null} [job]
  *
  * @typedef {object} VideoHeader
  * @property {string} payload
@@ -125,6 +126,23 @@
  * @property {Camera|null} [camera] the payloads'
  *
  * @typedef {import("./view_rays.js").Camera} Camera
+ *
+ * @typedef {object} Step from payload to flight
+ * @property {string} name
+ * @property {string} title
+ * @property {"done"|"ready"|"waiting"} state
+ * @property {string} found
+ * @property {string} check
+ * @property {{text: string, command: string}[]} ways
+ * @property {string[]} choices recordings or maps that a job of it takes
+ *
+ * @typedef {object} Job
+ * @property {string} command
+ * @property {boolean} running
+ * @property {number|null} status
+ * @property {string} line the last that it said
+ * @property {number|null} share
+ * @property {string} page where a person goes on with it
  *
  * @typedef {object} Answer of a command
  * @property {boolean} done
