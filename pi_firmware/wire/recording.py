@@ -313,7 +313,7 @@ class RecordingReader:
 
     def message_count(self, topic: str) -> int | None:
         """The number of messages on `topic` by the recording's index, None when it has none."""
-        summary = self._summary()
+        summary = self.summary()
         if summary is None or summary.statistics is None:
             return None
         counts = summary.statistics.channel_message_counts
@@ -321,7 +321,7 @@ class RecordingReader:
 
     def metadata_table(self, name: str) -> dict[str, str]:
         """The metadata table of that name, wherever it stands in the file; empty when it is not."""
-        summary = self._summary()
+        summary = self.summary()
         if name not in self.metadata and (
             summary is None or any(index.name == name for index in summary.metadata_indexes)
         ):
@@ -329,7 +329,27 @@ class RecordingReader:
                 pass
         return self.metadata.get(name, {})
 
-    def _summary(self) -> Summary | None:
+    def since(
+        self, from_ns: int, topics: set[str] | None = None
+    ) -> Iterator[tuple[Channel, McapMessage]]:
+        """The messages from a log time on, in the order of those times.
+
+        One without an index, as after a cut, is read from its beginning and in file order.
+        """
+        if self.summary() is None:
+            for channel, message in self.messages(topics):
+                if message.log_time >= from_ns:
+                    yield channel, message
+            return
+        with self.path.open("rb") as file:
+            reader = SeekingReader(Clamped.of(file, self.path.stat().st_size))
+            try:
+                for _, channel, message in reader.iter_messages(topics, start_time=from_ns):
+                    yield channel, message
+            except (*PARSE_ERRORS, OSError):
+                self.cut, self.cut_reason = True, "it is damaged"
+
+    def summary(self) -> Summary | None:
         """The index at the end of the file; None when it is cut off or damaged."""
         with self.path.open("rb") as file:
             try:

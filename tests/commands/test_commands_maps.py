@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from ground_station.cli import main
 from ground_station.commands import maps
 from ground_station.errors import CameraError, GroundStationError, InputError, MapError
 from pi_firmware.wire.errors import ConfigError
@@ -146,7 +147,7 @@ def test_a_build_ends_with_a_verdict_a_picture_and_the_next_command(
     shutil.copytree(built.folder, tmp_path / "map")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(build, "build_map", lambda *_, **__: built.map)
-    assert _run("build", "two", "--out", "map", "--json", "b.json") == 0
+    assert main(["map", "build", "two", "--out", "map", "--json", "b.json"]) == 0
     _, cached, *lines = capsys.readouterr().out.splitlines()  # after the guessed lens
     assert "features of 0 of 0 images" in cached
     notes = built.map.info.built["notes"]

@@ -205,7 +205,7 @@ def test_the_command_makes_a_case(folders: Path, capsys: pytest.CaptureFixture[s
     words = ["--make-case", "flight.mcap", "--map", str(stand.SAMPLE), "--truth", "recording"]
     flown = ["--from", "a", "--stepped", "--rate-hz", "10", "--out", "c.toml"]
     assert cli.main(["replay", *words, *flown]) == 0
-    assert capsys.readouterr().out == "c.toml\n"
+    assert capsys.readouterr().out == "c.toml\nnext: make hil\n"
     text = (folders / "c.toml").read_text()
     assert "stepped = true" in text and "rate_hz = 10.0" in text
     assert "coverage_min = 0.95" in text

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 import web_station as station
 import websockets
+from viewing import connect, next_of, run
 
 from ground_station.service import bus_messages
-from ground_station.service.web import live as live_module
+from ground_station.service.web import viewer as viewer_module
 from ground_station.service.web.app import build
 from ground_station.service.web.outbox import SLOTS, TEXTS, Outbox
 from ground_station.service.web.server import listen, server
@@ -42,30 +43,6 @@ def served(tmp_path):
         serving.should_exit = True
         thread.join(10.0)
         assert not thread.is_alive()
-
-
-def connect(port, path="/api/live", **arguments):
-    return websockets.connect(
-        f"ws://127.0.0.1:{port}{path}", compression=None, max_size=1 << 24, **arguments
-    )
-
-
-async def next_of(viewer, *kinds, limit_s=20.0):
-    """The next message of a kind; a picture's kind is video."""
-    async with asyncio.timeout(limit_s):
-        while True:
-            message = await viewer.recv()
-            if isinstance(message, bytes):
-                length = int.from_bytes(message[:4], "big")
-                found = {**json.loads(message[4 : 4 + length]), "jpeg": message[4 + length :]}
-            else:
-                found = json.loads(message)
-            if found["type"] in kinds:
-                return found
-
-
-def run(main):
-    asyncio.run(asyncio.wait_for(main, 60.0))
 
 
 def test_a_viewer_is_greeted_with_everything_and_then_told_what_changes(served):
@@ -294,7 +271,7 @@ def stopped_viewer(port) -> socket.socket:
 
 def test_a_viewer_that_takes_nothing_harms_nobody_and_is_closed(served, monkeypatch):
     web, _, port = served
-    monkeypatch.setattr(live_module, "TAKES_NOTHING_S", 6.0)
+    monkeypatch.setattr(viewer_module, "TAKES_NOTHING_S", 6.0)
     stopped = stopped_viewer(port)
     station.until(lambda: web.live.viewers == 1)
     loop = web.loop()

@@ -28,6 +28,7 @@ from ground_station.service.web import (
     live,
     maps,
     pages,
+    playback,
     problems,
     recordings,
     state,
@@ -51,6 +52,10 @@ Live, over the WebSocket /api/live?payload=ID: text messages {"type": hello, sta
 alarm, recording, gone, selected or pong, …}; binary ones are pictures: a header's length (4 bytes,
 big-endian), the header in JSON, a JPEG. It takes {"type": "select", "payload"}, {"type": "video",
 "on"}, {"type": "shown", "sequence", "shown_ms"} and {"type": "ping", "sent_ms"}.
+
+A recording is played back by the same messages over /api/recordings/FILE/play. Its hello has `tape`
+(begin_ns, length_s, marks), its state `playback` (at_s, playing, rate); it also takes
+{"type": "play", "on"}, {"type": "seek", "at_s"} and {"type": "rate", "rate"}.
 """
 # The system's own table may lack these, and scripts of another type are not run.
 _TYPES = {
@@ -143,6 +148,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
         jobs.router(guide.Guide(settings, shelf, recorded), job, shelf, recorded, snapshot)
     )
     app.include_router(live.router(viewers, access.sessions.holds))
+    app.include_router(playback.router(recorded, run, __version__, access.sessions.holds))
     app.include_router(pages.router(access, settings.name))
     app.include_router(pages.docs_router(app))
     _serve_dashboard(app, static)

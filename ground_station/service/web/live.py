@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import sys
 import time
 import traceback
@@ -12,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 from fastapi import APIRouter, WebSocket
-from starlette.websockets import WebSocketDisconnect
 
 from ground_station.service import alarms, bus_messages
 from ground_station.service.bus import Bus
@@ -23,44 +21,23 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.settings import HttpSettings
-from ground_station.service.web.access import Buckets
 from ground_station.service.web.metrics import Metrics
-from ground_station.service.web.outbox import Outbox
 from ground_station.service.web.snapshot import PAYLOADS, TEXT, Snapshot
 from ground_station.service.web.video import Video
+from ground_station.service.web.viewer import (
+    ENDS,
+    TRY_LATER,
+    Broken,
+    Viewer,
+    close,
+    finite,
+    may_stay,
+    said,
+)
 
 STATE_S = 0.25
-TAKES_NOTHING_S = 10.0
-MESSAGE_BYTES = 2048
-_MESSAGES_HZ, _MESSAGES_BURST = 100.0, 200
-_ESTIMATES_HZ, _OTHERS_HZ = 30.0, 5.0
 _LONGEST_SHOWN_MS = 60_000.0
-_LARGEST = 1e15
-_CLOSE_S = 1.0
-
-ENDS, GONE, NOT_OBEYED, FAILED, TRY_LATER, SESSION_ENDED = 1001, 1006, 1008, 1011, 1013, 4401
-"""Close codes; those below 4000 are RFC 6455's, section 7.4.1."""
-
-
-class _Broken(Exception):
-    """A viewer's message that is none."""
-
-
-class _Viewer:
-    """One live connection."""
-
-    def __init__(self, payload_id: str | None) -> None:
-        self.payload_id = payload_id
-        self.video = True
-        self.outbox = Outbox()
-        self.due_s: dict[str, float] = {}
-        self.messages = Buckets(_MESSAGES_HZ, _MESSAGES_BURST)
-        self.ended: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
-
-    def end(self, code: int, reason: str) -> None:
-        """Closes the connection soon."""
-        if not self.ended.done():
-            self.ended.set_result((code, reason))
+_ESTIMATES_HZ, _OTHERS_HZ = 30.0, 5.0
 
 
 class Live:
@@ -71,7 +48,7 @@ class Live:
     ) -> None:
         self._snapshot, self._metrics, self._settings = snapshot, metrics, settings
         self.video = video
-        self._viewers: set[_Viewer] = set()
+        self._viewers: set[Viewer] = set()
         self._alarms: dict[str, alarms.Standing] = {}
         self._alive: frozenset[str] = frozenset()
         self._job_ran = False
@@ -112,18 +89,18 @@ class Live:
             if own not in texts:
                 document = bus_messages.as_document(note)
                 document["points_px"] = document["points_px"][:600] if own else []
-                texts[own] = _text("estimate", payload=payload_id, estimate=document)
+                texts[own] = said("estimate", payload=payload_id, estimate=document)
             viewer.outbox.replace(f"estimate/{payload_id}", texts[own])
 
     def event(self, payload_id: str, note: EventMessage) -> None:
         """Everybody is told."""
         document = bus_messages.as_document(note)
         document["text"] = document["text"][:TEXT]
-        self._tell(_text("event", event={**document, "payload": payload_id}))
+        self._tell(said("event", event={**document, "payload": payload_id}))
 
     def recording(self, _: str, note: RecordingMessage) -> None:
         """Everybody is told the newest."""
-        text = _text("recording", recording=bus_messages.as_document(note))
+        text = said("recording", recording=bus_messages.as_document(note))
         for viewer in self._viewers:
             viewer.outbox.replace("recording", text)
 
@@ -162,18 +139,18 @@ class Live:
         self._follow_job(state["job"])
         alive = frozenset(name for name, item in state["payloads"].items() if item["alive"])
         for payload_id in self._alive - alive:
-            self._tell(_text("gone", payload=payload_id))
+            self._tell(said("gone", payload=payload_id))
         self._alive = alive
         for viewer in self._viewers:
             if viewer.payload_id is None and alive:
                 self._select(viewer, min(alive))
         if self._viewers:
-            text = _text("state", **state)
+            text = said("state", **state)
             for viewer in self._viewers:
                 viewer.outbox.replace("state", text)
 
     def _alarm(self, alarm: alarms.Alarm, active: bool) -> None:
-        self._tell(_text("alarm", active=active, alarm=vars(alarm)))
+        self._tell(said("alarm", active=active, alarm=vars(alarm)))
         level, word = (alarm.level, "begins") if active else (bus_messages.INFO, "is over")
         text = f"alarm {word}: {alarm.text}"
         name = "alarm-begins" if active else "alarm-over"
@@ -215,35 +192,28 @@ class Live:
             await socket.close(TRY_LATER, reason)
             return
         living = self._snapshot.living()
-        viewer = _Viewer(payload_id or (min(living) if living else None))
+        chosen = payload_id or (min(living) if living else None)
+        viewer = Viewer(chosen, self._metrics.pictures_sent.inc)
         viewer.outbox.tell(self._hello(viewer))
         self._viewers.add(viewer)
         self._want()
-        tasks = [
-            asyncio.create_task(self._send(socket, viewer)),
-            asyncio.create_task(self._receive(socket, viewer)),
-            asyncio.create_task(_watch(viewer, authorized)),
-        ]
-        for task in tasks:
-            task.add_done_callback(lambda _: viewer.end(GONE, ""))
         try:
-            code, reason = await viewer.ended
+            code, reason = await viewer.serve(
+                socket, lambda message: self._heard(viewer, message), authorized
+            )
         finally:
             self._viewers.discard(viewer)
             self._want()
             self._metrics.pictures_lost.inc(viewer.outbox.pictures_lost)
-            for task in tasks:
-                task.cancel()
-            await asyncio.wait(tasks)
-        await _close(socket, code, reason)
+        await close(socket, code, reason)
 
     def close(self) -> None:
         """Tells all viewers that the service ends."""
         for viewer in self._viewers:
             viewer.end(ENDS, "the service ends")
 
-    def _hello(self, viewer: _Viewer) -> str:
-        return _text(
+    def _hello(self, viewer: Viewer) -> str:
+        return said(
             "hello",
             now_ns=time.time_ns(),
             payload=viewer.payload_id,
@@ -252,68 +222,33 @@ class Live:
             state=self._snapshot.document(),
         )
 
-    async def _send(self, socket: WebSocket, viewer: _Viewer) -> None:
-        try:
-            while True:
-                message = await viewer.outbox.take()
-                async with asyncio.timeout(TAKES_NOTHING_S):
-                    if isinstance(message, str):
-                        await socket.send_text(message)
-                    else:
-                        await socket.send_bytes(message)
-                        self._metrics.pictures_sent.inc()
-        except TimeoutError:
-            viewer.end(FAILED, f"took nothing for {TAKES_NOTHING_S:.0f} s")
-        except (WebSocketDisconnect, RuntimeError, OSError):
-            viewer.end(GONE, "")
-
-    async def _receive(self, socket: WebSocket, viewer: _Viewer) -> None:
-        try:
-            while True:
-                text = await socket.receive_text()
-                if viewer.messages.take("") > 0:
-                    raise _Broken("too many messages")
-                self._heard(viewer, text)
-        except (_Broken, KeyError) as error:  # a binary message has no text
-            viewer.end(NOT_OBEYED, str(error) if isinstance(error, _Broken) else "not text")
-        except (WebSocketDisconnect, RuntimeError):
-            viewer.end(GONE, "")
-
-    def _heard(self, viewer: _Viewer, text: str) -> None:
-        if len(text) > MESSAGE_BYTES:
-            raise _Broken(f"a message has at most {MESSAGE_BYTES} characters")
-        try:
-            message = json.loads(text)
-        except (ValueError, RecursionError):
-            raise _Broken("not JSON") from None
-        kind = message.get("type") if isinstance(message, dict) else None
-        if not isinstance(kind, str):
-            raise _Broken("a message is an object with a type")
+    def _heard(self, viewer: Viewer, message: dict[str, Any]) -> None:
+        kind = message["type"]
         if kind == "select":
             payload_id = message.get("payload")
             if not isinstance(payload_id, str) or len(payload_id) > 32:
-                raise _Broken("select: payload is no id")
+                raise Broken("select: payload is no id")
             self._select(viewer, payload_id)
         elif kind == "video":
             if not isinstance(message.get("on"), bool):
-                raise _Broken("video: on is true or false")
+                raise Broken("video: on is true or false")
             viewer.video = message["on"]
             viewer.outbox.forget_picture()
             self._want()
         elif kind == "shown":
-            shown_ms = _finite(message.get("shown_ms"), "shown: shown_ms")
+            shown_ms = finite(message.get("shown_ms"), "shown: shown_ms")
             if viewer.payload_id is not None and 0 <= shown_ms <= _LONGEST_SHOWN_MS:
                 self._metrics.shown(viewer.payload_id, shown_ms / 1e3)
         elif kind == "ping":
-            sent_ms = _finite(message.get("sent_ms", 0), "ping: sent_ms")
-            viewer.outbox.tell(_text("pong", sent_ms=sent_ms, now_ns=time.time_ns()))
+            sent_ms = finite(message.get("sent_ms", 0), "ping: sent_ms")
+            viewer.outbox.tell(said("pong", sent_ms=sent_ms, now_ns=time.time_ns()))
 
-    def _select(self, viewer: _Viewer, payload_id: str) -> None:
+    def _select(self, viewer: Viewer, payload_id: str) -> None:
         if payload_id not in self._snapshot.payload_ids():
             payload_id = viewer.payload_id or ""
         viewer.payload_id = payload_id or None
         viewer.outbox.forget_picture()
-        viewer.outbox.tell(_text("selected", payload=viewer.payload_id))
+        viewer.outbox.tell(said("selected", payload=viewer.payload_id))
         self._want()
 
     def _want(self) -> None:
@@ -322,52 +257,13 @@ class Live:
             self.video.want(frozenset(wanted))
 
 
-async def _watch(viewer: _Viewer, authorized: Callable[[], bool]) -> None:
-    while authorized():
-        await asyncio.sleep(1.0)
-    viewer.end(SESSION_ENDED, "the session has ended")
-
-
-async def _close(socket: WebSocket, code: int, reason: str) -> None:
-    """Closes as agreed, or the hard way where the other side takes nothing."""
-    hard = code in (GONE, FAILED)
-    try:
-        async with asyncio.timeout(_CLOSE_S):
-            if code != GONE:
-                await socket.close(code, reason)
-        if code == NOT_OBEYED and (abort := socket.scope.get("abort")):
-            # It may go on sending; a moment for it to read why.
-            asyncio.get_running_loop().call_later(_CLOSE_S, abort)
-    except TimeoutError:
-        hard = True
-    except (RuntimeError, OSError):
-        pass
-    finally:
-        # An orderly end would wait until everything was taken.
-        if hard and (abort := socket.scope.get("abort")):
-            abort()
-
-
-def _finite(value: Any, what: str) -> float:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not -_LARGEST <= value <= _LARGEST:
-        raise _Broken(f"{what} is no number")
-    return float(value)
-
-
-def _text(kind: str, **content: Any) -> str:
-    return json.dumps({"type": kind, **content}, separators=(",", ":"), allow_nan=False)
-
-
 def router(live: Live, holds: Callable[[str], bool]) -> APIRouter:
     """The WebSocket; `holds` tells whether a session's cookie is still good."""
     result = APIRouter()
 
     @result.websocket("/api/live")
     async def serve(socket: WebSocket, payload: str | None = None) -> None:
-        state = socket.scope.get("state", {})
-        by, session = state.get("by"), str(state.get("session"))
         chosen = payload if payload in live.known() else None
-        await live.serve(socket, chosen, lambda: by != "cookie" or holds(session))
+        await live.serve(socket, chosen, may_stay(socket, holds))
 
     return result

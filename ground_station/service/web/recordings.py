@@ -20,6 +20,7 @@ from ground_station.errors import GroundStationError
 from ground_station.service.intake.files import MAP_TABLE
 from ground_station.service.web.models import FILE_PATTERN, AnswerModel, FileName, RecordingModel
 from ground_station.service.web.problems import Busy, NotFound, problems
+from pi_firmware.wire.errors import BlimpError
 
 _FILES = 500
 _PIECE_BYTES = 256 * 1024
@@ -85,6 +86,11 @@ class Recordings:
             if descriptor >= 0:
                 os.close(descriptor)
 
+    def path(self, name: str) -> Path:
+        """Where a recording lies; raises `NotFound`."""
+        self.size(name)
+        return self._folder / name
+
     def size(self, name: str) -> int:
         """How many bytes a recording has now; raises `NotFound`."""
         with self.open(name) as descriptor:
@@ -110,11 +116,11 @@ class Recordings:
         """
         from ground_station.recording.export import tum_lines
 
-        self.size(name)
+        path = self.path(name)
         if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
-            return "".join(tum_lines(self._folder / name))
+            return "".join(tum_lines(path))
         except OSError as error:
             raise NotFound(f"{name}: {error.strerror or error}") from None
         finally:
@@ -145,12 +151,11 @@ class Recordings:
 
 
 def _summed_up(path: Path) -> _Told:
-    from mcap.reader import SeekingReader
+    from pi_firmware.wire.recording import RecordingReader
 
     try:
-        with path.open("rb") as file:
-            summary = SeekingReader(file, record_size_limit=64 << 20).get_summary()
-    except Exception:  # a cut or foreign file: whatever its reader stumbles over
+        summary = RecordingReader(path).summary()
+    except BlimpError:  # a foreign file
         return _Told()
     figures = summary.statistics if summary else None
     if summary is None or figures is None or not figures.message_count:

@@ -1,4 +1,4 @@
-"""`ground_station.service.web.live`: what a viewer says over its WebSocket."""
+"""`ground_station.service.web.live` and `.viewer`: what a viewer says over its WebSocket."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 
 from pieces import Picker, as_json, changed, stretch
 
-from ground_station.service.web import live
+from ground_station.service.web import viewer as viewers
 from readers import asgi
 
 _WEB = asgi.application()
@@ -26,7 +26,7 @@ def fuzz(data: bytes) -> None:
 
 
 async def _hear(picker: Picker) -> None:
-    viewer = live._Viewer("blimp-1")
+    viewer = viewers.Viewer("blimp-1")
     for _ in range(50):
         if not picker.left():
             break
@@ -36,8 +36,8 @@ async def _hear(picker: Picker) -> None:
         else:
             text = as_json(changed(picker, message)).decode()
         try:
-            _WEB.live._heard(viewer, text)
-        except live._Broken as error:
+            _WEB.live._heard(viewer, viewers.parse(text))
+        except viewers.Broken as error:
             reason = str(error)
             # A close frame's reason has 123 bytes at most (RFC 6455, 5.5).
             assert len(reason.encode()) <= 123 and len(reason.splitlines()) == 1

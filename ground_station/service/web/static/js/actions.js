@@ -98,7 +98,7 @@ export class Actions {
     setText(this.buttons.map.f.detail, store.current?.estimate?.map || store.station.map || "–");
     for (const [name, button] of Object.entries(this.buttons)) {
       // What the payload does needs a payload; a localizer may be asked for an old one, too.
-      button.node.disabled = !is_open || (name !== "record" && !is_live);
+      button.node.disabled = !is_open || Boolean(store.playback) || (name !== "record" && !is_live);
     }
   }
 

@@ -106,7 +106,7 @@ export class Alarms {
 
   ring() {
     const is_loud = this.store.alarms.some((alarm) => rank(alarm.level) === 2 && !this.isSeen(alarm));
-    this.sound.ring(is_loud || this.isOffline());
+    this.sound.ring((is_loud && !this.store.playback) || this.isOffline());
   }
 
   isOffline() {

@@ -65,6 +65,15 @@ export class Connection {
     socket.onclose = (event) => socket === this.socket && this.lost(event.reason, event.code);
   }
 
+  /** Leaves what it is connected to for what the address is now. */
+  reopen() {
+    const before = this.socket;
+    this.socket = null; // its end is no loss
+    before?.close();
+    this.failures = 0;
+    this.open();
+  }
+
   /** Tries at once instead of at the end of the wait. */
   retryNow() {
     if (this.status.phase === "waiting") this.open();

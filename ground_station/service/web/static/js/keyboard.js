@@ -36,7 +36,7 @@ export class Keyboard {
   press(event) {
     if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || event.defaultPrevented) return;
     if (document.querySelector("dialog[open]")) return;
-    if (event.target instanceof HTMLInputElement) return;
+    if (event.target instanceof HTMLInputElement || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
     if (event.key === "?") {
       this.help.showModal();
       return;
@@ -56,7 +56,7 @@ export class Keyboard {
     const rows = [...this.shortcuts, { key: "1 … 9", does: "Choose a payload" }, { key: "?", does: "This page" }];
     byId("help-keys").append(
       ...rows.map(({ key, does }) => {
-        const keys = key.split(" ").map((part) => (part === "…" ? part : make("kbd", "", part.length === 1 ? part.toUpperCase() : part)));
+        const keys = (key === " " ? ["space"] : key.split(" ")).map((part) => (part === "…" ? part : make("kbd", "", part.length === 1 ? part.toUpperCase() : part)));
         return make("div", "", make("dt", "", ...keys), make("dd", "", does));
       }),
     );

@@ -15,6 +15,7 @@ import { Layout } from "./layout.js";
 import { Loop } from "./loop.js";
 import { Maps } from "./maps.js";
 import { Plan } from "./plan.js";
+import { Playback } from "./playback.js";
 import { body } from "./protocol.js";
 import { RecordingsDialog } from "./recordings.js";
 import { Scene } from "./scene.js";
@@ -58,7 +59,12 @@ const timing = new Timing(store, loop, theme, video);
 const alarms = new Alarms(store, loop);
 const mapDialog = new MapDialog(store);
 const powerDialog = new PowerDialog(store);
-const recordings = new RecordingsDialog();
+const playback = new Playback(store, send, () => {
+  store.clear();
+  video.clear();
+  connection.reopen();
+});
+const recordings = new RecordingsDialog((file) => playback.open(file));
 const steps = new Steps(store, loop);
 const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
 new Layout(() => {
@@ -90,13 +96,19 @@ loop.add(["selection"], () => {
 const takes = {
   hello: (message) => {
     clock.hello(message.now_ns);
+    if (message.tape) store.clear();
+    playback.take(message.tape);
     store.take(body(message, "state"));
     if (!store.selected && message.payload) store.select(message.payload);
     if (store.selected && store.selected !== message.payload) send({ type: "select", payload: store.selected });
     video.ask();
     maps.again();
   },
-  state: (message) => store.take(body(message)),
+  state: (message) => {
+    if (message.playback) clock.hello(message.now_ns); // it stands still, or runs faster
+    store.take(body(message));
+    playback.show(message.playback);
+  },
   estimate: (message) => store.takeEstimate(message.payload, body(message)),
   event: (message) => store.takeEvents([body(message)]),
   recording: (message) => store.takeRecording(body(message)),
@@ -113,12 +125,17 @@ const connection = new Connection({
   url: () => {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const query = store.selected ? `?payload=${encodeURIComponent(store.selected)}` : "";
-    return `${scheme}://${location.host}/api/live${query}`;
+    return `${scheme}://${location.host}${playback.path || `/api/live${query}`}`;
   },
   message: (message) => takes[message.type]?.(message),
   video: (header, jpeg) => video.take(header, jpeg),
   status: (status) => {
     store.link = status;
+    if (status.phase === "waiting" && playback.file) {
+      const why = status.reason || "the connection was lost";
+      actions.say("refused", `${playback.file}: not played: ${why}`, 12_000);
+      playback.leave();
+    }
     if (status.phase === "refused") location.assign("/login");
     // A handshake that is refused looks to a page like a broken network.
     if (status.phase === "waiting") api.isSignedOut().then((is) => is && location.assign("/login"));
@@ -136,6 +153,7 @@ new Keyboard(
     { key: "m", does: "Choose a map", act: () => actions.buttons.map.node.click() },
     { key: "n", does: "Steps from payload to flight", act: () => steps.open() },
     { key: "g", does: "Recordings", act: () => recordings.open() },
+    { key: " ", does: "Play or pause a recording", act: () => playback.toggle() },
     { key: "i", does: "Refresh the picture (key frame)", act: () => actions.buttons.idr.node.click() },
     { key: "a", does: "Acknowledge all alarms", act: () => alarms.acknowledgeAll() },
     { key: "s", does: "Alarm sound on or off", act: () => alarms.turnSound() },

@@ -8,7 +8,9 @@ import { dateTime, size, stopwatch } from "./format.js";
 const SURE_MS = 4000; // a second press within deletes
 
 export class RecordingsDialog {
-  constructor() {
+  /** @param {(file: string) => void} play */
+  constructor(play) {
+    this.play = play;
     this.dialog = dialog("recordings-dialog");
     this.f = fields(this.dialog);
     byId("recordings-open").addEventListener("click", () => this.open());
@@ -43,7 +45,13 @@ export class RecordingsDialog {
     const [path, name] = [api.recordingPath(file.file), make("b", "", dateTime(began_ms))];
     name.title = file.file;
     const row = make("li", "", make("div", "", name, make("small", "", facts), make("small", "", file.file)));
-    row.append(link("Download", path, file.file), link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
+    const player = make("button", "", "Play");
+    player.setAttribute("type", "button");
+    player.addEventListener("click", () => {
+      this.dialog.close();
+      this.play(file.file);
+    });
+    row.append(player, link("Download", path, file.file), link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
     if (!file.active) row.append(this.deleter(file.file));
     return row;
   }

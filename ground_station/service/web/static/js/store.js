@@ -83,10 +83,20 @@ export class Store {
     this.recording = null;
     /** @type {import("./types.js").Job|null} */
     this.job = null;
+    /** Where a recording is that is shown in place of the live flight. @type {{at_s: number, playing: boolean, rate: number}|null} */
+    this.playback = null;
     /** @type {any[]} */
     this.processes = [];
     /** @type {import("./connection.js").Status} */
     this.link = { phase: "connecting", since_ms: performance.now(), retry_ms: 0, reason: "" };
+  }
+
+  /** Forgets what was shown: another source is. */
+  clear() {
+    this.payloads.clear();
+    this.select("");
+    [this.events, this.alarms, this.recording, this.job, this.playback] = [[], [], null, null, null];
+    for (const topic of ["payloads", "payload", "estimate", "trail", "events", "alarms", "recording", "job"]) this.changed(topic);
   }
 
   /** @returns {Payload|null} */
@@ -126,6 +136,7 @@ export class Store {
       for (const topic of ["payload", "estimate", "trail"]) this.changed(topic);
       if (!this.selected) this.select(this.firstId());
     }
+    this.playback = snapshot.playback ?? null;
     if (snapshot.job !== undefined) {
       this.job = snapshot.job;
       this.changed("job");
@@ -203,6 +214,7 @@ export class Store {
     if (!this.isTold(payload)) return "OFFLINE";
     if (!payload.is_alive) return "GONE";
     if (!payload.estimate) return "WAITING";
+    if (this.playback) return payload.estimate.state;
     return performance.now() - payload.estimate_ms < STALE_S * 1e3 ? payload.estimate.state : "STALE";
   }
 }

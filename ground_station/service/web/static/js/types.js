@@ -95,6 +95,7 @@
  * @property {Event[]} [events]
  * @property {Alarm[]} [alarms]
  * @property {Job|null} [job]
+ * @property {{at_s: number, playing: boolean, rate: number}} [playback]
  *
  * @typedef {object} VideoHeader
  * @property {string} payload

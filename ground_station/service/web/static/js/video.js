@@ -155,7 +155,7 @@ export class Video {
 
   drawState() {
     const since_s = (performance.now() - this.shown_at_ms) / 1e3;
-    const is_stale = Boolean(this.shown) && since_s > 2;
+    const is_stale = Boolean(this.shown) && since_s > 2 && !this.store.playback;
     setAttribute(this.canvas, "data-stale", is_stale ? "true" : null);
     setAttribute(this.overlay, "data-stale", is_stale ? "true" : null);
     show(this.empty, !this.shown || is_stale);
