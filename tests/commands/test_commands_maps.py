@@ -156,7 +156,8 @@ def test_a_build_ends_with_a_verdict_a_picture_and_the_next_command(
     assert lines[0] == "WHOLE: all 16 images stand in this map, in one piece"
     assert lines[-2:] == [
         "picture: map/map.png",
-        "next: blimp map register map --page    (its scale and its place in the building)",
+        "next: blimp map register map --page --plan floorplan.png"
+        "    (its scale and its place in the building)",
     ]
     assert len(lines) <= 6
     assert (tmp_path / "map" / "map.png").read_bytes()[:4] == b"\x89PNG"

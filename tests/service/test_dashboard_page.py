@@ -337,7 +337,7 @@ def test_the_steps_lead_on_and_start_a_job(shown: Watched, station: FakeStation)
     station.refuse = ""
     build.get_by_role("button", name="Start").click()
     shown.until("document.querySelector('.step-outcome').textContent.startsWith('It runs')")
-    asked = ("job", {"step": "build", "recording": "b.mcap", "map": "hall"})
+    asked = ("job", {"step": "build", "choice": "b.mcap", "map": "hall"})
     assert station.asked == [asked, asked]
     shown.page.keyboard.press("Escape")
 
@@ -381,9 +381,10 @@ def test_recordings_are_listed_and_deleted_by_a_second_press(
     assert "atrium, <b>hall</b> · 12:34 · 61 MB" in shown.text(row)
     links = shown.page.locator(f"{row} a").evaluate_all("links => links.map((a) => a.pathname)")
     assert links == [f"/api/recordings/{file}", f"/api/recordings/{file}/trajectory.txt"]
-    shown.page.click(f"{row} button")
+    deleter = shown.page.locator(f"{row} button:last-child")
+    deleter.click()
     assert station.asked == []
-    shown.page.click(f"{row} button")
+    deleter.click()
     shown.until("document.querySelectorAll('.recordings li').length === 1")
     assert station.asked == [("delete", file)]
     shown.page.keyboard.press("Escape")

@@ -80,6 +80,7 @@ def own_map(name: str = "hall", registered: bool = True, inputs: str = "flight.m
     text = (folder / "map.toml").read_text().replace("mapping.mcap", inputs)
     if not registered:
         text = text.replace('frame = "world"', 'frame = "sfm"')
+        (folder / "floorplan.yaml").unlink()
     (folder / "map.toml").write_text(text)
 
 
@@ -147,8 +148,11 @@ def test_with_the_payloads_own_recording() -> None:
         "blimp map build recordings/board.mcap --camera camera.toml --out maps/NAME"
     )
     own_map(registered=False)
+    register = told(guide())["register"]
+    assert "as floorplan.png" in register.ways[0].text and register.choices == []
     Path("floorplan.png").touch()
     steps = told(guide(), heard())
+    assert steps["register"].choices == ["hall"]
     assert steps["build"].state == "done" and "WHOLE: all 125 images" in steps["build"].found
     assert steps["register"].state == "ready" and steps["fly"].state == "waiting"
     assert steps["register"].ways[0].command == (
@@ -172,6 +176,11 @@ def test_with_a_map_of_a_phones_video_the_payload_needs_a_lens_of_its_own() -> N
     steps = told(guide())
     assert steps["record"].state == "done" and steps["build"].state == "ready"
     assert steps["build"].ways[1].command == "blimp map build 'Walk 1.MP4' --out maps/NAME"
+    assert steps["build"].choices == ["Walk 1.MP4"]
+    Path("camera.toml").write_text(CAMERA)  # the payload's, and not the phone's
+    words = guide().job({"station": {"demo": False}, "payloads": {}}, "build", "Walk 1.MP4", "hall")
+    assert words == ["blimp", "map", "build", "Walk 1.MP4", "--out", "maps/hall"]
+    Path("camera.toml").unlink()
     own_map(inputs="Walk 1.MP4")
     fly = told(guide(), heard())["fly"]
     assert fly.state == "waiting" and "another camera" in fly.found

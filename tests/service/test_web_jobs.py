@@ -118,19 +118,28 @@ def test_what_is_left_of_a_killed_run_is_no_job(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "status"),
     [
-        ({"step": "build", "recording": "a.mcap", "map": "../x"}, 422),
-        ({"step": "build", "recording": "../a.mcap", "map": "x"}, 422),
-        ({"step": "build", "recording": "none.mcap", "map": "x"}, 404),
-        ({"step": "build", "recording": "a.mcap"}, 409),
-        ({"step": "build", "recording": "a.mcap", "map": "atrium"}, 409),
-        ({"step": "register", "map": "nowhere"}, 404),
-        ({"step": "fly", "map": "atrium"}, 422),
-        ({"step": "build", "recording": "a.mcap", "map": "x", "command": "rm"}, 422),
+        ({"step": "build", "choice": "a.mcap", "map": "../x"}, 422),
+        ({"step": "build", "choice": "../recordings/a.mcap", "map": "x"}, 404),
+        ({"step": "build", "choice": "none.mcap", "map": "x"}, 404),
+        ({"step": "build", "choice": "a.mcap"}, 409),
+        ({"step": "build", "choice": "a.mcap", "map": "atrium"}, 409),
+        ({"step": "register", "choice": "nowhere"}, 404),
+        ({"step": "register", "choice": "atrium"}, 404),
+        ({"step": "fly", "choice": "a.mcap"}, 422),
+        ({"step": "build"}, 422),
+        ({"step": "build", "choice": "--out.mp4", "map": "x"}, 404),
+        ({"step": "build", "choice": "a.mcap", "map": "x", "command": "rm"}, 422),
     ],
 )
 def test_only_what_is_there_is_built_and_nothing_is_overwritten(
-    served: Any, tmp_path: Path, body: dict[str, Any], status: int
+    served: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    body: dict[str, Any],
+    status: int,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "--out.mp4").touch()
     shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
     assert served[0].post("/api/job", json=body).status_code == status
     assert served[0].get("/api/state").json()["job"] is None
@@ -141,9 +150,10 @@ def test_a_real_command_goes_on_without_its_page(
 ) -> None:
     """Here it fails, in its own words, and everybody is told."""
     client, bus, _ = served
-    (tmp_path / "recordings" / "a.mcap").write_bytes(b"nothing")
-    monkeypatch.setattr("ground_station.service.web.guide.CAMERA", str(tmp_path / "none.toml"))
-    answer = client.post("/api/job", json={"step": "calibrate", "recording": "a.mcap"})
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
+    (tmp_path / "board.toml").write_text("no = 'board'\n")
+    answer = client.post("/api/job", json={"step": "calibrate", "choice": "a.mcap"})
     assert answer.json()["done"], answer.text
     station.until(lambda: not client.get("/api/state").json()["job"]["running"])
     job = client.get("/api/state").json()["job"]

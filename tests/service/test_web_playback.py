@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import threading
 from collections.abc import Iterator
@@ -14,58 +13,13 @@ import numpy as np
 import pytest
 import web_station as station
 import websockets
+from tape_stand import ALARM_S, FLIGHT, OTHER, RATE_HZ, SECONDS, T0_NS, P, serving, write, x_of
 from viewing import connect, next_of, run
 
 from ground_station.recording.flight import FlightRecording
-from ground_station.service import bus_messages
-from ground_station.service.web.app import build
 from ground_station.service.web.playback import AT_ONCE
-from ground_station.service.web.server import listen, server
 from ground_station.service.web.tape import Tape
 from pi_firmware.wire.errors import BlimpError
-from pi_firmware.wire.recording import RecordingReader, RecordingWriter
-
-T0_NS, RATE_HZ, SECONDS = 1_700_000_000_000_000_000, 30.0, 14.0
-P, OTHER = station.PAYLOAD, "blimp-2"
-FLIGHT = station.ATRIUM / "flight.mcap"
-ALARM = "alarm begins: LOST for 2 s: searching"
-
-
-def x_of(at_s: float) -> float:
-    """Where the payload was then, metres: it flies along x."""
-    return round(0.5 * at_s, 3)
-
-
-def write(path: Path, *, told: bool = True) -> Path:
-    """As `GroundRun` writes: a flight along x, a second payload, an alarm at 6 s; or video."""
-    units = [sample.data for sample in RecordingReader(FLIGHT).video()][: int(SECONDS * RATE_HZ)]
-    with RecordingWriter(path) as writer:
-        if told:
-            writer.write_metadata("map atrium", {"name": "atrium"})
-
-        def say(topic: str, at_ns: int, note: bus_messages.Message) -> None:
-            writer.write_json_text(topic, at_ns, bus_messages.encode(note), schema_name="x")
-
-        for k, unit in enumerate(units):
-            at_s = k / RATE_HZ
-            at_ns = T0_NS + int(1e9 * at_s)
-            writer.write_video(at_ns - 5, unit, log_ns=at_ns)
-            if not told:
-                continue
-            note = station.estimate(
-                k, capture_ns=at_ns, done_ns=at_ns, points_px=[], position_m=[x_of(at_s), 2.0, 1.5],
-                state="LOST" if 6.0 <= at_s < 9.0 else "TRACKING",
-            )  # fmt: skip
-            say("/estimate/state", at_ns, note)
-            if k % 15 == 0:
-                for name in (P, OTHER):
-                    battery = {"voltage": round(4.2 - 0.01 * at_s, 3)}
-                    say(f"/station/{name}/payload", at_ns, station.payload(battery=battery))
-            if k == int(6 * RATE_HZ):
-                said = station.event(level="alarm", name="alarm-begins", text=ALARM, time_ns=at_ns)
-                say(f"/station/{P}/event", at_ns, said)
-                say("/station/event", at_ns, station.event(text="of no weight", time_ns=at_ns))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -79,20 +33,9 @@ def shelf(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def port(tmp_path: Path, shelf: Path, flight: Path) -> Iterator[int]:
-    """The application behind the real server, with the flight among its recordings."""
-    bus = station.SilentBus()
-    web = build(station.run_of(tmp_path, video_rate_hz=20.0), tmp_path, bus, None)
-    (shelf / "flight.mcap").write_bytes(flight.read_bytes())
-    with listen("127.0.0.1", 0) as sock:
-        serving = server(web.guarded)
-        thread = threading.Thread(target=lambda: asyncio.run(serving.serve([sock])), daemon=True)
-        thread.start()
-        station.until(lambda: serving.started)
-        yield sock.getsockname()[1]
-        serving.should_exit = True
-        thread.join(10.0)
-        assert not thread.is_alive()
+def port(tmp_path: Path, flight: Path) -> Iterator[int]:
+    with serving(tmp_path, flight) as port:
+        yield port
 
 
 def play(port: int, file: str = "flight.mcap") -> Any:
@@ -131,7 +74,7 @@ def test_a_flight_is_shown_as_it_was_from_its_beginning(port: int) -> None:
 
 def test_the_time_line_has_the_alarms_of_then_and_not_what_is_of_no_weight(flight: Path) -> None:
     tape = Tape(flight)
-    mark = {"at_s": 6.0, "level": "alarm", "payload": P, "text": "LOST for 2 s: searching"}
+    mark = {"at_s": ALARM_S, "level": "alarm", "payload": P, "text": "LOST for 2 s: searching"}
     assert tape.marks == [mark]
     assert tape.payloads == [P, OTHER] and tape.map == "atrium"
 
@@ -232,7 +175,7 @@ def test_one_that_was_cut_is_played_up_to_there(port: int, shelf: Path, flight: 
         async with play(port, "cut.mcap") as viewer:
             hello = await next_of(viewer, "hello")
             assert 6.5 < hello["tape"]["length_s"] < SECONDS - 2
-            assert [mark["at_s"] for mark in hello["tape"]["marks"]] == [6.0]
+            assert [mark["at_s"] for mark in hello["tape"]["marks"]] == [ALARM_S]
             await ask(viewer, "seek", at_s=5.0)
             found = await told_hello(viewer, 5.0)
             x = found["state"]["payloads"][P]["estimate"]["position_m"][0]

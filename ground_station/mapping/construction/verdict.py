@@ -76,7 +76,8 @@ def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
         return "blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
     if map_.info.registered:
         return f"blimp localize VIDEO --map {where} --out est.txt"
-    return f"blimp map register {where} --page    (its scale and its place in the building)"
+    plan = "" if (Path(folder) / "floorplan.yaml").exists() else " --plan floorplan.png"
+    return f"blimp map register {where} --page{plan}    (its scale and its place in the building)"
 
 
 def _first(

@@ -144,9 +144,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     app.include_router(maps.router(shelf))
     app.include_router(control.router(control.Control(bus, snapshot), shelf))
     app.include_router(recordings.router(recorded))
-    app.include_router(
-        jobs.router(guide.Guide(settings, shelf, recorded), job, shelf, recorded, snapshot)
-    )
+    app.include_router(jobs.router(guide.Guide(settings, shelf, recorded), job, snapshot))
     app.include_router(live.router(viewers, access.sessions.holds))
     app.include_router(playback.router(recorded, run, __version__, access.sessions.holds))
     app.include_router(pages.router(access, settings.name))

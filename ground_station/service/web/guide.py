@@ -15,17 +15,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import load_camera
 from ground_station.map.store import MapInfo
 from ground_station.mapping.construction.verdict import first_line
 from ground_station.service import lan
 from ground_station.service.settings import DEMO_PAYLOAD, SAMPLE, StationSettings
 from ground_station.service.web.maps import Maps
+from ground_station.service.web.problems import NotFound
 from ground_station.service.web.recordings import Recordings
 from pi_firmware.wire.errors import BlimpError
 
 State = Literal["done", "ready", "waiting"]
 CAMERA, BOARD, REPORT = "camera.toml", "board.toml", "calibration.html"
+PLAN = "floorplan.png"
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 _CHOICES = 50
 
@@ -122,7 +125,7 @@ class Guide:
     def _calibrate(self, recordings: list[Any]) -> Step:
         title = "The payload's camera is calibrated"
         names = [str(item["file"]) for item in recordings]
-        again = self._calibration(names[0] if names else "RECORDING.mcap")
+        again = shlex.join(self._words("calibrate", [*names, "RECORDING.mcap"][0]))
         board = Path(BOARD).is_file()
         make = Way("once: a board to print", "blimp calibrate board --out board.pdf")
         ways = [
@@ -164,17 +167,16 @@ class Guide:
         names = [str(item["file"]) for item in recordings]
         videos = _videos()
         ways = [
-            Way("of the payload's recording", self.build_of(names[0] if names else "FLIGHT.mcap")),
-            Way(
-                "of a phone's video, whose lens the build finds itself",
-                f"blimp map build {shlex.quote((videos or ['walk.mp4'])[0])} --out"
-                f" {shlex.quote(f'{self._settings.map.shelf}/NAME')}",
-            ),
+            Way(text, shlex.join(self._words("build", choice)))
+            for text, choice in (
+                ("of the payload's recording", [*names, "FLIGHT.mcap"][0]),
+                ("of a phone's video, whose lens the build finds itself", [*videos, "walk.mp4"][0]),
+            )
         ]
         name = maps[0][0] if maps else "NAME"
-        folder = shlex.quote(f"{self._settings.map.shelf}/{name}")
+        folder = shlex.quote(self._folder(name))
         check = f"blimp map view {folder} --out {shlex.quote(f'{name}.html')} --open"
-        choices = names[:_CHOICES]
+        choices = [*names[:_CHOICES], *videos[:_CHOICES]]
         if maps:
             found = f"{name}: {first_line(maps[0][1].built)}"
             return Step("build", title, "done", found, check, ways, choices)
@@ -186,8 +188,12 @@ class Guide:
         title = "The map lies in the building"
         open_ones = [name for name, info in maps if not info.registered]
         name, info = maps[0] if maps else ("NAME", None)
-        folder = shlex.quote(f"{self._settings.map.shelf}/{name}")
-        ways = [Way("click the same places on map and floor plan", self.registration(name))]
+        folder = shlex.quote(self._folder(name))
+        words = self._words("register", name)
+        ways = [Way("click the same places on map and floor plan", shlex.join(words))]
+        if PLAN in words and not Path(PLAN).is_file():
+            ways.insert(0, Way(f"put a picture of the floor plan into this folder, as {PLAN}"))
+            open_ones = []
         check = f"blimp map info {folder}"
         if info is None:
             return Step("register", title, "waiting", "needs a map", check, ways)
@@ -211,7 +217,7 @@ class Guide:
                 found = f"{payload} is tracked in {estimate['map']}"
                 return Step("fly", title, "done", found, check)
         (name, info), camera = registered[0], self.camera()
-        command = f"blimp serve --lan --map {shlex.quote(f'{self._settings.map.shelf}/{name}')}"
+        command = f"blimp serve --lan --map {shlex.quote(self._folder(name))}"
         if camera:
             command += f" --set map.camera={shlex.quote(camera)}"
         ways = [Way("or choose it by Map… (M) on a page that shows the payload", command)]
@@ -226,32 +232,38 @@ class Guide:
         """The payload's calibration as it is or will be given; "" where there is none."""
         return self._settings.map.camera or (CAMERA if Path(CAMERA).is_file() else "")
 
-    def _recording(self, file: str) -> str:
-        return str(Path(self._settings.recording.folder) / file)
+    def _folder(self, name: str) -> str:
+        """Where a map lies, or will."""
+        try:
+            return str(self._shelf.folder(name))
+        except BlimpError:
+            return str(Path(self._settings.map.shelf) / name)
 
-    def _calibration(self, file: str) -> str:
-        return shlex.join(self.words("calibrate", file, ""))
+    def job(self, station: Mapping[str, Any], step: str, choice: str, name: str) -> list[str]:
+        """The command line of a step's long job: of one of its choices, and of a new map's name.
 
-    def build_of(self, file: str) -> str:
-        """The command that builds a map of a recording."""
-        return shlex.join(self.words("build", file, "NAME"))
+        Raises a `BlimpError` for another choice, and for a name that is taken.
+        """
+        if choice not in next(one.choices for one in self.steps(station) if one.name == step):
+            raise NotFound(f"{choice[:80]!r}: cannot be taken for this step now")
+        if step == "build" and (not name or Path(self._folder(name)).exists()):
+            raise GroundStationError(f"{name or 'the map'}: give it a name that is not taken")
+        return self._words(step, choice, name)
 
-    def registration(self, name: str) -> str:
-        """The command that registers a map by clicks."""
-        return shlex.join(self.words("register", "", name))
-
-    def words(self, step: str, file: str, name: str) -> list[str]:
-        """The command line of a step, of a recording's file or a map's name."""
-        recording, folder = self._recording(file), f"{self._settings.map.shelf}/{name}"
+    def _words(self, step: str, choice: str, name: str = "NAME") -> list[str]:
+        """The command line of a step, of a recording, a video or a map."""
+        recording = str(Path(self._settings.recording.folder) / choice)
         if step == "calibrate":
             given = [recording, "--board", BOARD, "--out", CAMERA, "--report", REPORT]
             return ["blimp", "calibrate", *given]
-        if step == "build":
-            lens = ["--camera", camera] if (camera := self.camera()) else []
-            return ["blimp", "map", "build", recording, *lens, "--out", folder]
-        plans = sorted(str(path) for path in Path().glob("floorplan.*") if path.suffix != ".yaml")
-        plan = ["--plan", plans[0]] if plans else []
-        return ["blimp", "map", "register", folder, "--page", *plan]
+        if step == "register":
+            folder = self._folder(choice)
+            plan = [] if (Path(folder) / "floorplan.yaml").is_file() else ["--plan", PLAN]
+            return ["blimp", "map", "register", folder, "--page", *plan]
+        if choice.lower().endswith(_VIDEOS):  # whose camera is another than the payload's
+            return ["blimp", "map", "build", choice, "--out", self._folder(name)]
+        lens = ["--camera", camera] if (camera := self.camera()) else []
+        return ["blimp", "map", "build", recording, *lens, "--out", self._folder(name)]
 
     def _own_maps(self) -> Iterator[tuple[str, MapInfo]]:
         """Those that do not ship: the station's own map first, then the newest."""
@@ -293,7 +305,9 @@ def _videos() -> list[str]:
         found = [
             (-entry.stat().st_mtime_ns, entry.name)
             for entry in entries
-            if entry.name.lower().endswith(_VIDEOS) and entry.is_file(follow_symlinks=False)
+            if entry.name.lower().endswith(_VIDEOS)
+            and not entry.name.startswith("-")
+            and entry.is_file(follow_symlinks=False)
         ]
     return [name for _, name in sorted(found)]
 

@@ -26,10 +26,8 @@ from fastapi import APIRouter
 
 from ground_station.errors import GroundStationError
 from ground_station.service.web.guide import Guide
-from ground_station.service.web.maps import Maps
 from ground_station.service.web.models import AnswerModel, GuideModel, JobRequest
-from ground_station.service.web.problems import Busy, NotFound, problems
-from ground_station.service.web.recordings import Recordings
+from ground_station.service.web.problems import Busy, problems
 from ground_station.service.web.snapshot import Snapshot
 from pi_firmware.wire import files
 from pi_firmware.wire.text import printable
@@ -152,9 +150,7 @@ class Jobs:
         return []
 
 
-def router(
-    guide: Guide, jobs: Jobs, shelf: Maps, recorded: Recordings, snapshot: Snapshot
-) -> APIRouter:
+def router(guide: Guide, jobs: Jobs, snapshot: Snapshot) -> APIRouter:
     """The guide and its jobs over HTTP."""
     result = APIRouter(prefix="/api", tags=["guide"])
 
@@ -166,14 +162,8 @@ def router(
     @result.post("/job", response_model=AnswerModel, responses=problems(404, 409, 413))
     def start(request: JobRequest) -> Any:
         """Starts a long job, which goes on when the page is closed."""
-        file, name = request.recording or "", request.map or ""
-        if request.step != "register":
-            recorded.size(file)
-        if request.step == "register" and name not in shelf.names():
-            raise NotFound(f"there is no map {name!r}")
-        if request.step == "build" and (not name or name in shelf.names()):
-            raise GroundStationError(f"{name or 'map'}: give the map a name that is not taken")
-        words = guide.words(request.step, file, name)
+        station = snapshot.document(full=False)
+        words = guide.job(station, request.step, request.choice, request.map or "")
         browser = ["--no-browser"] if request.step == "register" else []
         jobs.start(request.step, [*words, *browser])
         return {"done": True, "reason": "", "values": {}}

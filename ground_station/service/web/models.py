@@ -32,10 +32,10 @@ class _Model(BaseModel):
 
 
 class JobRequest(_Model):
-    """A long job: the step that it is of, with its recording, or the name of its map."""
+    """A long job: its step, one of the choices that the guide has for it, and a new map's name."""
 
     step: Literal["calibrate", "build", "register"]
-    recording: Annotated[str, StringConstraints(pattern=FILE_PATTERN)] | None = None
+    choice: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     map: Annotated[str, StringConstraints(pattern=MAP_PATTERN)] | None = None
 
 

@@ -96,7 +96,10 @@ loop.add(["selection"], () => {
 const takes = {
   hello: (message) => {
     clock.hello(message.now_ns);
-    if (message.tape) store.clear();
+    if (message.tape) {
+      store.clear();
+      store.select(message.payload ?? "");
+    }
     playback.take(message.tape);
     store.take(body(message, "state"));
     if (!store.selected && message.payload) store.select(message.payload);

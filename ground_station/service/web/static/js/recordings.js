@@ -51,7 +51,8 @@ export class RecordingsDialog {
       this.dialog.close();
       this.play(file.file);
     });
-    row.append(player, link("Download", path, file.file), link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
+    if (!file.active) row.append(player);
+    row.append(link("Download", path, file.file), link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
     if (!file.active) row.append(this.deleter(file.file));
     return row;
   }

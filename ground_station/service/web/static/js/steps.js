@@ -85,9 +85,8 @@ export class Steps {
     const outcome = make("p", "step-outcome", "");
     outcome.setAttribute("role", "status");
     button.addEventListener("click", async () => {
-      const of = step.name === "register" ? { map: select.value } : { recording: select.value };
       const more = step.name === "build" ? { map: name.value.trim() } : {};
-      const answer = await api.post("/api/job", { step: step.name, ...of, ...more });
+      const answer = await api.post("/api/job", { step: step.name, choice: select.value, ...more });
       setText(outcome, answer.done ? "It runs, also when this page is closed." : answer.reason);
     });
     const parts = [make("span", "", label), select, ...(step.name === "build" ? [name] : []), button];
