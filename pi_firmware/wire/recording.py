@@ -7,6 +7,7 @@ Times are integer nanoseconds; a message's log time is its capture time.
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -313,7 +314,7 @@ class RecordingReader:
 
     def message_count(self, topic: str) -> int | None:
         """The number of messages on `topic` by the recording's index, None when it has none."""
-        summary = self.summary()
+        summary = self.summary
         if summary is None or summary.statistics is None:
             return None
         counts = summary.statistics.channel_message_counts
@@ -321,7 +322,7 @@ class RecordingReader:
 
     def metadata_table(self, name: str) -> dict[str, str]:
         """The metadata table of that name, wherever it stands in the file; empty when it is not."""
-        summary = self.summary()
+        summary = self.summary
         if name not in self.metadata and (
             summary is None or any(index.name == name for index in summary.metadata_indexes)
         ):
@@ -336,19 +337,21 @@ class RecordingReader:
 
         One without an index, as after a cut, is read from its beginning and in file order.
         """
-        if self.summary() is None:
+        if (summary := self.summary) is None:
             for channel, message in self.messages(topics):
                 if message.log_time >= from_ns:
                     yield channel, message
             return
         with self.path.open("rb") as file:
             reader = SeekingReader(Clamped.of(file, self.path.stat().st_size))
+            reader._summary = summary  # of an hour's recording it takes a second to read
             try:
                 for _, channel, message in reader.iter_messages(topics, start_time=from_ns):
                     yield channel, message
             except (*PARSE_ERRORS, OSError):
                 self.cut, self.cut_reason = True, "it is damaged"
 
+    @functools.cached_property
     def summary(self) -> Summary | None:
         """The index at the end of the file; None when it is cut off or damaged."""
         with self.path.open("rb") as file:

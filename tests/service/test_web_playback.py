@@ -17,6 +17,7 @@ from tape_stand import ALARM_S, FLIGHT, OTHER, RATE_HZ, SECONDS, T0_NS, P, servi
 from viewing import connect, next_of, run
 
 from ground_station.recording.flight import FlightRecording
+from ground_station.service.web import playback
 from ground_station.service.web.playback import AT_ONCE
 from ground_station.service.web.tape import Tape
 from pi_firmware.wire.errors import BlimpError
@@ -180,6 +181,29 @@ def test_one_that_was_cut_is_played_up_to_there(port: int, shelf: Path, flight: 
             found = await told_hello(viewer, 5.0)
             x = found["state"]["payloads"][P]["estimate"]["position_m"][0]
             assert x == pytest.approx(x_of(5.0), abs=0.02)
+
+    run(main())
+
+
+def test_a_page_is_told_that_a_long_one_is_being_read(
+    port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would take the silence for a broken connection."""
+    read = threading.Event()
+
+    def slow(path: Path) -> Tape:
+        read.wait(30.0)
+        return Tape(path)
+
+    monkeypatch.setattr(playback, "_BREATH_S", 0.05)
+    monkeypatch.setattr(playback, "Tape", slow)
+
+    async def main() -> None:
+        async with play(port) as viewer:
+            for _ in range(3):
+                assert json.loads(await viewer.recv())["type"] == "reading"
+            read.set()
+            assert (await next_of(viewer, "hello"))["payload"] == P
 
     run(main())
 

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fastapi import APIRouter, WebSocket
+from starlette.websockets import WebSocketDisconnect
 
 from ground_station.service import alarms, bus_messages
 from ground_station.service.bus_messages import (
@@ -51,6 +52,7 @@ SLOWEST, FASTEST = 0.1, 16.0
 _LEAD_NS, _DECODE_NS = 10_000_000_000, 1_500_000_000
 """Heard and decoded before the time that is sought; an IDR comes each second."""
 _BEHIND_NS = 1_000_000_000
+_BREATH_S = 1.0
 _SAME = {"offset_ns": 0, "uncertainty_ns": 0}
 _REASON = 120
 
@@ -273,6 +275,13 @@ class Playback:
                 self._post(self._viewer.outbox.show, self._picture)
 
 
+async def _breathe(viewer: Viewer) -> None:
+    """A page takes silence for a broken connection, and a cut recording's times are far apart."""
+    while True:
+        viewer.outbox.replace("reading", said("reading"))
+        await asyncio.sleep(_BREATH_S)
+
+
 def router(recorded: Recordings, run: Run, version: str, holds: Callable[[str], bool]) -> APIRouter:
     """The WebSocket of a recording; `holds` as for the live one."""
     result = APIRouter()
@@ -285,10 +294,15 @@ def router(recorded: Recordings, run: Run, version: str, holds: Callable[[str], 
             await close(socket, TRY_LATER, f"{AT_ONCE} recordings are played back already")
             return
         async with places:
+            reading = asyncio.create_task(asyncio.to_thread(lambda: Tape(recorded.path(file))))
             try:
-                tape = await asyncio.to_thread(lambda: Tape(recorded.path(file)))
+                while not (await asyncio.wait({reading}, timeout=_BREATH_S))[0]:
+                    await socket.send_text(said("reading"))
+                tape = reading.result()
             except (BlimpError, OSError) as error:
                 await close(socket, TRY_LATER, str(error)[:_REASON])
+                return
+            except (WebSocketDisconnect, RuntimeError):
                 return
             viewer = Viewer(tape.payloads[0] if tape.payloads else None)
             loop = asyncio.get_running_loop()
@@ -299,9 +313,11 @@ def router(recorded: Recordings, run: Run, version: str, holds: Callable[[str], 
 
             playback = Playback(tape, run, version, viewer, post)
             playback.start()
+            breathing = asyncio.create_task(_breathe(viewer))
             try:
                 code, reason = await viewer.serve(socket, playback.heard, may_stay(socket, holds))
             finally:
+                breathing.cancel()
                 playback.close()
         await close(socket, code, reason)
 

@@ -154,7 +154,7 @@ def _summed_up(path: Path) -> _Told:
     from pi_firmware.wire.recording import RecordingReader
 
     try:
-        summary = RecordingReader(path).summary()
+        summary = RecordingReader(path).summary
     except BlimpError:  # a foreign file
         return _Told()
     figures = summary.statistics if summary else None

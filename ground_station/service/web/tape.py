@@ -47,9 +47,8 @@ class Tape:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        reader = RecordingReader(path)
-        summary = reader.summary()
+        self._reader = reader = RecordingReader(path)
+        summary = reader.summary
         figures = summary.statistics if summary else None
         self.map = ""
         if summary is not None and figures is not None and figures.message_count:
@@ -82,7 +81,7 @@ class Tape:
         return self._heard(from_ns, set(self._sources))
 
     def _heard(self, from_ns: int, topics: set[str]) -> Iterator[Heard]:
-        for channel, message in RecordingReader(self._path).since(from_ns, topics):
+        for channel, message in self._reader.since(from_ns, topics):
             payload_id, kind = self._sources[channel.topic]
             if kind == VIDEO_TOPIC:
                 with contextlib.suppress(ValueError):  # what is no video is left out
