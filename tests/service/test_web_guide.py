@@ -13,7 +13,12 @@ import web_station as station
 
 from ground_station import cli
 from ground_station.cli import parser as blimp
-from ground_station.service.settings import MapSettings, RecordingSettings, StationSettings
+from ground_station.service.settings import (
+    MapSettings,
+    RecordingSettings,
+    StationSettings,
+    TelemetrySettings,
+)
 from ground_station.service.web.guide import Guide, Step, first_way
 from ground_station.service.web.maps import Maps
 from ground_station.service.web.recordings import Recordings
@@ -107,6 +112,16 @@ def test_it_begins_with_keys_and_goes_on_as_each_is_made() -> None:
     assert first_way(guide().steps(lan)) == "sudo blimp doctor --lan"
     lan["station"]["loopback"] = True
     assert first_way(guide().steps(lan)) == "blimp serve --lan"
+
+
+def test_keys_that_were_made_elsewhere_are_not_asked_for() -> None:
+    """As of an installed service, whose user has none but its certificates."""
+    telemetry = TelemetrySettings(["tls/0.0.0.0:7447"], certificates="/etc/blimp")
+    settings = StationSettings(map=MapSettings(folder=str(station.ATRIUM)), telemetry=telemetry)
+    of = Guide(settings, Maps(settings.map), Recordings(Path("recordings"), lambda: ""))
+    lan = {"station": {"demo": False, "loopback": False}, "payloads": {}}
+    assert first_way(of.steps(lan)) == "sudo blimp doctor --lan"
+    assert first_way(of.steps(None)) == "blimp serve --lan"
 
 
 def test_a_payload_counts_when_its_video_comes_and_the_demos_does_not() -> None:

@@ -92,16 +92,18 @@ class Guide:
             found = f"{', '.join(heard)}: heard, without video"
             return Step("payload", title, "ready", found, check, [way])
         if recordings:
-            found = f"none now; the newest recording is of {_day(recordings[0])}"
-            way = Way("power it, and listen on its network", "blimp serve --lan")
-            return Step("payload", title, "ready", found, check, [way])
-        found, way = self._towards_a_payload(station)
+            newest = f"none now; the newest recording is of {_day(recordings[0])}"
+            found, way = self._listening(station, newest)
+        else:
+            found, way = self._towards_a_payload(station)
         return Step("payload", title, "ready", found, check, [way])
 
     def _towards_a_payload(self, station: Mapping[str, Any] | None) -> tuple[str, Way]:
         """What stands between this computer and a payload that is heard."""
         keys = lan.authority()
         payloads = sorted(path.name for path in (keys / "payload").glob("*") if path.is_dir())
+        if not keys.is_dir() and self._settings.telemetry.certificates:
+            return self._listening(station, "nothing is heard")  # the keys are made elsewhere
         if not keys.is_dir():
             return "no keys yet", Way("your own authority, once", "blimp keys init")
         if not (keys / "ground" / self._settings.name).is_dir():
@@ -118,9 +120,12 @@ class Guide:
             flash += f" PAYLOAD={payloads[0]} WIFI=SSID COUNTRY=DE"
             return "no card is written", Way("with the card in this computer", flash)
         written = f"the card of {', '.join(flashed)} is written; nothing is heard of it"
+        return self._listening(station, written)
+
+    def _listening(self, station: Mapping[str, Any] | None, found: str) -> tuple[str, Way]:
         if station is None or station["station"]["loopback"]:
-            return written, Way("power the payload, and listen on its network", "blimp serve --lan")
-        return written, Way("power the payload; nothing after a minute?", "sudo blimp doctor --lan")
+            return found, Way("power the payload, and listen on its network", "blimp serve --lan")
+        return found, Way("power the payload; nothing after a minute?", "sudo blimp doctor --lan")
 
     def _calibrate(self, recordings: list[Any]) -> Step:
         title = "The payload's camera is calibrated"
