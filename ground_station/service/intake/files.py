@@ -27,6 +27,8 @@ from pi_firmware.wire.recording import CALIBRATION_TOPIC, ESTIMATE_TOPIC
 
 ESTIMATE_STATE_TOPIC = "/estimate/state"
 """JSON: the whole estimate but for the pixels of its points."""
+STATION_TOPIC = "/station"
+"""Before what the service says: /station/event, /station/blimp-1/payload."""
 MAP_TABLE = "map "
 """Behind this the names of metadata tables name the maps in which a recording was localized."""
 _OVERLAP_S = 2.0

@@ -13,13 +13,12 @@ from pathlib import Path
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage, Level, Message, RecordingMessage
-from ground_station.service.intake.files import Estimated, GroundRun, Said
+from ground_station.service.intake.files import STATION_TOPIC, Estimated, GroundRun, Said
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire import keys, messages, sei
 from pi_firmware.wire.recorder.recorder import Recorder
 
-STATION_TOPIC = "/station"
 _FREE_PERIOD_S = 2.0
 
 

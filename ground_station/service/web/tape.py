@@ -16,8 +16,7 @@ from ground_station.service.bus_messages import (
     Message,
     PayloadMessage,
 )
-from ground_station.service.intake.files import ESTIMATE_STATE_TOPIC, MAP_TABLE
-from ground_station.service.intake.recording import STATION_TOPIC
+from ground_station.service.intake.files import ESTIMATE_STATE_TOPIC, MAP_TABLE, STATION_TOPIC
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader
 
