@@ -11,10 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import web_station as station
 
 from ground_station.errors import GroundStationError
+from ground_station.service.bus import Router
+from ground_station.service.settings import write_run
 from ground_station.service.web import jobs as jobs_module
 from ground_station.service.web.jobs import Jobs
 from ground_station.service.web.problems import Busy
@@ -113,6 +116,39 @@ def test_what_is_left_of_a_killed_run_is_no_job(tmp_path: Path) -> None:
         Jobs(tmp_path).close()
         assert bystander.poll() is None
         bystander.send_signal(signal.SIGKILL)
+
+
+def test_a_job_outlives_a_killed_web_process_and_ends_with_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ground_station.calibration.board import new_board, write_board
+
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path, station.run_of(tmp_path))
+    write_board(tmp_path / "board.toml", new_board(10, 7, 25.0))
+    shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
+    router = Router(tmp_path)
+
+    def job(port: int) -> dict[str, Any]:
+        found = httpx.get(f"http://127.0.0.1:{port}/api/state", timeout=20.0).json()["job"]
+        return dict(found or {})
+
+    try:
+        with station.web_process(tmp_path) as (process, port):
+            asked = {"step": "calibrate", "choice": "a.mcap"}
+            answer = httpx.post(f"http://127.0.0.1:{port}/api/job", json=asked, timeout=20.0)
+            assert answer.json()["done"], answer.text
+            before = job(port)
+            process.kill()
+        with station.web_process(tmp_path) as (process, port):
+            after = job(port)
+            assert after["started_ns"] == before["started_ns"]
+            assert after["running"] or after["status"] is not None  # it was not killed, too
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30.0) == 0
+        assert not (Jobs(tmp_path).state() or {})["running"]
+    finally:
+        router.close()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ can be decoded and every value is there.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import sys
 import threading
@@ -308,7 +309,7 @@ def router(recorded: Recordings, run: Run, version: str, holds: Callable[[str], 
             loop = asyncio.get_running_loop()
 
             def post(call: Callable[..., object], *arguments: Any) -> None:
-                if not loop.is_closed():
+                with contextlib.suppress(RuntimeError):  # the loop has ended
                     loop.call_soon_threadsafe(call, *arguments)
 
             playback = Playback(tape, run, version, viewer, post)

@@ -36,7 +36,7 @@ export class Keyboard {
   press(event) {
     if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || event.defaultPrevented) return;
     if (document.querySelector("dialog[open]")) return;
-    if (event.target instanceof HTMLInputElement || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
+    if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement || (event.key === " " && event.target instanceof HTMLButtonElement)) return;
     if (event.key === "?") {
       this.help.showModal();
       return;
