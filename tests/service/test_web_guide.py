@@ -1,4 +1,4 @@
-"""The way from a payload to a flight: what is on disk and on the bus decides how far it is gone."""
+"""The way from a payload to a flight: what is on disk and on the bus decides how far one is."""
 
 from __future__ import annotations
 

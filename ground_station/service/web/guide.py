@@ -1,4 +1,4 @@
-"""The way from a payload to a flight: how far it is gone, by what is on disk and on the bus.
+"""The way from a payload to a flight: how far one is, by what is on disk and on the bus.
 
 Six steps, each with what was found of it, how to check it, and the commands that go on. A map may
 come of the payload's own recording or of a phone's video; both ways are told. `blimp init` and the
@@ -43,7 +43,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Step:
-    """A step: `ready` may be gone now, `waiting` needs another first.
+    """A step: `ready` can be taken now, `waiting` needs another first.
 
     `choices` are what the page's own button may be given: recordings, or names of maps.
     """
