@@ -127,6 +127,7 @@ def test_it_stands_still_runs_faster_and_ends_where_it_can_be_begun_again(port: 
             await ask(viewer, "rate", rate=16.0)
             await ask(viewer, "play", on=True)
             end_s = SECONDS - 1 / RATE_HZ
+            await told(viewer, lambda state: state["playback"]["playing"])  # none of before
             last = await told(viewer, lambda state: not state["playback"]["playing"])
             assert last["playback"]["at_s"] == pytest.approx(end_s, abs=0.01)
             position = last["payloads"][P]["estimate"]["position_m"]
