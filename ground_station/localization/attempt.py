@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass
 
-from ground_station.arrays import Indices
+import numpy as np
+import numpy.typing as npt
+
+from ground_station.arrays import Bools, Indices
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.kinematics import Kinematics
+
+_MACROBLOCK_PX = 16
+_AROUND_PX = 10
+"""What a point is known by lies within this: KLT's window is of 21 px, a SIFT descriptor's of more,
+but with little weight."""
 
 
 class Stopwatch:
@@ -31,12 +40,26 @@ class Conditions:
     """How a frame was taken.
 
     `exposure_s`, None where the camera does not tell; `sharpness` against the frames before, 0 to
-    1; `recent` (R,), the landmarks seen just before, where any are known.
+    1; `recent` (R,), the landmarks seen just before, where any are known; `damaged` (rows, columns)
+    the macroblocks of 16 px that a loss took on the way, None where all is as it was sent.
     """
 
     exposure_s: float | None = None
     sharpness: float = 1.0
     recent: Indices | None = None
+    damaged: Bools | None = None
+
+    def shows(self, pixel_px: npt.NDArray[np.floating]) -> Bools:
+        """Whether what is around pixels (N, 2) is as it was sent (N,)."""
+        whole = np.ones(len(pixel_px), bool)
+        if self.damaged is None:
+            return whole
+        last = np.array(self.damaged.shape[::-1]) - 1
+        for step in itertools.product((-_AROUND_PX, 0, _AROUND_PX), repeat=2):
+            beside = np.nan_to_num((pixel_px + step) // _MACROBLOCK_PX)
+            column, row = np.clip(beside, 0, last).astype(int).T
+            whole &= ~self.damaged[row, column]
+        return whole
 
 
 class Attempt:

@@ -48,7 +48,9 @@ def follow(
     """The keyframe's points in a frame (H, W), and the state that explains them."""
     settings = matcher.settings
     doubt_px = matcher.doubt_px(keyframe.points_m, predicted)
-    tracks = track(keyframe, image, predicted.wTc, matcher.camera, settings.tracking, doubt_px)
+    tracks = track(
+        keyframe, image, predicted.wTc, matcher.camera, settings.tracking, doubt_px, attempt.taken
+    )
     attempt.watch.lap("track")
     found = len(tracks.point)
     landmark = keyframe.landmark[tracks.point]

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.arrays import U8, Indices
+from ground_station.arrays import U8, Bools, Indices
 from ground_station.errors import GroundStationError, InputError
 from ground_station.features.extractor import Extractor, Features
 from ground_station.geometry import poses
@@ -137,9 +137,17 @@ class Localizer:
         return final
 
     def process(
-        self, time_ns: int, image: U8, index: int = 0, exposure_s: float | None = None
+        self,
+        time_ns: int,
+        image: U8,
+        index: int = 0,
+        exposure_s: float | None = None,
+        damaged: Bools | None = None,
     ) -> PoseEstimate:
         """The pose of a grey frame (H, W) uint8 taken at `time_ns`.
+
+        `damaged` (rows, columns) are macroblocks of 16 px that show nothing of what was taken. Such
+        a frame is followed and never searched: the rest of it may fit elsewhere, too.
 
         Raises `InputError` when its size is not the camera's. A frame that is not later than the
         one before is refused: its estimate says so and nothing else changes.
@@ -161,15 +169,16 @@ class Localizer:
         if reason := gate.low_contrast(image, self.settings.gate):
             return self._gated(attempt, reason, state.lost_after_s)
         attempt.watch.lap("gate")
-        attempt.taken = self._conditions(image, exposure_s)
+        attempt.taken = self._conditions(image, exposure_s, damaged)
         attempt.watch.lap("sharpness")
-        unhurried = self._unhurried(time_ns)
+        unhurried = damaged is None and self._unhurried(time_ns)
         self._last_worked_ns = time_ns
         if unhurried:
             estimate = self._describe(attempt, image)
         else:
             estimate = self._follow(attempt, image)
-            self._recent.append((time_ns, image))
+            if damaged is None:
+                self._recent.append((time_ns, image))
         self._idle_since_s = perf_counter()
         return estimate
 
@@ -181,13 +190,15 @@ class Localizer:
         self._last_frame_ns = self._last_worked_ns = time_ns
         return self._locate(attempt, describe(features, self.camera, self._conditions(None, None)))
 
-    def _conditions(self, image: U8 | None, exposure_s: float | None) -> Conditions:
+    def _conditions(
+        self, image: U8 | None, exposure_s: float | None, damaged: Bools | None = None
+    ) -> Conditions:
         sharp = 1.0
         if image is not None and self.settings.blur.enabled:
             energy = gradient_energy(image)
             sharp = sharpness(energy, self._energies)
             self._energies.append(energy)
-        return Conditions(exposure_s, sharp, self._seen)
+        return Conditions(exposure_s, sharp, self._seen, damaged)
 
     def _fresh(self) -> Estimator:
         return make_estimator(self.camera, self.settings, self._smoothing)
@@ -299,7 +310,10 @@ class Localizer:
         """Asks for the next keyframe when this one is old, far or half out of view.
 
         Under overload only the last counts, or a doubt: an old one costs some accuracy and no pose.
+        One that shows but a part is none, as a whole one is soon to come.
         """
+        if attempt.taken.damaged is not None:
+            return
         settings, keyframe = self.settings.tracking, self._keyframe
         assert keyframe is not None and followed.solution.state is not None
         age_s = (attempt.time_ns - keyframe.time_ns) / 1e9
@@ -323,7 +337,8 @@ class Localizer:
 
     def _search(self, attempt: Attempt, image: U8) -> None:
         """Asks for this frame to be found, near its prediction or anywhere."""
-        if self._worker.busy or not self._may_search(attempt.time_ns):
+        whole = attempt.taken.damaged is None
+        if self._worker.busy or not whole or not self._may_search(attempt.time_ns):
             return
         self._last_search_ns = attempt.time_ns
         expected = [] if self._gone(attempt.time_ns) else self._expected(attempt)

@@ -50,10 +50,12 @@ class Described:
 
 
 def describe(features: Features, camera: Camera, taken: Conditions) -> Described:
-    """Features that are finite and in what is used of the lens, and where they are without it."""
+    """Features that are finite, in what is used of the lens and as they were sent, and where they
+    are without the lens."""
     finite = np.isfinite(features.keypoints_px).all(axis=1)
     finite &= np.isfinite(features.descriptors).all(axis=1)
-    features = features.where(finite & camera.uses(features.keypoints_px))
+    finite &= camera.uses(features.keypoints_px) & taken.shows(features.keypoints_px)
+    features = features.where(finite)
     normalized = camera.undistort(features.keypoints_px)
     focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
     return Described(features, normalized, normalized * focal + centre, taken)

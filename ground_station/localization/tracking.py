@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ground_station.arrays import F32, F64, U8, Bools, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.localization.attempt import Conditions
 from ground_station.localization.settings import TrackingSettings
 
 _EPSILON_PX = 0.02
@@ -137,24 +138,31 @@ def track(
     camera: Camera,
     settings: TrackingSettings,
     doubt_px: float = np.inf,
+    taken: Conditions = Conditions(),  # noqa: B008  # frozen
 ) -> Tracks:
     """The keyframe's points in an image (H, W) taken near the pose `predicted` (4, 4).
 
     Each is first looked for where the predicted pose puts it, moved by what it was off in the
-    keyframe. Those that do not come back to where they started when followed back are dropped.
+    keyframe. Those that do not come back to where they started when followed back are dropped, and
+    those that fall into what the image, as it was `taken`, does not show.
     `doubt_px` is how far off the prediction may put them: they are looked for with no more levels
     of the pyramid than that needs, as each costs as much as the finest; with all where that finds
     fewer than half of them.
     """
     few = _levels(settings, doubt_px)
-    tracks = _track(keyframe, image, predicted, camera, few)
+    tracks = _track(keyframe, image, predicted, camera, few, taken)
     if few.levels < settings.levels and len(tracks.point) < _FEW * tracks.sought:
-        return _track(keyframe, image, predicted, camera, settings)
+        return _track(keyframe, image, predicted, camera, settings, taken)
     return tracks
 
 
 def _track(
-    keyframe: Keyframe, image: U8, predicted: F64, camera: Camera, settings: TrackingSettings
+    keyframe: Keyframe,
+    image: U8,
+    predicted: F64,
+    camera: Camera,
+    settings: TrackingSettings,
+    taken: Conditions,
 ) -> Tracks:
     expected, was = (
         camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
@@ -163,7 +171,7 @@ def _track(
     guess = (expected + keyframe.pixel_px - was).astype(np.float32)
     with np.errstate(invalid="ignore"):
         inside = ((guess >= 0) & (guess <= [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
-        inside &= camera.uses(guess)
+        inside &= camera.uses(guess) & taken.shows(guess)
     point = np.flatnonzero(inside)
     if not len(point):
         return Tracks(point, np.empty((0, 2), np.float32), 0)
@@ -171,7 +179,7 @@ def _track(
     even = evenly_lit(image)
     found, ok = _follow(keyframe.even, even, start, guess[point], settings)
     size = [camera.width_px - 1, camera.height_px - 1]
-    ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found)
+    ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found) & taken.shows(found)
     kept = np.flatnonzero(ok)
     # Followed back from a guess that is off, or it would only confirm what it was given.
     back_guess = start[kept] + np.float32(settings.max_return_px)

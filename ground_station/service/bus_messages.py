@@ -71,6 +71,7 @@ class FrameMessage(Message):
     sharpness: float = 0.0
     heartbeat: bool = False
     shown: Count = 0  # frames of this session up to this one
+    damaged: bytes = b""  # macroblocks that a loss took, a bit each, row by row; empty: none
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,8 @@ class EstimateMessage(Message):
     position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns,
     `landmarks` their indices in the map, which only a replay asks for.
     `processed`, `localized` and `skipped` count the frames of this payload's session.
-    `overload` says in words that the processor is too slow for them; "" while it is not.
+    `overload` says in words that the processor is too slow for them; "" while it is not. `damaged`
+    is the share of the picture that a loss took.
     """
 
     sequence: Count
@@ -113,16 +115,17 @@ class EstimateMessage(Message):
     localized: int = 0
     skipped: int = 0
     overload: str = ""
+    damaged: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class PayloadMessage(Message):
     """A payload as the intake sees it, twice a second.
 
-    `frames` by fate: captured, gated, sent, discarded (the payload's own account), received, lost,
-    withheld, dropped. `stream` has the receiver's counters. `battery`, `health` and `autopilot` are
-    the newest messages as they came; `refused` counts those that were not as agreed. `ended`: it
-    said that its stream is over, and its own account is final.
+    `frames` by fate: captured, gated, sent, discarded (the payload's own account), received (of
+    these `damaged`), lost, withheld, dropped. `stream` has the receiver's counters. `battery`,
+    `health` and `autopilot` are the newest messages as they came; `refused` counts those that were
+    not as agreed. `ended`: it said that its stream is over, and its own account is final.
     """
 
     alive: bool

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_station.arrays import Bools
 from ground_station.recording.frames import plausible_exposure_s
 from ground_station.stream import rtp
 from ground_station.stream.arrivals import Arrivals
@@ -33,7 +34,8 @@ class ReceivedFrame:
     `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
     machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is gray
     (H, W) uint8. `exposure_s` is None where the payload does not tell it or what it tells cannot
-    be. `access_unit` is what it was decoded from, Annex B with its SEI.
+    be. `access_unit` is what it was decoded from, Annex B with its SEI. `damaged` (rows, columns of
+    macroblocks) is what a loss since the last whole IDR took of it; None where nothing was lost.
     """
 
     image: NDArray[np.uint8]
@@ -48,13 +50,14 @@ class ReceivedFrame:
     heartbeat: bool
     ssrc: int
     access_unit: bytes = b""
+    damaged: Bools | None = None
 
 
 class Assembly:
     """What belongs to one SSRC from its first packet to its last; for one thread.
 
-    It gives out only what the payload sent: no frame painted over a loss, none without capture
-    time. All else is counted in `counters`.
+    It gives out only what the payload sent, and says what of a frame is not: none is painted over a
+    loss, none is without capture time. All else is counted in `counters`.
     """
 
     def __init__(
@@ -109,31 +112,34 @@ class Assembly:
             self._reorderer.corrected_ns = packet.arrival_ns
         else:
             self._counters.packets += not packet.again
-            for ordered, gap in self._reorderer.push(packet):
-                yield from self._assemble(ordered, gap)
+            for ordered, missing in self._reorderer.push(packet):
+                yield from self._assemble(ordered, missing)
         for found in self.correction.take(packet):
-            for ordered, gap in self._reorderer.push(found):
-                yield from self._assemble(ordered, gap)
+            for ordered, missing in self._reorderer.push(found):
+                yield from self._assemble(ordered, missing)
 
     def expire(self, now_ns: int) -> Iterator[ReceivedFrame]:
         """The frames that are whole because what is missing before them is given up."""
-        for ordered, gap in self._reorderer.expire(now_ns):
-            yield from self._assemble(ordered, gap)
+        for ordered, missing in self._reorderer.expire(now_ns):
+            yield from self._assemble(ordered, missing)
 
-    def _assemble(self, packet: rtp.Packet, gap: bool) -> Iterator[ReceivedFrame]:
-        for unit in self._depacketizer.push(packet, gap):
+    def _assemble(self, packet: rtp.Packet, missing: int) -> Iterator[ReceivedFrame]:
+        for unit in self._depacketizer.push(packet, missing):
             self._counters.access_units += 1
-            image = self._decoder.decode(unit)
-            if image is None:
+            picture = self._decoder.decode(unit)
+            if picture is None:
                 continue
             info = sei.find(unit.data)
             if info is None or min(info.time_ns, info.clock_ns) < 0:
                 self._counters.unstamped += 1
                 continue
-            self._counters.decoded += 1
+            if picture.damaged is None:
+                self._counters.decoded += 1
+            else:
+                self._counters.damaged += 1
             since_ns = time.monotonic_ns() - unit.arrival_ns
             yield ReceivedFrame(
-                image=image,
+                image=picture.image,
                 sequence=info.sequence,
                 time_ns=info.time_ns,
                 clock_ns=info.clock_ns,
@@ -145,4 +151,5 @@ class Assembly:
                 heartbeat=info.heartbeat,
                 ssrc=self.ssrc,
                 access_unit=unit.data,
+                damaged=picture.damaged,
             )

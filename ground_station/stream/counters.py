@@ -16,9 +16,9 @@ class Counters:
     they were given up), is one of `packets_mended` (missing, asked for, and sent again in time), of
     `packets_corrected` (missing, and found from corrections in time), or one of `packets_lost`.
     `packets_asked` are those that were asked for, each once.
-    Every access unit of which anything arrived is one of `decoded`, `withheld` (damaged, or after
-    a loss and before the next IDR), `failed` (the decoder refused it) or `unstamped` (without
-    capture time).
+    Every access unit of which anything arrived is one of `decoded` (as it was sent), `damaged` (in
+    parts, which are known), `withheld` (nothing of it can be shown before the next IDR), `failed`
+    (the decoder refused it) or `unstamped` (without capture time).
     `overrun` packets were thrown away unread because those before them took too long to decode;
     they come to be lost.
     """
@@ -38,7 +38,13 @@ class Counters:
     malformed: int = 0
     access_units: int = 0
     decoded: int = 0
+    damaged: int = 0
     withheld: int = 0
     failed: int = 0
     unstamped: int = 0
     overrun: int = 0
+
+    @property
+    def received(self) -> int:
+        """Frames that can be shown, in whole or in parts."""
+        return self.decoded + self.damaged

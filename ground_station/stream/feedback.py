@@ -270,9 +270,10 @@ class Feedback:
     def _wants_idr(self, payload_id: str, video: Video, now_s: float) -> bool:
         """Whether frames came since the last look that only an IDR lets be shown again.
 
-        Those that wait for what was asked for again are not among them.
+        Whole again, that is. Those that wait for what was asked for again are not among them.
         """
-        withheld = video.counters.withheld
+        counters = video.counters
+        withheld = counters.withheld + counters.damaged
         before, asked_s = self._withheld.get(payload_id, (withheld, float("-inf")))
         wanted = withheld > before and now_s - asked_s >= _IDR_GAP_S
         if wanted or withheld < before:

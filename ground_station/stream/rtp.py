@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ground_station.stream.counters import Counters
 from ground_station.stream.retransmission import LIVE_NS, Retransmission
 from pi_firmware.wire import video
-from pi_firmware.wire.annexb import NAL_AUD, NAL_SPS, START_CODE
+from pi_firmware.wire.annexb import NAL_AUD, NAL_IDR, NAL_SEI, NAL_SLICE, NAL_SPS, START_CODE
 
 _HEADER_BYTES = 12
 _STAP_A, _FU_A = 24, 28
@@ -17,6 +17,8 @@ _FU_START, _FU_END = 0x80, 0x40
 MAX_JUMP = 3000
 """A sequence number further ahead than this is a new stream, not a loss (RFC 3550, A.1)."""
 MAX_ACCESS_UNIT_BYTES = 4 << 20
+_LEAST_WAIT_NS = 5_000_000
+"""What is missing is waited for so long at least: the packets of one frame come within less."""
 _CORRECTED_NS = 1_000_000_000
 """After so long without a correction none is waited for."""
 
@@ -87,8 +89,9 @@ class Reorderer:
     """Puts packets of one stream in order and decides when a missing one is lost.
 
     While `retransmission` helps, that is when it cannot come any more. Otherwise it is waited for
-    until `depth` later ones are here, or `wait_ns` have passed; while corrections come, which
-    follow their frame, only those of later frames count.
+    until `depth` later ones are here, or `wait_ns` have passed, and less where those that are
+    missing turn out to be lost and not overtaken; while corrections come, which follow their frame,
+    only those of later frames count.
     """
 
     def __init__(
@@ -101,7 +104,7 @@ class Reorderer:
     ) -> None:
         self._counters = counters
         self._depth = depth
-        self._wait_ns = wait_ns
+        self._wait_ns = self._longest_wait_ns = wait_ns
         self.retransmission = retransmission or Retransmission(counters)
         self._expected: int | None = None
         self._held: dict[int, Packet] = {}
@@ -112,8 +115,8 @@ class Reorderer:
         """When the newest correction came."""
         self._jumped: Packet | None = None
 
-    def push(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
-        """Packets that can go on, each with whether packets before it are missing."""
+    def push(self, packet: Packet) -> Iterator[tuple[Packet, int]]:
+        """Packets that can go on, each with how many before it are missing."""
         if packet.again:
             self._counters.retransmissions += 1
             if not self.retransmission.came(packet.sequence, packet.arrival_ns, again=True):
@@ -131,6 +134,8 @@ class Reorderer:
                 yield from self._restart(packet)
         elif ahead > MAX_JUMP or packet.sequence in self._held:
             self._counters.packets_late += not packet.corrected  # given up on, or here already
+            if packet.sequence not in self._held:
+                self._wait_ns = self._longest_wait_ns
         else:
             self._counters.packets_corrected += packet.corrected
             self._note(packet)
@@ -140,7 +145,7 @@ class Reorderer:
                 patient = len(self._later(packet.arrival_ns)) <= self._depth
             yield from self._release(patient=patient)
 
-    def expire(self, now_ns: int) -> Iterator[tuple[Packet, bool]]:
+    def expire(self, now_ns: int) -> Iterator[tuple[Packet, int]]:
         """Packets that go on because what is missing before them has not come in time."""
         if self._held:
             later = (packet.arrival_ns for packet in self._later(now_ns))
@@ -177,7 +182,7 @@ class Reorderer:
         self._next = (packet.sequence + 1) & 0xFFFF
         self._came_ns = now_ns
 
-    def _restart(self, packet: Packet) -> Iterator[tuple[Packet, bool]]:
+    def _restart(self, packet: Packet) -> Iterator[tuple[Packet, int]]:
         """The sender began again if two packets in a row are far off; one alone is a stray."""
         before, self._jumped = self._jumped, packet
         if before is None or (before.sequence + 1) & 0xFFFF != packet.sequence:
@@ -186,41 +191,42 @@ class Reorderer:
         yield from self._release(patient=False)
         self._jumped = None
         self._begin((packet.sequence + 1) & 0xFFFF)
-        yield before, True
-        yield packet, False
+        yield before, MAX_JUMP
+        yield packet, 0
 
-    def _release(self, *, patient: bool) -> Iterator[tuple[Packet, bool]]:
+    def _release(self, *, patient: bool) -> Iterator[tuple[Packet, int]]:
         """What can go on: up to a gap, and beyond it if nothing in it can come any more."""
         awaits, helps = self.retransmission.awaits, self.retransmission.helps
         while self._held:
             assert self._expected is not None
-            gap = False
+            missing = 0
             if self._expected not in self._held:
                 expected = self._expected
                 if patient and (not helps or awaits(expected)):
                     return
-                nearest = min((number - expected) & 0xFFFF for number in self._held)
-                if patient and any(awaits((expected + n) & 0xFFFF) for n in range(1, nearest)):
+                missing = min((number - expected) & 0xFFFF for number in self._held)
+                if patient and any(awaits((expected + n) & 0xFFFF) for n in range(1, missing)):
                     return
-                self._counters.packets_lost += nearest
-                self._expected = (expected + nearest) & 0xFFFF
-                gap = True
+                self._counters.packets_lost += missing
+                self._wait_ns -= (self._wait_ns - _LEAST_WAIT_NS) // 4
+                self._expected = (expected + missing) & 0xFFFF
             packet = self._held.pop(self._expected)
             self._expected = (self._expected + 1) & 0xFFFF
-            yield packet, gap
+            yield packet, missing
 
 
 @dataclass(frozen=True)
 class AccessUnit:
     """One access unit in Annex B form, with the arrival of its last packet.
 
-    `complete`: all of its packets are here. `follows_gap`: packets between the one before and this
-    one are missing, so that what it refers to may be.
+    `complete`: all of its packets are here; a slice of which only the beginning is stands in it up
+    to where it was cut. `missing_before`: so many packets between the newest one of the one before
+    and the first of this one are missing, so that what it refers to may be.
     """
 
     data: bytes
     complete: bool
-    follows_gap: bool
+    missing_before: int
     arrival_ns: int
 
 
@@ -236,17 +242,18 @@ class Depacketizer:
         self._units = bytearray()
         self._fragment: bytearray | None = None
         self._complete = True
-        self._follows_gap = False
+        self._missing_before = 0
         self._arrival_ns = 0
 
-    def push(self, packet: Packet, gap: bool) -> Iterator[AccessUnit]:
-        """Access units that end with, or before, this packet."""
+    def push(self, packet: Packet, missing: int) -> Iterator[AccessUnit]:
+        """Access units that end with, or before, this packet; so many before it are missing."""
         if self._timestamp is not None and packet.timestamp != self._timestamp:
             # Its last packet was lost, or never had the marker.
-            yield self._finish(complete=not gap)
-        if gap:
-            self._follows_gap = True
-            self._fragment = None
+            yield self._finish(complete=not missing)
+        if missing:
+            self._cut()
+            if self._timestamp is None:
+                self._missing_before = missing
             # Nothing of this one is missing if the packet after the gap is its first.
             self._complete = self._timestamp is None and _begins_access_unit(packet.payload)
         self._timestamp = packet.timestamp
@@ -259,10 +266,17 @@ class Depacketizer:
 
     def _finish(self, *, complete: bool) -> AccessUnit:
         whole = complete and self._complete and self._fragment is None
-        unit = AccessUnit(bytes(self._units), whole, self._follows_gap, self._arrival_ns)
+        self._cut()
+        unit = AccessUnit(bytes(self._units), whole, self._missing_before, self._arrival_ns)
         self._clear()
         self._timestamp = None
         return unit
+
+    def _cut(self) -> None:
+        """The rest of a unit does not come: of a slice the beginning can be decoded."""
+        if self._fragment is not None and self._fragment[0] & 0x1F in (NAL_SLICE, NAL_IDR):
+            self._units += START_CODE + self._fragment
+        self._fragment = None
 
     def _take(self, payload: bytes) -> bool:
         kind = payload[0] & 0x1F
@@ -292,6 +306,7 @@ class Depacketizer:
         indicator, header = payload[0], payload[1]
         if header & _FU_START:
             whole = self._fragment is None
+            self._cut()
             self._fragment = bytearray([indicator & 0xE0 | header & 0x1F])
         elif self._fragment is None:
             return False
@@ -311,4 +326,4 @@ def _begins_access_unit(payload: bytes) -> bool:
     kind = payload[0] & 0x1F
     if kind == _STAP_A and len(payload) > 3:
         kind = payload[3] & 0x1F
-    return kind in (NAL_SPS, NAL_AUD)
+    return kind in (NAL_SEI, NAL_SPS, NAL_AUD)

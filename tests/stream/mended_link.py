@@ -175,7 +175,7 @@ def shown(made: Mended, idr: Sequence[int]) -> list[int]:
 def _shown(made: Mended, idr: frozenset[int]) -> Iterator[int]:
     trusted = False
     for _, unit in made.units:
-        if unit.follows_gap or not unit.complete:
+        if unit.missing_before or not unit.complete:
             trusted = False
         if not unit.complete:
             continue

@@ -48,15 +48,20 @@ def number_in(image: NDArray[np.uint8]) -> int:
 
 
 @functools.cache
-def encoded(frames: int, dark: frozenset[int] = frozenset(), slices: int = 1) -> tuple[bytes, ...]:
-    """Access units of the flight's first `frames` pictures: no B-frames, an IDR each 15."""
+def encoded(
+    frames: int, dark: frozenset[int] = frozenset(), slices: int = 1, more: str = "cabac=0"
+) -> tuple[bytes, ...]:
+    """Access units of the flight's first `frames` pictures: no B-frames, an IDR each 15.
+
+    `more` are settings of x264's.
+    """
     codec = av.CodecContext.create("libx264", "w")
     codec.width, codec.height, codec.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
     codec.time_base, codec.framerate = Fraction(1, RATE_HZ), Fraction(RATE_HZ)
     codec.thread_count = 1
     codec.options = {
         "tune": "zerolatency", "preset": "ultrafast", "crf": "18", "g": str(GOP),
-        "slices": str(slices),
+        "slices": str(slices), "x264-params": more,
     }  # fmt: skip
     units = []
     for index in range(frames):

@@ -280,6 +280,8 @@ def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryL
         assert asked is not None and asked.ssrc == 5
         time.sleep(0.3)
         assert len(ear.reports) == 1  # nothing more was withheld since
+        video.counters = Counters(packets=21, packets_lost=1, withheld=1, damaged=1)
+        assert until(lambda: len(ear.reports) == 2)
         for withheld in range(2, 60):
             video.counters = Counters(packets=20 + withheld, packets_lost=1, withheld=withheld)
             time.sleep(0.01)

@@ -45,7 +45,7 @@ def test_access_units_come_out_as_they_went_in(slices: int, mtu_bytes: int) -> N
     sent = flight_units(slices=slices)
     units, counters = received(packets(sent, mtu_bytes=mtu_bytes))
     assert [nal_units(unit.data) for unit in units] == [nal_units(unit) for unit in sent]
-    assert all(unit.complete and not unit.follows_gap for unit in units)
+    assert all(unit.complete and not unit.missing_before for unit in units)
     assert counters == Counters()
 
 
@@ -91,7 +91,7 @@ def test_a_lost_packet_never_leaves_its_access_unit_complete(drawn: set[int]) ->
     # Between two units without a gap, nothing is missing.
     places = [whole.index(nal_units(unit.data)) if unit.complete else None for unit in units]
     for (before, after), unit in zip(pairwise(places), units[1:], strict=True):
-        if before is not None and after is not None and not unit.follows_gap:
+        if before is not None and after is not None and not unit.missing_before:
             assert after == before + 1
 
 
@@ -101,7 +101,7 @@ def test_an_idr_after_a_gap_is_complete_when_the_gap_lies_before_it() -> None:
     count_15 = len(packets(sent[:15]))
     units, _ = received([*datagrams[: count_15 - 1], *datagrams[count_15:]])
     assert not units[14].complete
-    assert units[15].complete and units[15].follows_gap
+    assert units[15].complete and units[15].missing_before
 
 
 def test_a_sender_that_begins_anew_is_followed_but_a_stray_packet_is_not() -> None:
@@ -113,7 +113,7 @@ def test_a_sender_that_begins_anew_is_followed_but_a_stray_packet_is_not() -> No
     assert len(units) == len(first) + len(second)
     assert all(unit.complete for unit in units)
     assert counters.packets_lost == 0
-    assert [unit.follows_gap for unit in units].index(True) == len(first)
+    assert [unit.missing_before > 0 for unit in units].index(True) == len(first)
 
 
 def test_aggregated_packets_are_taken_apart() -> None:

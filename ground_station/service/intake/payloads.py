@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import FrameMessage, Message, PayloadMessage
 from ground_station.service.intake.recording import GroundRecorder
@@ -75,9 +77,9 @@ class Payload:
                 self._shown = 0
             elif self._began_anew(frame, before_s) and self.stream is not None:
                 counters = self.stream.counters
-                self._base = dataclasses.replace(
-                    counters, access_units=counters.access_units - 1, decoded=counters.decoded - 1
-                )
+                fate = "decoded" if frame.damaged is None else "damaged"
+                before = {name: getattr(counters, name) - 1 for name in ("access_units", fate)}
+                self._base = dataclasses.replace(counters, **before)
                 self._first = (frame.ssrc, frame.sequence, 1)
                 self._before, self._dropped, self._shown = None, 0, 0
             self._last_sequence = frame.sequence
@@ -122,6 +124,7 @@ class Payload:
             sharpness=frame.sharpness,
             heartbeat=frame.heartbeat,
             shown=self._shown,
+            damaged=b"" if frame.damaged is None else np.packbits(frame.damaged).tobytes(),
         )
         self._say(bus_messages.FRAME, self.id, note)
 
@@ -149,7 +152,7 @@ class Payload:
         """How it is, for all who want to know."""
         stream, now_s = self.stream, time.monotonic()
         counters = stream.counters if stream is not None else Counters()
-        rate_hz, kbps = self._rates(now_s, counters.decoded, stream.bytes if stream else 0)
+        rate_hz, kbps = self._rates(now_s, counters.received, stream.bytes if stream else 0)
         sent = state.frames.sent if state is not None and state.frames is not None else 0
         lost_share = 0.0
         if stream is not None:
@@ -182,26 +185,29 @@ class Payload:
             with self._lock, contextlib.suppress(OSError):
                 self._pictures.close()
 
-    def _rates(self, now_s: float, decoded: int, received_bytes: int) -> tuple[float, float]:
+    def _rates(self, now_s: float, received: int, received_bytes: int) -> tuple[float, float]:
         """Frames a second and kbit/s, of late."""
         samples = self._samples
-        samples.append((now_s, decoded, received_bytes))
+        samples.append((now_s, received, received_bytes))
         while len(samples) > 2 and now_s - samples[1][0] >= _WINDOW_S:
             samples.popleft()
         then_s, frames, size = samples[0]
         span_s = now_s - then_s
         if span_s <= 0:
             return 0.0, 0.0
-        return (decoded - frames) / span_s, (received_bytes - size) * 8e-3 / span_s
+        return (received - frames) / span_s, (received_bytes - size) * 8e-3 / span_s
 
     def _frames(self, state: PayloadState | None, counters: Counters) -> dict[str, int]:
         """Frames by fate, since this session was first seen: sent = received + withheld + lost.
+
+        Of those received, some are damaged.
 
         What was sent before that is none of the lost: the payload's own account is told as it is.
         """
         base = self._base  # a frame's thread may have set it after these counters were read
         result = {
-            "received": max(0, counters.decoded - base.decoded),
+            "received": max(0, counters.received - base.received),
+            "damaged": max(0, counters.damaged - base.damaged),
             "lost": 0,
             "withheld": max(0, _withheld(counters) - _withheld(base)),
             "dropped": self._dropped,

@@ -72,9 +72,13 @@ class GroundRecorder(Recorder):
         self._announce(messages.EVENT_RECORDING_ENDED, reason)
 
     def frame(self, payload_id: str, frame: ReceivedFrame, log_ns: int) -> None:
-        """Records a frame as it came; `log_ns` is when it was captured, by this machine's clock."""
+        """Records a frame as it came; `log_ns` is when it was captured, by this machine's clock.
+
+        Not a damaged one: who decodes a recording cannot know what of it, and of those after it, is
+        as it was sent.
+        """
         active = self._run
-        if active is None:
+        if active is None or frame.damaged is not None:
             return
         height, width = frame.image.shape[:2]
         self._sizes[payload_id] = (width, height)

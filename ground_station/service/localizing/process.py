@@ -14,7 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ground_station.arrays import U8
+import numpy as np
+
+from ground_station.arrays import U8, Bools
 from ground_station.errors import GroundStationError, MapError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
@@ -114,9 +116,11 @@ class Localizing:
             self._start = None
 
     def _localize(self, localizer: Localizer, note: FrameMessage, image: U8) -> None:
-        estimate, reason = None, ""
+        estimate, reason, damaged = None, "", _damaged(note)
         try:
-            estimate = localizer.process(note.time_ns, image, note.sequence, note.exposure_s)
+            estimate = localizer.process(
+                note.time_ns, image, note.sequence, note.exposure_s, damaged
+            )
             self._failed = 0
         except BlimpError as error:  # the frame is at fault, as one of another camera's size
             reason = str(error)
@@ -139,7 +143,9 @@ class Localizing:
         said = self._overload.watch(
             localizer, time.monotonic(), accounts.processed, accounts.skipped
         )
-        self._bus.publish(bus_messages.ESTIMATE, self._payload_id, replace(told, overload=said))
+        share = 0.0 if damaged is None else round(float(damaged.mean()), 3)
+        told = replace(told, overload=said, damaged=share)
+        self._bus.publish(bus_messages.ESTIMATE, self._payload_id, told)
 
     def _fail(self, localizer: Localizer, reason: str) -> None:
         self._failed += 1
@@ -206,3 +212,12 @@ class Localizing:
     def _event(self, level: bus_messages.Level, name: str, text: str) -> None:
         note = EventMessage(time.time_ns(), "localizer", level, name, text)
         self._bus.publish(bus_messages.EVENT, self._payload_id, note)
+
+
+def _damaged(note: FrameMessage) -> Bools | None:
+    """The macroblocks (rows, columns) of a frame that a loss took; None: none."""
+    if not note.damaged:
+        return None
+    high, wide = -(-note.height_px // 16), -(-note.width_px // 16)
+    bits = np.unpackbits(np.frombuffer(note.damaged, np.uint8), count=high * wide)
+    return bits.reshape(high, wide).astype(bool)

@@ -1,0 +1,161 @@
+"""Which parts of a picture a loss took, and where motion carried them since.
+
+What is not marked is the picture that was sent, bit for bit. Of a slice that was cut FFmpeg decodes
+on into garbage and tells neither where it began nor, for all it conceals, what it decoded. So the
+slice is decoded twice more, in decoders of its own, with zeros and with ones behind the cut: what
+both decode alike stands before it, as whatever was sent lies between the two (arithmetic decoding
+keeps the order of its input, and of a code word that is cut zeros and ones make two others).
+"""
+
+from __future__ import annotations
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_station.arrays import F64, I64, Bools
+from ground_station.stream.slices import ParameterSets, slice_header, with_frame_num
+from pi_firmware.wire import annexb
+
+CELL_PX, _CELLS = 4, 4
+"""Damage is told in cells of H.264's smallest block, 4 by 4 to a macroblock."""
+MACROBLOCK_PX = 16
+_ALIKE = 8
+"""Macroblocks before the first one that differs that are not believed either: where little moves a
+few may look alike by chance (measured: three at most at 300 kbit/s, none at 2,000)."""
+_BEHIND = b"\xff" * 64
+_BEFORE_PX, _AFTER_PX = 2, 3
+"""What the luma's filter of six taps looks at beyond a block (H.264, 8.4.2.2.1)."""
+_PART_PX = 8
+"""Blocks of this size may be of parts whose motion FFmpeg does not tell: it lies within about the
+same again."""
+
+
+def open_decoder(**options: str) -> av.VideoCodecContext:
+    """A decoder that paints over nothing, holds no picture back and tells motion vectors."""
+    codec = av.CodecContext.create("h264", "r")
+    assert isinstance(codec, av.VideoCodecContext)
+    codec.thread_count = 1  # frame threads would hold pictures back
+    codec.flags |= int(av.codec.context.Flags.low_delay)
+    codec.options = {"ec": "0", "flags2": "+export_mvs", **options}
+    return codec
+
+
+def missing_rows(unit: bytes, idr: bytes, sets: ParameterSets) -> Bools | None:
+    """Of an access unit of which packets are missing: which rows of macroblocks are (rows,).
+
+    `idr` is a whole IDR of the same parameter sets. None: nothing of the picture is here.
+    """
+    pictures = []
+    for tail in (b"", _BEHIND):
+        made, is_idr = _alone(unit, sets, tail)
+        codec = open_decoder(skip_loop_filter="all")
+        try:
+            if not is_idr:
+                codec.decode(av.Packet(idr))
+            (frame,) = codec.decode(av.Packet(made))
+        except (av.FFmpegError, ValueError):  # ValueError: not exactly one picture
+            return None
+        if frame.format.name not in ("yuv420p", "yuvj420p"):
+            return None
+        pictures.append(
+            [
+                np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[
+                    : plane.height, : plane.width
+                ]
+                for plane in frame.planes
+            ]
+        )
+    # A fresh decoder's pictures are zero, which no chroma that was decoded is.
+    same = _all_of(pictures[0][1] != 0, MACROBLOCK_PX // 2)
+    for with_zeros, with_ones, size in zip(*pictures, (16, 8, 8), strict=True):
+        same &= _all_of(with_zeros == with_ones, size)
+    if same.shape != (sets.height, sets.width):
+        return None
+    differs = np.flatnonzero(~same)
+    missing = np.zeros(sets.height, bool)
+    missing[differs // sets.width] = True
+    missing[np.maximum(differs - _ALIKE, 0) // sets.width] = True
+    return missing
+
+
+def _alone(unit: bytes, sets: ParameterSets, tail: bytes) -> tuple[bytes, bool]:
+    """The unit as it would follow an IDR at once, `tail` behind its slices; whether it is one."""
+    made, is_idr = bytearray(), False
+    for nal in annexb.nal_units(unit):
+        header = slice_header(nal, sets)
+        if header is not None:
+            is_idr = header.idr
+            nal = nal + tail if is_idr else with_frame_num(nal + tail, header, sets, 1)
+        made += annexb.START_CODE + nal
+    return bytes(made), is_idr
+
+
+def _all_of(true: Bools, size: int) -> Bools:
+    """Of each block of `size` samples (rows, columns) whether all are true."""
+    for axis in (0, 1):
+        true = np.logical_and.reduceat(true, np.arange(0, true.shape[axis], size), axis)
+    return true
+
+
+def carried(motion: NDArray[np.void], before: Bools, sets: ParameterSets) -> Bools:
+    """The cells of a P picture (4 rows, 4 columns of a macroblock's) that rest on damaged ones.
+
+    `motion` are FFmpeg's motion vectors of it, `before` the damaged cells of what it was predicted
+    from. What is predicted inside the picture is damaged where what is around it is.
+    """
+    high, wide = before.shape
+    w, h = motion["w"].astype(int), motion["h"].astype(int)
+    x, y = motion["dst_x"] - w // 2, motion["dst_y"] - h // 2
+    scale = np.maximum(motion["motion_scale"], 1)
+    dx, dy = motion["motion_x"] / scale, motion["motion_y"] / scale
+    part = np.where((w <= _PART_PX) & (h <= _PART_PX), _PART_PX, 0)
+
+    def cells(first: F64, size: I64, most: int) -> tuple[I64, I64]:
+        ends = first - _BEFORE_PX - part, first + size + _AFTER_PX + part
+        low, end = (np.clip(px // CELL_PX, 0, most - 1).astype(int) for px in ends)
+        return low, end + 1
+
+    left, right = cells(x + dx, w, wide)
+    top, bottom = cells(y + dy, h, high)
+    summed = np.zeros((high + 1, wide + 1), int)
+    summed[1:, 1:] = before.cumsum(0).cumsum(1)
+    touched = (
+        summed[bottom, right] - summed[top, right] - summed[bottom, left] + summed[top, left]
+    ) > 0  # fmt: skip
+    corners = x // CELL_PX, y // CELL_PX, (x + w) // CELL_PX, (y + h) // CELL_PX
+    damaged = _painted(corners, touched, high, wide)
+    inter = _painted(corners, np.ones(len(x), bool), high, wide)
+    for row, column in np.argwhere(~inter[::_CELLS, ::_CELLS]).tolist():
+        r, c = _CELLS * row, _CELLS * column
+        around = damaged[max(0, r - 1) : r + _CELLS, max(0, c - 1) : c + 2 * _CELLS]
+        above, beside = around[: r > 0], around[r > 0 :, : c > 0]
+        damaged[r : r + _CELLS, c : c + _CELLS] |= bool(above.any() or beside.any())
+    return damaged
+
+
+def _painted(corners: tuple[I64, ...], chosen: Bools, high: int, wide: int) -> Bools:
+    """The cells of the chosen rectangles."""
+    left, top, right, bottom = (np.clip(at[chosen], 0, limit) for at, limit in zip(
+        corners, (wide, high, wide, high), strict=True))  # fmt: skip
+    edges = np.zeros((high + 1, wide + 1), int)
+    for r, c, by in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
+        np.add.at(edges, (r, c), by)
+    return np.asarray(edges.cumsum(0).cumsum(1)[:high, :wide] > 0)
+
+
+def blurred(damaged: Bools) -> Bools:
+    """With the cells beside them, into which the loop filter carries three pixels (8.7)."""
+    grown = damaged.copy()
+    grown[1:] |= damaged[:-1]
+    grown[:-1] |= damaged[1:]
+    grown[:, 1:] |= damaged[:, :-1]
+    grown[:, :-1] |= damaged[:, 1:]
+    return grown
+
+
+def of_macroblocks(cells: Bools) -> Bools:
+    """Which macroblocks (rows, columns) have a damaged cell."""
+    high, wide = cells.shape
+    blocks = cells.reshape(high // _CELLS, _CELLS, wide // _CELLS, _CELLS)
+    return np.asarray(blocks.any(axis=(1, 3)))
