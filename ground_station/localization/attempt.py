@@ -12,8 +12,8 @@ import numpy.typing as npt
 from ground_station.arrays import Bools, Indices
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.kinematics import Kinematics
+from pi_firmware.wire import annexb
 
-_MACROBLOCK_PX = 16
 _AROUND_PX = 10
 """What a point is known by lies within this: KLT's window is of 21 px, a SIFT descriptor's of more,
 but with little weight."""
@@ -41,7 +41,7 @@ class Conditions:
 
     `exposure_s`, None where the camera does not tell; `sharpness` against the frames before, 0 to
     1; `recent` (R,), the landmarks seen just before, where any are known; `damaged` (rows, columns)
-    the macroblocks of 16 px that a loss took on the way, None where all is as it was sent.
+    the macroblocks of H.264 that a loss took on the way, None where all is as it was sent.
     """
 
     exposure_s: float | None = None
@@ -56,7 +56,7 @@ class Conditions:
             return whole
         last = np.array(self.damaged.shape[::-1]) - 1
         for step in itertools.product((-_AROUND_PX, 0, _AROUND_PX), repeat=2):
-            beside = np.nan_to_num((pixel_px + step) // _MACROBLOCK_PX)
+            beside = np.nan_to_num((pixel_px + step) // annexb.MACROBLOCK_PX)
             column, row = np.clip(beside, 0, last).astype(int).T
             whole &= ~self.damaged[row, column]
         return whole

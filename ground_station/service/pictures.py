@@ -15,11 +15,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_station.arrays import Bools
+from ground_station.service.bus_messages import FrameMessage
+from pi_firmware.wire import annexb
+
 SLOTS = 8
 _MAGIC = b"blimpic1"
 _FILE = struct.Struct("<8sIIII")  # magic, slots, width, height, reserved
 _SLOT = struct.Struct("<q")  # stamp
 _HEADER_BYTES, _SLOT_BYTES = 64, 64
+
+
+def packed(damaged: Bools | None) -> bytes:
+    """Which macroblocks (rows, columns) of a picture a loss took, as a message tells it."""
+    return b"" if damaged is None else np.packbits(damaged).tobytes()
+
+
+def damaged_in(frame: FrameMessage) -> Bools | None:
+    """The same of a message; None: all is as it was sent."""
+    if not frame.damaged:
+        return None
+    size_px = np.array([frame.height_px, frame.width_px])
+    rows, columns = -(-size_px // annexb.MACROBLOCK_PX)
+    bits = np.unpackbits(np.frombuffer(frame.damaged, np.uint8), count=rows * columns)
+    return np.asarray(bits.reshape(rows, columns) > 0)
 
 
 def path_of(folder: Path, payload_id: str) -> Path:

@@ -17,12 +17,13 @@ from ground_station.arrays import F64, I64, Bools
 from ground_station.stream.slices import ParameterSets, slice_header, with_frame_num
 from pi_firmware.wire import annexb
 
-CELL_PX, _CELLS = 4, 4
+_CELL_PX, _CELLS = 4, 4
 """Damage is told in cells of H.264's smallest block, 4 by 4 to a macroblock."""
-MACROBLOCK_PX = 16
 _ALIKE = 8
 """Macroblocks before the first one that differs that are not believed either: where little moves a
 few may look alike by chance (measured: three at most at 300 kbit/s, none at 2,000)."""
+_MAX_PIXELS = 1920 * 1088
+"""A stranger's parameter sets must not make a decoder ask for gigabytes."""
 _BEHIND = b"\xff" * 64
 _BEFORE_PX, _AFTER_PX = 2, 3
 """What the luma's filter of six taps looks at beyond a block (H.264, 8.4.2.2.1)."""
@@ -37,7 +38,7 @@ def open_decoder(**options: str) -> av.VideoCodecContext:
     assert isinstance(codec, av.VideoCodecContext)
     codec.thread_count = 1  # frame threads would hold pictures back
     codec.flags |= int(av.codec.context.Flags.low_delay)
-    codec.options = {"ec": "0", "flags2": "+export_mvs", **options}
+    codec.options = {"ec": "0", "flags2": "+export_mvs", "max_pixels": str(_MAX_PIXELS), **options}
     return codec
 
 
@@ -67,7 +68,7 @@ def missing_rows(unit: bytes, idr: bytes, sets: ParameterSets) -> Bools | None:
             ]
         )
     # A fresh decoder's pictures are zero, which no chroma that was decoded is.
-    same = _all_of(pictures[0][1] != 0, MACROBLOCK_PX // 2)
+    same = _all_of(pictures[0][1] != 0, annexb.MACROBLOCK_PX // 2)
     for with_zeros, with_ones, size in zip(*pictures, (16, 8, 8), strict=True):
         same &= _all_of(with_zeros == with_ones, size)
     if same.shape != (sets.height, sets.width):
@@ -113,7 +114,7 @@ def carried(motion: NDArray[np.void], before: Bools, sets: ParameterSets) -> Boo
 
     def cells(first: F64, size: I64, most: int) -> tuple[I64, I64]:
         ends = first - _BEFORE_PX - part, first + size + _AFTER_PX + part
-        low, end = (np.clip(px // CELL_PX, 0, most - 1).astype(int) for px in ends)
+        low, end = (np.clip(px // _CELL_PX, 0, most - 1).astype(int) for px in ends)
         return low, end + 1
 
     left, right = cells(x + dx, w, wide)
@@ -123,7 +124,7 @@ def carried(motion: NDArray[np.void], before: Bools, sets: ParameterSets) -> Boo
     touched = (
         summed[bottom, right] - summed[top, right] - summed[bottom, left] + summed[top, left]
     ) > 0  # fmt: skip
-    corners = x // CELL_PX, y // CELL_PX, (x + w) // CELL_PX, (y + h) // CELL_PX
+    corners = x // _CELL_PX, y // _CELL_PX, (x + w) // _CELL_PX, (y + h) // _CELL_PX
     damaged = _painted(corners, touched, high, wide)
     inter = _painted(corners, np.ones(len(x), bool), high, wide)
     for row, column in np.argwhere(~inter[::_CELLS, ::_CELLS]).tolist():

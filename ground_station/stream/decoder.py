@@ -17,9 +17,6 @@ from ground_station.stream.rtp import AccessUnit
 from ground_station.stream.slices import ParameterSets, SliceHeader, parameter_sets, slice_header
 from pi_firmware.wire import annexb, sei
 
-_MAX_PIXELS = 1920 * 1088
-"""A stranger's parameter sets must not make the decoder ask for gigabytes."""
-
 
 @dataclass(frozen=True)
 class Picture:
@@ -42,7 +39,7 @@ class Decoder:
         self.saw_parameter_sets = False
         self._counters = counters
         self._trusted = False
-        self._codec = _open()
+        self._codec = damage.open_decoder()
         self._sets: ParameterSets | None = None
         self._idr = self._last = b""
         self._number: int | None = None
@@ -63,7 +60,7 @@ class Decoder:
         except (av.FFmpegError, ValueError):  # ValueError: not exactly one picture
             self._counters.failed += 1
             self._trusted = False
-            self._codec = _open()
+            self._codec = damage.open_decoder()
             return None
         if self._damaged is None:
             return Picture(image)
@@ -138,7 +135,3 @@ def _follows(before: bytes, unit: AccessUnit, sets: ParameterSets) -> bool:
 def _first_slice(access_unit: bytes, sets: ParameterSets) -> SliceHeader | None:
     headers = (slice_header(nal, sets) for nal in annexb.nal_units(access_unit))
     return next((header for header in headers if header is not None), None)
-
-
-def _open() -> av.VideoCodecContext:
-    return damage.open_decoder(max_pixels=str(_MAX_PIXELS))

@@ -20,7 +20,7 @@ from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import keys, messages
 
 PERIOD_S = 1.0
-_LOOK_S = 0.02
+_LOOK_S = 0.01
 _IDR_GAP_S = 0.1
 WINDOW_S = 2.0
 EARLY_S = 0.2

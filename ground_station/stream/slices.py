@@ -10,7 +10,8 @@ _HEADER_BYTES = 64
 """More than what is read of a header takes, scaling lists and offsets of picture order aside."""
 _WITH_CHROMA_FORMAT = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}
 _P, _I = 0, 2
-_MOST_REFERENCES = 16
+_MOST_MACROBLOCKS = 139_264
+"""Of a picture (table A-1)."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +113,9 @@ def _read(sps_unit: bytes, pps_unit: bytes) -> ParameterSets | None:
     arithmetic = pps.u(1)
     pps.u(1)
     slice_groups = pps.ue()
-    if (
-        not (arithmetic and whole_frames)
-        or slice_groups
-        or frame_num_bits > 16
-        or references > _MOST_REFERENCES
-    ):
+    if not (arithmetic and whole_frames) or slice_groups:
+        return None
+    if frame_num_bits > 16 or references > 16 or width * height > _MOST_MACROBLOCKS:
         return None
     return ParameterSets(width, height, max(1, references), frame_num_bits, (sps_unit, pps_unit))
 

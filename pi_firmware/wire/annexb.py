@@ -12,6 +12,7 @@ NAL_SEI = 6
 NAL_SPS = 7
 NAL_PPS = 8
 NAL_AUD = 9
+MACROBLOCK_PX = 16
 
 _NEEDS_PREVENTION = re.compile(rb"\x00\x00(?=[\x00-\x03])")
 

@@ -20,6 +20,7 @@ READERS = (
     Reader("retransmission", "RTP packets that were asked for again, and others"),
     Reader("correction", "RTP packets that correct others, genuine and forged"),
     Reader("rtcp", "what is asked of the payload, as RTCP and SRTCP"),
+    Reader("slices", "H.264's parameter sets and slice headers"),
     Reader("assembly", "RTP packets to decoded pictures", 8192),
     Reader("srtp", "SRTP packets, authentic and forged"),
     Reader("messages", "telemetry, commands and answers"),

@@ -14,6 +14,7 @@ from ground_station.features.methods.rootsift import RootSift
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization import tracking
+from ground_station.localization.attempt import Conditions
 from ground_station.localization.estimate import State
 from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.localizer import Localizer
@@ -196,6 +197,36 @@ def test_points_of_what_is_no_longer_there_are_dropped(wall):
     assert tracks.sought == len(keyframe) and len(tracks.point) < 0.2 * tracks.sought
 
 
+def below(row: int) -> np.ndarray:
+    """The macroblocks (30, 40) of a picture of 640x480 from a row on."""
+    damaged = np.zeros((30, 40), bool)
+    damaged[row:] = True
+    return damaged
+
+
+def test_points_in_what_a_loss_took_are_neither_sought_nor_found(wall):
+    keyframe, damaged = wall.keyframe(np.eye(4)), below(15)
+    image = wall.picture(np.eye(4))
+    whole = track(keyframe, image, np.eye(4), wall.camera, TrackingSettings())
+    taken = Conditions(damaged=damaged)
+    part = track(keyframe, image, np.eye(4), wall.camera, TrackingSettings(), taken=taken)
+    above = int((keyframe.pixel_px[:, 1] < 240 - 10).sum())
+    assert part.sought == above < whole.sought and len(part.point) > 0.95 * above
+    # A point that is led into it by a wrong prediction, or comes out of it, is dropped, too.
+    assert (part.pixel_px[:, 1] < 240 - 10).all()
+    all_of_it = Conditions(damaged=below(0))
+    assert track(
+        keyframe, image, np.eye(4), wall.camera, TrackingSettings(), taken=all_of_it
+    ).sought == 0  # fmt: skip
+
+
+def test_what_a_picture_shows_ends_a_window_before_the_damage():
+    taken = Conditions(damaged=below(15))
+    pixels = np.array([[5, 229.9], [5, 230.1], [639, 100], [320, 400], [-40, -40], [np.nan, 0]])
+    assert taken.shows(pixels).tolist() == [True, False, True, False, True, True]
+    assert Conditions().shows(pixels).all()
+
+
 def relit(picture: np.ndarray, light: float | np.ndarray, seed: int = 2) -> np.ndarray:
     """A picture (H, W) in that many times the light, a number or (H, 1), with a sensor's noise."""
     level = np.clip(light * (picture / 255.0) ** 2.2, 0, 1)
@@ -315,6 +346,32 @@ def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
     back = localizer.process(times[9], wall.picture(truth[9]), 9)
     assert back.localized and back.tracked and back.state is State.DEGRADED
     assert extractor.threads.count(threading.current_thread().name) == 1
+
+
+def test_a_damaged_frame_is_followed_by_what_is_left_of_it(wall):
+    localizer, extractor, times, truth = after_eight_frames(wall)
+    image, noise = wall.picture(truth[8]), np.random.default_rng(1)
+    image[240:] = noise.integers(0, 255, image[240:].shape)
+    part = localizer.process(times[8], image, 8, damaged=below(15))
+    assert part.localized and part.tracked and part.state is State.TRACKING
+    assert (part.observations.pixel_px[:, 1] < 230).all()
+    assert np.linalg.norm(part.wTc[:3, 3] - truth[8][:3, 3]) < 0.01
+    # All of it gone: nothing is found, and nothing is looked for.
+    described = len(extractor.threads)
+    gone = localizer.process(times[9], image, 9, damaged=below(0))
+    assert not gone.localized and gone.state is State.DEGRADED
+    assert len(extractor.threads) == described
+
+
+def test_a_place_is_found_in_whole_frames_only(wall):
+    localizer, extractor = make(wall)
+    times, truth = path(12)
+    for k in range(6):
+        seen = localizer.process(times[k], wall.picture(truth[k]), k, damaged=below(25))
+        assert not seen.localized and seen.state is State.INITIALIZING
+    assert extractor.threads == []
+    whole = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(6, 12)]
+    assert extractor.threads != [] and len(whole) == 6
 
 
 def test_a_strange_frame_is_searched_beside_and_the_next_is_followed_again(wall):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ground_station.service import bus_messages
@@ -15,6 +17,7 @@ from ground_station.service.bus_messages import (
     MessageError,
     PayloadMessage,
 )
+from ground_station.service.pictures import damaged_in, packed
 from pi_firmware.wire import messages
 
 FRAME = FrameMessage(0, 2, 1, 10, 20, 30, 64, 48, 5, exposure_s=0.01)
@@ -67,3 +70,15 @@ def test_a_refusal_is_one_line_whatever_the_bytes_are(text: bytes) -> None:
     with pytest.raises(MessageError) as refused:
         bus_messages.decode(bus_messages.ProcessMessage, text)
     assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (470, 650)])
+def test_damage_crosses_the_bus_as_bits(height: int, width: int) -> None:
+    rows, columns = -(-height // 16), -(-width // 16)
+    damaged = np.random.default_rng(3).random((rows, columns)) < 0.3
+    frame = FrameMessage(0, 2, 7, 1_000, 2_000, 3_000, width, height, 1, damaged=packed(damaged))
+    again = damaged_in(bus_messages.decode(FrameMessage, bus_messages.encode(frame)))
+    assert again is not None and np.array_equal(again, damaged)
+    assert damaged_in(replace(frame, damaged=packed(None))) is None
+    short = damaged_in(replace(frame, damaged=b"\xff"))
+    assert short is not None and short.shape == (rows, columns)

@@ -33,7 +33,7 @@ def all_right(stand: Stand, payload_id: str) -> list[int]:
     frames = stand.heard.of(payload_id)
     shown = [note.sequence for note, _ in frames]
     assert shown == sorted(set(shown))
-    assert all(number in (note.sequence % ROUND, -1) for note, number in frames)
+    assert all(number in (note.sequence % ROUND, -1) for note, number in frames if not note.damaged)
     assert sum(number == -1 for _, number in frames) <= len(frames) // 4  # a busy machine's
     return shown
 

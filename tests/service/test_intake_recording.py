@@ -149,6 +149,23 @@ def test_a_recording_holds_all_that_was_said_on_the_grounds_clock(tmp_path: Path
     assert {level for _, level, _ in events.told} == {"info"}
 
 
+def test_damaged_frames_are_told_and_their_video_is_left_out(tmp_path: Path) -> None:
+    made = recorder(tmp_path)
+    made.start()
+    part = np.zeros((30, 40), bool)
+    for k in range(GOP + 5):
+        hit = 5 <= k < GOP
+        made.frame("blimp-1", replace(frame(k), damaged=part if hit else None), log_ns(k))
+        made.estimate("blimp-1", estimate(k, damaged=0.25 if hit else 0.0))
+    made.close()
+    (path,) = recorded(tmp_path)
+    whole = [*range(5), *range(GOP, GOP + 5)]
+    assert sequences(path) == whole
+    assert [number_in(f.image) for f in open_input(path)] == whole
+    told = [state["damaged"] for _, state in RecordingReader(path).json("/estimate/state")]
+    assert told == [0.25 if 5 <= k < GOP else 0.0 for k in range(GOP + 5)]
+
+
 def test_others_open_it(tmp_path: Path) -> None:
     """`mcap doctor`, MCAP's own reader with CRCs checked, and Foxglove's message types."""
     made = recorder(tmp_path)

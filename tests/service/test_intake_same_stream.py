@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from intake_stand import Stand, eventually
 
+from ground_station.arrays import Bools
 from ground_station.service.intake import payloads
 from ground_station.service.intake.payloads import Payload
 from ground_station.service.intake.recording import GroundRecorder
@@ -44,15 +45,22 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
     payload.follow(stream)  # type: ignore[arg-type]
     listener = SimpleNamespace(clock=lambda _: None, round_trip_s=lambda _: None)
 
-    def received() -> int:
-        note = payload.note(None, listener, encrypted=False)  # type: ignore[arg-type]
-        return note.frames["received"]
+    def told() -> tuple[int, int]:
+        frames = payload.note(None, listener, encrypted=False).frames  # type: ignore[arg-type]
+        return frames["received"], frames["damaged"]
 
-    def take(sequence: int, at_s: float, clock_s: float = 0.0) -> None:
+    def received() -> int:
+        return told()[0]
+
+    def take(
+        sequence: int, at_s: float, clock_s: float = 0.0, damaged: Bools | None = None
+    ) -> None:
         """At a time, when this machine's clock was set ahead by `clock_s`."""
         monkeypatch.setattr(payloads.time, "monotonic", lambda: at_s)
         arrival_ns = round((at_s + clock_s) * 1e9)
-        stream.counters = replace(stream.counters, decoded=stream.counters.decoded + 1)
+        fate = "decoded" if damaged is None else "damaged"
+        counted = {fate: getattr(stream.counters, fate) + 1}
+        stream.counters = replace(stream.counters, **counted)
         payload.take(
             ReceivedFrame(
                 image=np.zeros((4, 4), np.uint8),
@@ -66,11 +74,13 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
                 gain=None,
                 heartbeat=False,
                 ssrc=77,
+                damaged=damaged,
             )
         )
 
     for number in range(5):
         take(number, 100.0 + number / 10)
+    assert told() == (5, 0)
     take(5, 103.0)  # a stutter alone is no new session
     assert received() == 6
     payload.started_s = 104.0
@@ -83,3 +93,7 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
     take(12, 105.3, clock_s=-60.0)  # nor is a clock that is set
     take(13, 105.4)
     assert received() == 5
+    take(14, 105.5, damaged=np.ones((1, 1), bool))
+    assert told() == (6, 1)
+    take(0, 107.0, damaged=np.ones((1, 1), bool))  # the first one of a session
+    assert told() == (1, 1)

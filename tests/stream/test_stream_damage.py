@@ -96,6 +96,19 @@ def test_a_cut_slice_damages_from_there_on_and_an_idr_heals_it() -> None:
     assert counters.damaged == 10 and counters.withheld == 0
 
 
+@pytest.mark.parametrize("more", [CABAC, VARIETY, "cabac=1:partitions=none:deblock=3"])
+@pytest.mark.parametrize("part", [0.6, 0.8])
+def test_motion_carries_damage_on_no_further_than_is_marked(part: float, more: str) -> None:
+    sent, truth = units(more=more), pictures(units(more=more))
+    begin = len(packets(sent[:2], mtu_bytes=100))
+    hit = len(packets(sent[:3], mtu_bytes=100)) - begin
+    frames, _ = received(packets(sent, mtu_bytes=100), [begin + int(part * hit)])
+    by_number = {frame.sequence: frame for frame in frames if frame.damaged is not None}
+    assert set(by_number) >= {2, 3, 4}
+    for number, frame in by_number.items():
+        assert is_true(frame, truth[number]), number
+
+
 def test_a_lost_sei_costs_its_own_frame_and_no_other() -> None:
     sent = units()
     frames, counters = received(packets(sent), [in_frame(sent, 5)[0]])

@@ -10,12 +10,10 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import FrameMessage, Message, PayloadMessage
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.pictures import PictureWriter
+from ground_station.service.pictures import PictureWriter, packed
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.feedback import StreamAccount
@@ -124,7 +122,7 @@ class Payload:
             sharpness=frame.sharpness,
             heartbeat=frame.heartbeat,
             shown=self._shown,
-            damaged=b"" if frame.damaged is None else np.packbits(frame.damaged).tobytes(),
+            damaged=packed(frame.damaged),
         )
         self._say(bus_messages.FRAME, self.id, note)
 

@@ -14,14 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ground_station.arrays import U8, Bools
+from ground_station.arrays import U8
 from ground_station.errors import GroundStationError, MapError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
-from ground_station.service import bus_messages
+from ground_station.service import bus_messages, pictures
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
 from ground_station.service.localizing import derive
@@ -29,7 +27,6 @@ from ground_station.service.localizing.accounting import Accounting
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
 from ground_station.service.localizing.overload import Overload
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
-from ground_station.service.pictures import SLOTS, PictureReader
 from ground_station.service.settings import Run
 from pi_firmware.wire.errors import BlimpError
 
@@ -56,7 +53,7 @@ class Localizing:
     def __init__(self, bus: Bus, folder: Path, payload_id: str, run: Run) -> None:
         self._bus, self._payload_id, self._run = bus, payload_id, run
         self._start = read_tum(run.start) if run.start else None
-        self._pictures = PictureReader(folder, payload_id)
+        self._pictures = pictures.PictureReader(folder, payload_id)
         self._loader = Loader(run)
         self._localizer: Localizer | None = None
         self._map, self._waiting = "", "the map is being loaded"
@@ -70,7 +67,7 @@ class Localizing:
             lambda name, text: self._event(bus_messages.WARNING, name, text)
         )
         # A payload that waits for poses has fewer frames on their way than the ring has slots.
-        most = SLOTS if run.stepped else _QUEUED
+        most = pictures.SLOTS if run.stepped else _QUEUED
         self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, most)
         self._loader.begin(Path(run.station.map.folder))
         bus.serve(bus.process, self._do)
@@ -116,7 +113,7 @@ class Localizing:
             self._start = None
 
     def _localize(self, localizer: Localizer, note: FrameMessage, image: U8) -> None:
-        estimate, reason, damaged = None, "", _damaged(note)
+        estimate, reason, damaged = None, "", pictures.damaged_in(note)
         try:
             estimate = localizer.process(
                 note.time_ns, image, note.sequence, note.exposure_s, damaged
@@ -212,12 +209,3 @@ class Localizing:
     def _event(self, level: bus_messages.Level, name: str, text: str) -> None:
         note = EventMessage(time.time_ns(), "localizer", level, name, text)
         self._bus.publish(bus_messages.EVENT, self._payload_id, note)
-
-
-def _damaged(note: FrameMessage) -> Bools | None:
-    """The macroblocks (rows, columns) of a frame that a loss took; None: none."""
-    if not note.damaged:
-        return None
-    high, wide = -(-note.height_px // 16), -(-note.width_px // 16)
-    bits = np.unpackbits(np.frombuffer(note.damaged, np.uint8), count=high * wide)
-    return bits.reshape(high, wide).astype(bool)
