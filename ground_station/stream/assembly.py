@@ -17,8 +17,8 @@ from ground_station.stream.correction import Correction
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
 from ground_station.stream.retransmission import Retransmission
-from pi_firmware.wire import sei
-from pi_firmware.wire.annexb import NO_PARAMETER_SETS
+from ground_station.stream.stamps import Stamps
+from pi_firmware.wire import annexb, sei
 
 SETS_TIMEOUT_S = 3.0
 """A stream that has come for so long without parameter sets cannot be shown."""
@@ -80,6 +80,7 @@ class Assembly:
         self._reorderer = rtp.Reorderer(counters, retransmission=self.retransmission)
         self._depacketizer = rtp.Depacketizer(counters)
         self._decoder = Decoder(counters)
+        self._stamps = Stamps()
         self._sets_timeout_ns = int(sets_timeout_s * 1e9)
         self._first_arrival_ns: int | None = None
 
@@ -95,7 +96,7 @@ class Assembly:
         sent, lost = counters.packets - counters.packets_late, counters.packets_lost
         sent += lost  # those that came too late are among the lost
         if lost <= _TOO_MANY_LOST * sent:
-            return NO_PARAMETER_SETS
+            return annexb.NO_PARAMETER_SETS
         return (
             f"no picture came whole in {came_ns / 1e9:.0f} s: of {sent} packets {lost} were lost or"
             " came too late"
@@ -129,7 +130,11 @@ class Assembly:
             picture = self._decoder.decode(unit)
             if picture is None:
                 continue
-            info = sei.find(unit.data)
+            data, info = unit.data, sei.find(unit.data)
+            if info is not None:
+                self._stamps.take(unit.timestamp, info)
+            elif not unit.complete and (info := self._stamps.reckon(unit.timestamp)) is not None:
+                data = annexb.insert_before_slice(data, sei.encode(info))
             if info is None or min(info.time_ns, info.clock_ns) < 0:
                 self._counters.unstamped += 1
                 continue
@@ -150,6 +155,6 @@ class Assembly:
                 gain=info.gain,
                 heartbeat=info.heartbeat,
                 ssrc=self.ssrc,
-                access_unit=unit.data,
+                access_unit=data,
                 damaged=picture.damaged,
             )

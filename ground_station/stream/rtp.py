@@ -228,6 +228,8 @@ class AccessUnit:
     complete: bool
     missing_before: int
     arrival_ns: int
+    timestamp: int = 0
+    """RTP's."""
 
 
 class Depacketizer:
@@ -267,7 +269,9 @@ class Depacketizer:
     def _finish(self, *, complete: bool) -> AccessUnit:
         whole = complete and self._complete and self._fragment is None
         self._cut()
-        unit = AccessUnit(bytes(self._units), whole, self._missing_before, self._arrival_ns)
+        unit = AccessUnit(
+            bytes(self._units), whole, self._missing_before, self._arrival_ns, self._timestamp or 0
+        )
         self._clear()
         self._timestamp = None
         return unit

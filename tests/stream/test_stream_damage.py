@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import av
 import numpy as np
 import pytest
-from numbered_flight import HEIGHT_PX, WIDTH_PX, encoded, packets, stamped
+from numbered_flight import HEIGHT_PX, WIDTH_PX, capture_ns, encoded, packets, stamped
 
 from ground_station.arrays import U8
 from ground_station.recording.h264 import grey
@@ -16,7 +16,8 @@ from ground_station.stream import rtp
 from ground_station.stream.assembly import Assembly, ReceivedFrame
 from ground_station.stream.counters import Counters
 from ground_station.stream.slices import parameter_sets, slice_header, with_frame_num
-from pi_firmware.wire import annexb
+from ground_station.stream.stamps import Stamps
+from pi_firmware.wire import annexb, sei
 
 FRAMES = 40
 CABAC = "cabac=1"
@@ -109,11 +110,39 @@ def test_motion_carries_damage_on_no_further_than_is_marked(part: float, more: s
         assert is_true(frame, truth[number]), number
 
 
-def test_a_lost_sei_costs_its_own_frame_and_no_other() -> None:
+def test_a_lost_sei_costs_nothing_once_the_clocks_are_known() -> None:
     sent = units()
-    frames, counters = received(packets(sent), [in_frame(sent, 5)[0]])
-    assert [frame.sequence for frame in frames] == [n for n in range(FRAMES) if n != 5]
+    lost = [in_frame(sent, 1)[0], in_frame(sent, 5)[0], in_frame(sent, 6)[0]]
+    frames, counters = received(packets(sent), lost)
+    assert [frame.sequence for frame in frames] == [n for n in range(FRAMES) if n != 1]
     assert counters.unstamped == 1 and counters.damaged == counters.withheld == 0
+    for frame in frames:
+        off_ns = 0 if frame.sequence not in (5, 6) else 2_000_000
+        assert abs(frame.time_ns - capture_ns(frame.sequence)) <= off_ns
+        told = sei.find(frame.access_unit)
+        assert told is not None and (told.sequence, told.time_ns) == (frame.sequence, frame.time_ns)
+
+
+def info(sequence: int, time_ns: int) -> sei.FrameInfo:
+    return sei.FrameInfo(sequence, time_ns, time_ns + 5, 7.0, 1.0)
+
+
+def test_a_stamp_is_reckoned_by_the_rtp_clock_where_that_is_certain() -> None:
+    stamps = Stamps()
+    stamps.take(0xFFFFFFFF - 2999, info(7, 10**9))
+    assert stamps.reckon(0) is None  # of one frame nothing can be told
+    stamps.take(0, info(8, 10**9 + 33_400_000))
+    next_one = stamps.reckon(3000)
+    assert next_one is not None and next_one.sequence == 9
+    assert next_one.time_ns == 10**9 + 33_400_000 + 33_333_333 == next_one.clock_ns - 5
+    after_one = stamps.reckon(6010)  # one in between that the gate held back
+    assert after_one is not None and after_one.sequence == 10
+    assert stamps.reckon(4000) is None  # between two frames
+    assert stamps.reckon(0) is stamps.reckon(90_000) is None  # none, and too far
+    stamps.take(3000, info(9, 10**9 + 90_000_000))  # the camera's clock is another one
+    assert stamps.reckon(6000) is None
+    stamps.take(6000, info(0, 10**9 + 123_300_000))  # a session begins
+    assert stamps.reckon(9000) is None
 
 
 @pytest.mark.parametrize("part", ["begin of its slice", "all of it"])
