@@ -8,6 +8,10 @@ from dataclasses import dataclass, field
 RATE_HZ = 30.0
 ADAPTING = ("encoder.adapt=true",)
 """As the payload flies: bit rate and IDR interval follow what the ground reports."""
+ALONE = ("link.history_s=0", "link.assumed_loss=0.02")
+"""A link that is one way: nothing is sent again, and correction does not wait for reports."""
+UNMENDED = ("link.history_s=0", "link.correction=0")
+"""A payload of 0.1."""
 BURST_PACKETS = 10.0
 """The mean length of a burst in which all packets are lost."""
 QUEUE_S = 0.5
@@ -48,8 +52,8 @@ class Axis:
     levels: tuple[Level, ...]
 
 
-def _link(text: str, **impairment: float) -> Level:
-    return Level(text, Conditions(impairment, ADAPTING))
+def _link(text: str, *settings: str, **impairment: float) -> Level:
+    return Level(text, Conditions(impairment, (*ADAPTING, *settings)))
 
 
 def _percent(share: float) -> str:
@@ -91,6 +95,11 @@ _FREE = Level("all", Conditions())
 AXES = (
     Axis("loss", "packets lost, one by one", (
         _link("none"), *(_link(_percent(share), loss=share) for share in _SHARES))),
+    Axis("loss-one-way", "packets lost, one by one; nothing is sent again", (
+        _link("none", *ALONE), *(_link(_percent(share), *ALONE, loss=share) for share in _SHARES))),
+    Axis("loss-unmended", "packets lost, one by one; nothing is sent again or corrected", (
+        _link("none", *UNMENDED),
+        *(_link(_percent(share), *UNMENDED, loss=share) for share in _SHARES))),
     Axis("bursts", f"packets lost, in bursts of {BURST_PACKETS:g}", (
         _link("none"), *(_burst(share) for share in _SHARES))),
     Axis("latency", "delay of each packet", (
