@@ -79,7 +79,7 @@ class Decoder:
             sets, self.saw_parameter_sets = parameter_sets(unit.data), True
             if sets != self._sets:
                 self._sets, self._idr = sets, b""
-        elif not unit.complete or unit.missing_before:
+        elif not unit.complete:
             types.clear()  # an IDR may be of other sets than are known
         if annexb.NAL_IDR in types and self.saw_parameter_sets:
             self._trusted, self._damaged = True, None

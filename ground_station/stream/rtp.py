@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ground_station.stream.counters import Counters
 from ground_station.stream.retransmission import LIVE_NS, Retransmission
 from pi_firmware.wire import video
-from pi_firmware.wire.annexb import NAL_AUD, NAL_IDR, NAL_SEI, NAL_SLICE, NAL_SPS, START_CODE
+from pi_firmware.wire.annexb import NAL_AUD, NAL_IDR, NAL_SLICE, NAL_SPS, START_CODE
 
 _HEADER_BYTES = 12
 _STAP_A, _FU_A = 24, 28
@@ -330,4 +330,4 @@ def _begins_access_unit(payload: bytes) -> bool:
     kind = payload[0] & 0x1F
     if kind == _STAP_A and len(payload) > 3:
         kind = payload[3] & 0x1F
-    return kind in (NAL_SEI, NAL_SPS, NAL_AUD)
+    return kind in (NAL_SPS, NAL_AUD)
