@@ -171,13 +171,14 @@ class Localizer:
         attempt.watch.lap("gate")
         attempt.taken = self._conditions(image, exposure_s, damaged)
         attempt.watch.lap("sharpness")
-        unhurried = damaged is None and self._unhurried(time_ns)
-        self._last_worked_ns = time_ns
-        if unhurried:
+        unhurried, whole = self._unhurried(time_ns), damaged is None
+        if whole or not unhurried:  # else the next whole frame is the one that is described
+            self._last_worked_ns = time_ns
+        if unhurried and whole:
             estimate = self._describe(attempt, image)
         else:
             estimate = self._follow(attempt, image)
-            if damaged is None:
+            if whole:
                 self._recent.append((time_ns, image))
         self._idle_since_s = perf_counter()
         return estimate
