@@ -116,6 +116,26 @@ def test_a_sender_that_begins_anew_is_followed_but_a_stray_packet_is_not() -> No
     assert [unit.missing_before > 0 for unit in units].index(True) == len(first)
 
 
+def test_what_turns_out_lost_is_waited_for_less_until_one_was_late() -> None:
+    counters = Counters()
+    reorderer, ms = rtp.Reorderer(counters), 1_000_000
+
+    def waited_ms(first: int) -> int:
+        """For the packet that is missing before the second of two."""
+        pair = [rtp.Packet(first + n, 0, 1, False, b"a", 1000 * first * ms) for n in (0, 2)]
+        assert [p.sequence for packet in pair for p, _ in reorderer.push(packet)] == [first]
+        began = 1000 * first
+        while not list(reorderer.expire(began * ms)):
+            began += 1
+        return began - 1000 * first
+
+    assert waited_ms(0) == 30
+    waits = [waited_ms(3 * n) for n in range(1, 20)]
+    assert waits == sorted(waits, reverse=True) and 5 <= waits[-1] <= 7
+    list(reorderer.push(rtp.Packet(58, 0, 1, False, b"a", 57_001 * ms)))
+    assert counters.packets_late == 1 and waited_ms(60) == 30
+
+
 def test_aggregated_packets_are_taken_apart() -> None:
     (sent,) = flight_units(frames=1)
     small = [nal for nal in nal_units(sent) if len(nal) < 500]
