@@ -27,8 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Compares an estimated trajectory with the true one."
     parser.epilog = _EPILOG
     parser.set_defaults(
-        next="blimp map view maps/NAME --out map.html --compare {estimate} {truth}"
-        "    (where in the building it errs)"
+        next="blimp map view maps/NAME --out map.html    (where in the building a map is weak)"
     )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("estimate", metavar="EST.txt", type=Path, help="TUM text, or a recording")

@@ -281,7 +281,7 @@ class Service:
         return PayloadProcess(
             folder,
             f"payload_id={payload_id}",
-            f"camera.uri=replay:{ATRIUM / 'flight.mcap'}?loop=1&rate_hz={rate_hz:g}",
+            f"camera.uri=replay:{os.path.relpath(ATRIUM / 'flight.mcap')}?loop=1&rate_hz={rate_hz:g}",
             f"camera.rate_hz={rate_hz:g}",
             f"link.port={port or self.video}",
             f"telemetry.connect={json.dumps([self.endpoint])}",
