@@ -278,10 +278,11 @@ class Service:
 
         A lower rate takes fewer of the flight's frames; `port` is of a link before the service.
         """
+        flight = os.path.relpath(ATRIUM / "flight.mcap")  # a picture shows what is streamed
         return PayloadProcess(
             folder,
             f"payload_id={payload_id}",
-            f"camera.uri=replay:{os.path.relpath(ATRIUM / 'flight.mcap')}?loop=1&rate_hz={rate_hz:g}",
+            f"camera.uri=replay:{flight}?loop=1&rate_hz={rate_hz:g}",
             f"camera.rate_hz={rate_hz:g}",
             f"link.port={port or self.video}",
             f"telemetry.connect={json.dumps([self.endpoint])}",
