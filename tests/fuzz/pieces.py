@@ -8,6 +8,7 @@ It needs no fuzzer, so that every input can be played back by Python alone.
 from __future__ import annotations
 
 import atexit
+import base64
 import contextlib
 import json
 import shutil
@@ -157,6 +158,8 @@ def as_json(document: Any) -> bytes:
         return b"{" + b",".join(pairs) + b"}"
     if isinstance(document, list):
         return b"[" + b",".join(map(as_json, document)) + b"]"
+    if isinstance(document, bytes):  # as the bus writes it
+        document = base64.b64encode(document).decode()
     return json.dumps(document).encode()
 
 

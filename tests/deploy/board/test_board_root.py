@@ -191,6 +191,7 @@ def test_sshd_lets_in_the_pilot_by_key_and_nobody_else(tmp_path: Path) -> None:
     config = tmp_path / "sshd_config"
     ours = (TREE / "etc/ssh/sshd_config.d/10-blimp.conf").read_text()
     config.write_text(ours.replace("/data/ssh/ssh_host_ed25519_key", str(key)))
+    Path("/run/sshd").mkdir(mode=0o755, exist_ok=True)  # systemd's part
     told = run(find("sshd"), "-T", "-f", config)
     assert told.returncode == 0, told.stderr
     lines = set(told.stdout.splitlines())

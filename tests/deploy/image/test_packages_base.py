@@ -319,7 +319,7 @@ def test_stopped_or_killed_in_the_middle_nothing_half_is_left(
         "from deploy.image import raspios\n"
         "from deploy.image.packages import load_board\n"
         "from deploy.image.packages.board import Group\n"
-        f"board = dataclasses.replace(load_board('zerow'), packages=(Group('', ({name!r},)),),\n"
+        f"board = dataclasses.replace(load_board('zerow'), packages=(Group('x', ({name!r},)),),\n"
         f"    architecture={stand.board.architecture!r})\n"
         f"places = {[str(path) for path in (place, stand.base, cache, stand.checkout)]}\n"
         "image, base, cache, checkout = map(Path, places)\n"
