@@ -67,12 +67,14 @@ class Account:
         self.assert_pictures()
 
     def assert_pictures(self) -> None:
-        """What was shown had left the payload undamaged, and was shown once and right."""
+        """What was shown as whole had left the payload undamaged, and all was shown once, right."""
         shown = [frame.sequence for frame in self.seen]
         assert len(set(shown)) == len(shown)
-        assert not set(shown) - set(self.visible)
+        whole = {frame.sequence: frame.number for frame in self.seen if not frame.damaged}
+        assert not set(whole) - set(self.witness.showable())
+        assert not set(shown) - {frame.sequence for frame in self.left}
         if self.numbered:
-            assert [frame.number for frame in self.seen] == [number % ROUND for number in shown]
+            assert whole == {sequence: sequence % ROUND for sequence in whole}
 
     def assert_sent(self) -> None:
         """What the payload says it sent is what came to the link, each frame once."""
@@ -102,10 +104,10 @@ class Account:
         assert received is not None
         assert received.packets == link.passed + link.duplicated
         assert received.packets_lost - self.given_up == link.lost and self.given_up >= 0
-        assert received.decoded == len(self.seen)
+        assert (received.decoded + received.damaged) == len(self.seen)
         assert received.garbage == received.other_streams == 0
         assert received.failed == 0
-        assert len(self.visible) - len(self.seen) <= LONGEST_GOP * self.given_up
+        assert len(self.visible) - received.decoded <= LONGEST_GOP * self.given_up
 
 
 class Flight:

@@ -30,7 +30,10 @@ _START_LIMIT_S = 30.0
 
 @dataclass(frozen=True)
 class Seen:
-    """One frame that the receiver gave out; `number` is what its picture says, -1 unread."""
+    """One frame that the receiver gave out; `number` is what its picture says, -1 unread.
+
+    That of a damaged one is not read: it may stand in what is not as it was sent.
+    """
 
     sequence: int
     number: int
@@ -38,6 +41,7 @@ class Seen:
     time_ns: int
     clock_ns: int
     arrival_ns: int
+    damaged: bool = False
 
 
 class Gallery:
@@ -107,14 +111,16 @@ class Ground(Gallery):
         while not self._closing.is_set():
             frame = self.receiver.get(0.1)
             if frame is not None:
+                damaged = frame.damaged is not None
                 self.add(
                     Seen(
                         frame.sequence,
-                        number_in(frame.image) if self._numbered else -1,
+                        number_in(frame.image) if self._numbered and not damaged else -1,
                         frame.ssrc,
                         frame.time_ns,
                         frame.clock_ns,
                         frame.arrival_ns,
+                        damaged,
                     )
                 )
 

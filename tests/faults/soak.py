@@ -125,7 +125,7 @@ def fly(flown: Flown, options: Any, interrupted: threading.Event) -> None:
                 break
             frame = receiver.get(0.2)
             if frame is not None:
-                account.seen.append(frame.sequence)
+                account.take(frame)
                 _take(flown, windows, now_s - start_s, (frame.arrival_ns - frame.clock_ns) / 1e6)
             # The first frames and the last pass: a receiver notices a loss by what comes after it.
             if lossy != (bool(account.seen) and now_s < start_s + duration_s - CLEAN_END_S):
@@ -143,7 +143,7 @@ def fly(flown: Flown, options: Any, interrupted: threading.Event) -> None:
         flown.flown_s = time.monotonic() - start_s
         ended = payload.end()
         while frame := receiver.get(1.0):
-            account.seen.append(frame.sequence)
+            account.take(frame)
         account.received, account.link = asdict(receiver.counters), asdict(link.counts)
     account.counts, account.status, account.err = ended.counts, ended.status, ended.err
 

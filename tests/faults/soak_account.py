@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from soaking.table import Row
 from witness import Witness
 
+from ground_station.stream.assembly import ReceivedFrame
+
 
 @dataclass
 class Account:
@@ -14,6 +16,8 @@ class Account:
 
     seen: list[int] = field(default_factory=list)
     """Numbers of the frames that the receiver gave, in order."""
+    damaged: set[int] = field(default_factory=set)
+    """Those of them that were not whole."""
     counts: dict[str, int] = field(default_factory=dict)
     """The payload's own."""
     status: int = -1
@@ -21,6 +25,12 @@ class Account:
     witness: Witness = field(default_factory=Witness)
     link: dict[str, int] = field(default_factory=dict)
     received: dict[str, int] = field(default_factory=dict)
+
+    def take(self, frame: ReceivedFrame) -> None:
+        """One more that the receiver gave."""
+        self.seen.append(frame.sequence)
+        if frame.damaged is not None:
+            self.damaged.add(frame.sequence)
 
 
 def account_rows(account: Account) -> list[Row]:
@@ -33,7 +43,8 @@ def account_rows(account: Account) -> list[Row]:
     witness = account.witness
     encoded = counts["captured"] - counts["gated"]
     left, visible = [frame.sequence for frame in witness.left()], witness.visible()
-    damaged = sum(frame.damaged for frame in witness.left())
+    whole = [sequence for sequence in account.seen if sequence not in account.damaged]
+    showable = witness.showable()
     lost = counts["sent"] - len(account.seen)
     given_up = received["packets_late"] - link["duplicated"]
     return [
@@ -54,10 +65,16 @@ def account_rows(account: Account) -> list[Row]:
         ),
         Row("received", str(len(account.seen)), "", len(account.seen) > 0),
         Row(
-            "lost, damaged + following",
-            f"{lost} = {damaged} + {len(left) - len(visible) - damaged}",
+            "shown whole, at least and at most",
+            f"{len(visible)} <= {len(whole)} <= {len(showable)}",
             "exact, one by one",
-            account.seen == visible,
+            {*visible} <= {*whole} <= {*showable} and account.seen == sorted({*account.seen}),
+        ),
+        Row(
+            "shown damaged, lost, of damaged and following",
+            f"{len(account.damaged)} + {lost} of {len(left) - len(visible)}",
+            "one by one",
+            account.damaged <= {*left},
         ),
         Row(
             "packets lost, on the link",

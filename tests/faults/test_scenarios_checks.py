@@ -109,9 +109,9 @@ def test_the_intakes_account_is_held_against_the_payloads() -> None:
 
 
 def test_a_frame_that_is_shown_twice_or_damaged_is_told() -> None:
-    assert accounts.of_shown([1, 2, 4], [1, 2, 3, 4], "it") == []
-    assert "more than once" in accounts.of_shown([1, 2, 2], [1, 2], "it")[0]
-    assert "damaged" in accounts.of_shown([1, 5], [1, 2], "it")[0]
+    assert accounts.of_shown([1, 2, 4, 5], [5], [1, 2, 3, 4], "it") == []
+    assert "more than once" in accounts.of_shown([1, 2, 2], [], [1, 2], "it")[0]
+    assert "damaged" in accounts.of_shown([1, 5], [], [1, 2], "it")[0]
 
 
 def test_a_frame_that_the_localizer_neither_processed_nor_skipped_is_told() -> None:

@@ -7,17 +7,20 @@ against it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
 from pi_firmware.wire import annexb, sei
 
+_BESIDE = {annexb.NAL_SEI, annexb.NAL_SPS, annexb.NAL_PPS}
+
 
 @dataclass(frozen=True)
 class Left:
-    """One frame that left the payload; `damaged` when the link lost any part of it.
+    """One frame that left the payload; `damaged` when the link lost any part of it, `cut` when that
+    was one of its picture and not of what stands beside it.
 
     An access unit delimiter before parameter sets is no part: these only ever come first, too.
     """
@@ -25,13 +28,14 @@ class Left:
     sequence: int
     idr: bool
     damaged: bool
+    cut: bool
 
 
 class _Stream:
     def __init__(self) -> None:
         self.depacketizer = rtp.Depacketizer(Counters())
         self.next_sequence: int | None = None
-        self.damaged = self.undelimited = False
+        self.damaged = self.undelimited = self.cut = False
         self.frames: list[Left] = []
 
 
@@ -66,9 +70,17 @@ class Witness:
             return [frame for stream in streams for frame in stream.frames]
 
     def visible(self, ssrc: int | None = None) -> list[int]:
-        """Sequence numbers of the frames that a receiver can show: undamaged, as are all since the
-        last IDR, an undamaged one itself."""
-        return list(_visible(self.left(ssrc)))
+        """Sequence numbers of the frames that a receiver surely shows whole: undamaged, as are all
+        since the last IDR, an undamaged one itself."""
+        return list(_since_idr((frame, frame.damaged) for frame in self.left(ssrc)))
+
+    def showable(self, ssrc: int | None = None) -> list[int]:
+        """Those that it may show whole: no picture was cut since the last IDR, it included.
+
+        It can do without the SEI where the clocks tell the frame, and without parameter sets that
+        it has.
+        """
+        return list(_since_idr((frame, frame.cut) for frame in self.left(ssrc)))
 
     def _follow(self, packet: rtp.Packet, lost: bool) -> None:
         stream = self._streams.setdefault(packet.ssrc, _Stream())
@@ -80,6 +92,7 @@ class Witness:
             stream.undelimited = lost
         else:
             stream.damaged |= lost
+            stream.cut |= lost and packet.payload[0] & 0x1F not in _BESIDE
         for unit in stream.depacketizer.push(packet, False):
             info = sei.find(unit.data)
             if info is None:
@@ -87,13 +100,14 @@ class Witness:
             else:
                 idr = annexb.is_idr(unit.data)
                 damaged = stream.damaged or (stream.undelimited and not idr)
-                stream.frames.append(Left(info.sequence, idr, damaged))
-            stream.damaged = stream.undelimited = False
+                stream.frames.append(Left(info.sequence, idr, damaged, stream.cut))
+            stream.damaged = stream.undelimited = stream.cut = False
 
 
-def _visible(frames: list[Left]) -> Iterator[int]:
+def _since_idr(frames: Iterable[tuple[Left, bool]]) -> Iterator[int]:
+    """The frames that have nothing wrong, nor has any other since the last IDR."""
     trusted = False
-    for frame in frames:
-        trusted = not frame.damaged and (frame.idr or trusted)
+    for frame, wrong in frames:
+        trusted = not wrong and (frame.idr or trusted)
         if trusted:
             yield frame.sequence

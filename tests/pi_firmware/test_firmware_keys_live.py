@@ -229,7 +229,7 @@ def test_pictures_have_the_configured_size_and_rate(live: Live) -> None:
         for unit in units.push(packet, False)
         if isinstance(unit, AccessUnit)
     )
-    shape = next(picture.shape for picture in pictures if picture is not None)
+    shape = next(picture.image.shape for picture in pictures if picture is not None)
     assert shape == (live.asked["camera.height_px"], live.asked["camera.width_px"])
     times_ns = [frame.info.time_ns for frame in live.tap.frames()]
     period_s = statistics.median(b - a for a, b in itertools.pairwise(times_ns)) / 1e9

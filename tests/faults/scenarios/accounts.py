@@ -55,10 +55,13 @@ def of_intake(frames: Mapping[str, int], sent: int, before: tuple[int, int] = (0
     return [f"intake: sent is not received + withheld + lost: {sent}, {arrived}{earlier}"]
 
 
-def of_shown(shown: Sequence[int], visible: Sequence[int], who: str) -> list[str]:
-    """Sequence numbers of one stream: each frame that was shown had left whole, and came once."""
+def of_shown(
+    shown: Sequence[int], damaged: Sequence[int], showable: Sequence[int], who: str
+) -> list[str]:
+    """Sequence numbers of one stream: each frame that was shown came once, and whole where it was
+    not told as damaged."""
     twice = [number for number, times in Counter(shown).items() if times > 1]
-    wrong = sorted(set(shown) - set(visible))
+    wrong = sorted(set(shown) - set(damaged) - set(showable))
     return [
         *([f"{who}: shown more than once: {twice[:10]}"] if twice else []),
         *([f"{who}: shown, but damaged or never sent: {wrong[:10]}"] if wrong else []),

@@ -34,6 +34,7 @@ class Shown:
     time_ns: int
     at_s: float
     run: int  # the service's start
+    damaged: bool
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,8 @@ class Heard:
         with self._lock:
             shown = self.shown.setdefault(payload_id, [])
             self._places[(payload_id, note.sequence, note.clock_ns)] = len(shown)
-            shown.append(Shown(payload_id, key_of(note), note.time_ns, time.monotonic(), run))
+            now_s, damaged = time.monotonic(), bool(note.damaged)
+            shown.append(Shown(payload_id, key_of(note), note.time_ns, now_s, run, damaged))
 
     def _estimate(self, payload_id: str, note: EstimateMessage, run: int) -> None:
         with self._lock:

@@ -131,12 +131,17 @@ def _of_run(run: PayloadRun, until_s: float, heard: Heard) -> list[str]:
             complaints += accounts.of_link(run.ended.counts["sent"], left, run.watch.gaps)
     if run.ssrc in run.watch.ssrcs():
         shown = [
-            frame.key[1]
+            frame
             for frames in heard.shown.values()
             for frame in frames
             if frame.key[0] == run.ssrc and run.began_s < frame.at_s < until_s
         ]
-        complaints += accounts.of_shown(shown, run.watch.visible(run.ssrc), f"stream {run.ssrc}")
+        complaints += accounts.of_shown(
+            [frame.key[1] for frame in shown],
+            [frame.key[1] for frame in shown if frame.damaged],
+            run.watch.showable(run.ssrc),
+            f"stream {run.ssrc}",
+        )
     return complaints
 
 
