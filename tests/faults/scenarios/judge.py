@@ -178,6 +178,7 @@ def recorded(world: World) -> list[str]:
             Came(frame.key[1:], frame.at_s)
             for frames in world.heard.shown.values()
             for frame in frames
+            if not frame.damaged  # recordings hold whole frames only
         ),
         key=lambda one: one.at_s,
     )
