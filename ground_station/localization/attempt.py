@@ -14,10 +14,6 @@ from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.kinematics import Kinematics
 from pi_firmware.wire import annexb
 
-_AROUND_PX = 10
-"""What a point is known by lies within this: KLT's window is of 21 px, a SIFT descriptor's of more,
-but with little weight."""
-
 
 class Stopwatch:
     """Milliseconds by stage; a stage that runs twice adds up."""
@@ -49,13 +45,14 @@ class Conditions:
     recent: Indices | None = None
     damaged: Bools | None = None
 
-    def shows(self, pixel_px: npt.NDArray[np.floating]) -> Bools:
-        """Whether what is around pixels (N, 2) is as it was sent (N,)."""
+    def shows(self, pixel_px: npt.NDArray[np.floating], reach_px: int) -> Bools:
+        """Whether what is around pixels (N, 2), up to `reach_px` off, is as it was sent (N,)."""
         whole = np.ones(len(pixel_px), bool)
         if self.damaged is None:
             return whole
         last = np.array(self.damaged.shape[::-1]) - 1
-        for step in itertools.product((-_AROUND_PX, 0, _AROUND_PX), repeat=2):
+        steps = [*range(-reach_px, reach_px, annexb.MACROBLOCK_PX), reach_px]
+        for step in itertools.product(steps, repeat=2):
             beside = np.nan_to_num((pixel_px + step) // annexb.MACROBLOCK_PX)
             column, row = np.clip(beside, 0, last).astype(int).T
             whole &= ~self.damaged[row, column]

@@ -32,6 +32,9 @@ _APART = 1.2
 """Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
 """
 
+_DESCRIBED_PX = 10
+"""A SIFT descriptor looks further than this around its key point, but with little weight."""
+
 _REACH = 3.0
 """Standard deviations of a landmark's predicted pixel that a feature may be away."""
 
@@ -54,7 +57,7 @@ def describe(features: Features, camera: Camera, taken: Conditions) -> Described
     are without the lens."""
     finite = np.isfinite(features.keypoints_px).all(axis=1)
     finite &= np.isfinite(features.descriptors).all(axis=1)
-    finite &= camera.uses(features.keypoints_px) & taken.shows(features.keypoints_px)
+    finite &= camera.uses(features.keypoints_px) & taken.shows(features.keypoints_px, _DESCRIBED_PX)
     features = features.where(finite)
     normalized = camera.undistort(features.keypoints_px)
     focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]

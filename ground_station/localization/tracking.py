@@ -171,7 +171,7 @@ def _track(
     guess = (expected + keyframe.pixel_px - was).astype(np.float32)
     with np.errstate(invalid="ignore"):
         inside = ((guess >= 0) & (guess <= [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
-        inside &= camera.uses(guess) & taken.shows(guess)
+        inside &= camera.uses(guess) & taken.shows(guess, settings.window_px // 2)
     point = np.flatnonzero(inside)
     if not len(point):
         return Tracks(point, np.empty((0, 2), np.float32), 0)
@@ -179,7 +179,8 @@ def _track(
     even = evenly_lit(image)
     found, ok = _follow(keyframe.even, even, start, guess[point], settings)
     size = [camera.width_px - 1, camera.height_px - 1]
-    ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found) & taken.shows(found)
+    ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found)
+    ok &= taken.shows(found, settings.window_px // 2)
     kept = np.flatnonzero(ok)
     # Followed back from a guess that is off, or it would only confirm what it was given.
     back_guess = start[kept] + np.float32(settings.max_return_px)

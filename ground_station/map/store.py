@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -98,6 +99,12 @@ class MapInfo:
     def registered(self) -> bool:
         """Whether positions are metres in the world frame."""
         return self.frame == "world"
+
+    @property
+    def noise_px(self) -> float | None:
+        """A key point's noise as its build measured it; None where that is no length."""
+        found = self.built.get("noise_px")
+        return found if isinstance(found, float) and 0 < found < math.inf else None
 
 
 @dataclass

@@ -223,8 +223,10 @@ def test_points_in_what_a_loss_took_are_neither_sought_nor_found(wall):
 def test_what_a_picture_shows_ends_a_window_before_the_damage():
     taken = Conditions(damaged=below(15))
     pixels = np.array([[5, 229.9], [5, 230.1], [639, 100], [320, 400], [-40, -40], [np.nan, 0]])
-    assert taken.shows(pixels).tolist() == [True, False, True, False, True, True]
-    assert Conditions().shows(pixels).all()
+    assert taken.shows(pixels, 10).tolist() == [True, False, True, False, True, True]
+    assert Conditions().shows(pixels, 10).all()
+    stripe = below(15) & ~below(16)
+    assert Conditions(damaged=stripe).shows(np.array([[300.0, 220.0]]), 31).tolist() == [False]
 
 
 def relit(picture: np.ndarray, light: float | np.ndarray, seed: int = 2) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 
@@ -47,6 +48,15 @@ def test_quantised_descriptors_of_either_sign_come_back_within_a_degree(built, t
     cos = (store.load(tmp_path).landmarks.descriptor * signed).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(cos, -1, 1))).max() < 1
     assert "descriptor_i8" in load_file(tmp_path / "landmarks.safetensors")
+
+
+@pytest.mark.parametrize(
+    "said", [0.0, -1.0, float("nan"), float("inf"), "half a pixel", True, None]
+)
+def test_a_noise_that_is_no_length_is_not_known(built, said):
+    info = built.map.info
+    assert info.noise_px == info.built["noise_px"] > 0
+    assert dataclasses.replace(info, built={"noise_px": said}).noise_px is None
 
 
 def test_the_map_can_be_read_by_others_than_its_owner(built):

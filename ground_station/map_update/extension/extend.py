@@ -76,6 +76,7 @@ def extend_map(
     target = folder if out is None else Path(out)
     check_target(target.absolute())
     map_ = store.load(folder)
+    settings = settings.with_noise(map_.info.noise_px)
     past = Refined.of(map_)
     _check_map(map_)
     flights = [

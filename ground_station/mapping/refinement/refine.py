@@ -51,7 +51,7 @@ def refine_map(
     no observations itself."""
     settings, folder = settings or MappingSettings(), Path(folder)
     map_ = store.load(folder)
-    settings = settings.with_noise(map_.info.built.get("noise_px"))
+    settings = settings.with_noise(map_.info.noise_px)
     past = Refined.of(map_)
     _check_map(map_)
     chosen = [_choose(flight, map_, past, settings) for flight in flights]

@@ -23,6 +23,7 @@ from ground_station.features.extractor import FeatureError
 from ground_station.map import store
 from ground_station.map_update.extension import extend, localizing
 from ground_station.map_update.extension.extend import extend_map
+from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.folder import ImageFolder
 
 HERE = Path(__file__).parent
@@ -141,9 +142,15 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
 ):
     folder = tmp_path / "map"
     shutil.copytree(corridor_world.folder, folder)
+    map_ = store.load(folder)
+    map_.info.built["noise_px"] = 0.3
+    store.save_tables(folder, map_)
     before = _content(folder)
 
-    def stop(*_, **__):
+    losses = []
+
+    def stop(*given, **__):
+        losses.extend(one.sfm.loss_px for one in given if isinstance(one, MappingSettings))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(extend if moment == "describe" else extend.store, moment, stop)
@@ -151,6 +158,8 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
         extend_map(folder, [short_flight], SETTINGS, rate_hz=RATE_HZ)
     assert _content(folder) == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map", "short"]
+    # What is new is adjusted with a loss as wide as the noise that the map's build found.
+    assert losses == ([0.3] if moment == "describe" else [])
 
 
 def test_killed_while_it_writes_it_leaves_the_old_map(corridor_world, short_flight, tmp_path):
