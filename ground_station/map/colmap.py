@@ -1,8 +1,8 @@
 """The border to COLMAP: its models in memory and on disk.
 
-Pixels of COLMAP count from the corner of the top-left pixel, half a pixel more than ours: that
-stays behind this border and that of its database. Key points go in undistorted, so the
-camera in there is a plain pinhole, whatever the lens.
+Pixels of COLMAP count from the corner of the top-left pixel, half a pixel more than ours, and are
+those of the picture, where each has the same noise: that stays behind this border and that of its
+database. Outside, key points are undistorted.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import numpy.typing as npt
 import pycolmap as pycolmap  # others have it from here, after zlib
 
 from ground_station.arrays import F64, I64
-from ground_station.errors import MapError
+from ground_station.errors import CameraError, MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap_files
+from ground_station.map.colmap_cameras import HALF_PIXEL, camera_of, entry_of
+from ground_station.map.colmap_files import CameraEntry
 from ground_station.map.model import Model
+from pi_firmware.wire.errors import ConfigError
 
-HALF_PIXEL = 0.5
 CAMERA_ID = 1
 
 Reconstruction = pycolmap.Reconstruction
@@ -36,21 +38,25 @@ def quiet() -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
 
 
-def pinhole_camera(camera: Camera) -> pycolmap.Camera:
-    """The pinhole that sees what our camera sees, undistorted, in COLMAP's pixels."""
+def colmap_camera(ours: Camera, level: float = 1.0, camera_id: int = CAMERA_ID) -> pycolmap.Camera:
+    """Our camera as COLMAP's, with pixels that are 1 / `level` as large."""
+    entry = entry_of(ours)
     return pycolmap.Camera(
-        camera_id=CAMERA_ID,
-        model="PINHOLE",
-        width=camera.width_px,
-        height=camera.height_px,
-        params=[
-            camera.fx_px,
-            camera.fy_px,
-            camera.cx_px + HALF_PIXEL,
-            camera.cy_px + HALF_PIXEL,
-        ],
+        camera_id=camera_id,
+        model=entry.model,
+        width=int(np.ceil(level * entry.width)),
+        height=int(np.ceil(level * entry.height)),
+        params=[level * value for value in entry.params[:4]] + list(entry.params[4:]),
         has_prior_focal_length=True,
     )
+
+
+def pixels_of(camera: Camera, pinhole_px: F64) -> F64:
+    """COLMAP's pixels (N, 2) of undistorted ones (N, 2)."""
+    if camera.is_pinhole:
+        return pinhole_px + HALF_PIXEL
+    flat = (pinhole_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    return camera.distort(flat) + HALF_PIXEL
 
 
 def from_arrays(
@@ -66,21 +72,11 @@ def from_arrays(
     COLMAP's adjustment has one loss for all observations. So `weight` (K,) of the images becomes a
     camera for each weight whose pixels are so much smaller: the same rays, with residuals scaled.
     Without it there is one camera, that of the database."""
-    pinhole = pinhole_camera(camera)
     weights = np.ones(len(model.names)) if weight is None else np.asarray(weight, np.float64)
-    levels, camera_of = np.unique(weights, return_inverse=True)
+    levels, level_of = np.unique(weights, return_inverse=True)
     result = pycolmap.Reconstruction()
     for number, level in enumerate(levels.tolist()):
-        result.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=CAMERA_ID + number,
-                model="PINHOLE",
-                width=int(np.ceil(level * camera.width_px)),
-                height=int(np.ceil(level * camera.height_px)),
-                params=level * np.asarray(pinhole.params),
-                has_prior_focal_length=True,
-            )
-        )
+        result.add_camera_with_trivial_rig(colmap_camera(camera, level, CAMERA_ID + number))
     order = np.argsort(model.image, kind="stable")
     offset = np.searchsorted(model.image[order], np.arange(len(model.names) + 1))
     place = model.feature
@@ -91,12 +87,12 @@ def from_arrays(
     for k, name in enumerate(model.names):
         mine = order[offset[k] : offset[k + 1]]
         seen = model.pixel_px[mine] if keypoints_px is None else keypoints_px[k]
-        pixels = (seen + HALF_PIXEL) * weights[k]
+        pixels = pixels_of(camera, seen) * weights[k]
         result.add_image_with_trivial_frame(
             pycolmap.Image(
                 name=name,
                 keypoints=pixels,
-                camera_id=CAMERA_ID + int(camera_of[k]),
+                camera_id=CAMERA_ID + int(level_of[k]),
                 image_id=int(model.image_id[k]),
             ),
             pycolmap.Rigid3d(cTw[k, :3]),
@@ -124,7 +120,7 @@ def positions(reconstruction: Reconstruction, model: Model) -> tuple[F64, F64]:
 
 
 def to_arrays(model: Reconstruction) -> Model:
-    """A model as arrays; pixels lose COLMAP's half pixel here."""
+    """A model as arrays; raises `MapError` for a camera that ours cannot be."""
     ids = sorted(model.reg_image_ids())
     point_ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     position = np.array([model.points3D[int(i)].xyz for i in point_ids]).reshape(-1, 3)
@@ -140,7 +136,7 @@ def to_arrays(model: Reconstruction) -> Model:
         features.append(index)
         seen.append(np.array([point.point3D_id for point in points], dtype=np.int64))
         pixels.append(np.array([point.xy for point in points]).reshape(-1, 2) - HALF_PIXEL)
-    camera = model.cameras[CAMERA_ID]
+    camera = _our_camera(model)
     return Model(
         names=names,
         image_id=np.array(ids, dtype=np.int64),
@@ -150,9 +146,18 @@ def to_arrays(model: Reconstruction) -> Model:
         image=np.concatenate(images).astype(np.int64),
         feature=np.concatenate(features).astype(np.int64),
         point=np.searchsorted(point_ids, np.concatenate(seen)),
-        pixel_px=np.concatenate(pixels),
-        pinhole=np.asarray(camera.params) - [0.0, 0.0, HALF_PIXEL, HALF_PIXEL],
+        pixel_px=camera.undistort_to_pinhole(np.concatenate(pixels)),
+        camera=camera,
     )
+
+
+def _our_camera(model: Reconstruction) -> Camera:
+    found = model.cameras[CAMERA_ID]
+    entry = CameraEntry(found.model.name, found.width, found.height, tuple(found.params))
+    try:
+        return camera_of(entry)
+    except (CameraError, ConfigError) as error:
+        raise MapError(f"camera {CAMERA_ID}: {error}") from None
 
 
 def copied(model: Reconstruction) -> Reconstruction:

@@ -29,6 +29,9 @@ PARAMETERS = {
 }
 """How many numbers a camera has, by its model: those that our lens model can hold."""
 
+_OWN = ("PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE")
+"""Those of our own models."""
+
 OTHERS = f"what can be taken over is {', '.join(PARAMETERS)}"
 """What is said of the other models."""
 
@@ -147,7 +150,7 @@ class Files:
 def check(folder: Path) -> None:
     """Raises `MapError` with one line where a map's model is cut or contradicts itself."""
     with Files(folder) as files:
-        cameras = _cameras(_File(files.read("cameras.bin")), ("PINHOLE",), "a map's is PINHOLE")
+        cameras = _cameras(_File(files.read("cameras.bin")), _OWN, f"a map's is {', '.join(_OWN)}")
         if 1 not in cameras:
             raise Fault("it has no camera 1")
         rigs = _rigs(_File(files.read("rigs.bin")), cameras)

@@ -13,12 +13,13 @@ from ground_station.map.store import Landmarks
 
 
 def residuals_px(model: Model) -> F64:
-    """Reprojection residuals of all observations (O, 2), undistorted pixels; inf when behind."""
+    """Reprojection residuals of all observations (O, 2), pixels of the picture; inf when behind."""
     X = _in_camera(model)
     fx, fy, cx, cy = model.pinhole
     with np.errstate(divide="ignore", invalid="ignore"):
         projected = X[:, :2] / X[:, 2:] * [fx, fy] + [cx, cy]
-    return np.where(X[:, 2:] > 0, model.pixel_px - projected, np.inf)
+    stretch = model.camera.stretch(model.pixel_px)[:, None]
+    return np.where(X[:, 2:] > 0, (model.pixel_px - projected) / stretch, np.inf)
 
 
 def _in_camera(model: Model) -> F64:
@@ -69,7 +70,7 @@ def covariances(model: Model, sigma: float | F64) -> F64:
     J[:, 0, 0], J[:, 0, 2] = fx / z, -fx * X[:, 0] / z**2
     J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * X[:, 1] / z**2
     J = J @ np.swapaxes(model.wTc[model.image, :3, :3], 1, 2)
-    J /= np.broadcast_to(sigma, len(J))[:, None, None]
+    J /= (sigma * model.camera.stretch(model.pixel_px))[:, None, None]
     information = np.zeros((len(model.position), 3, 3))
     np.add.at(information, model.point, np.einsum("oki,okj->oij", J, J))
     return np.asarray(np.linalg.inv(information), np.float64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.arrays import F64, I64
+from ground_station.geometry.camera import Camera
 from ground_station.map.store import Map
 
 
@@ -17,7 +18,7 @@ class Model:
     `names`, K image names and `image_id` (K,) their ids, in order of id; `wTc` (K, 4, 4);
     `point_id` (M,), `position` (M, 3). Observation o is key point `feature[o]` of image `image[o]`
     (an index into `names`), an observation of point `point[o]` (an index into `point_id`), at
-    `pixel_px[o]` (O, 2), undistorted pixels. `pinhole` is fx, fy, cx, cy in our pixels.
+    `pixel_px[o]` (O, 2), undistorted pixels of `camera`, which took all images.
     """
 
     names: list[str]
@@ -29,7 +30,13 @@ class Model:
     feature: I64
     point: I64
     pixel_px: F64
-    pinhole: F64
+    camera: Camera
+
+    @property
+    def pinhole(self) -> F64:
+        """fx, fy, cx, cy (4,), pixels."""
+        camera = self.camera
+        return np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
 
 
 def model_of(map_: Map) -> Model:
@@ -46,5 +53,5 @@ def model_of(map_: Map) -> Model:
         feature=np.zeros(len(image), np.int64),
         point=kf.landmark.astype(np.int64),
         pixel_px=camera.undistort_to_pinhole(kf.pixel_px),
-        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        camera=camera,
     )

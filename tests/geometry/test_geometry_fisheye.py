@@ -23,7 +23,9 @@ FOLDING = replace(EQUIDISTANT, k1=-0.09)
 """Turns back at 110° from its axis."""
 NARROW = replace(USUAL, fx_px=700.0, fy_px=700.0)
 """Less than 65° from the axis in every corner."""
-CAMERAS = pytest.mark.parametrize("camera", [EQUIDISTANT, USUAL, FOLDING, NARROW])
+BENT = replace(THESIS_CAMERA, p1=0.02, k3=0.1)
+LENSES = [EQUIDISTANT, USUAL, FOLDING, NARROW]
+CAMERAS = pytest.mark.parametrize("camera", LENSES)
 GOOD = """\
 model = "fisheye"
 width_px = 640
@@ -119,7 +121,7 @@ def test_inside_is_what_is_used_and_in_the_picture(camera: Camera) -> None:
     assert math.isfinite(lens.max_radius)
 
 
-@CAMERAS
+@pytest.mark.parametrize("camera", [*LENSES, THESIS_CAMERA, BENT])
 def test_the_stretch_is_the_derivative_of_undistortion(camera: Camera) -> None:
     pixels = picture(camera)
     pixels = pixels[camera.uses(pixels + 2) & camera.uses(pixels - 2)]
@@ -133,7 +135,12 @@ def test_the_stretch_is_the_derivative_of_undistortion(camera: Camera) -> None:
     rms = np.sqrt(sum((column**2).sum(axis=1) for column in across) / 2)
     stretch = camera.stretch(camera.undistort_to_pinhole(pixels))
     np.testing.assert_allclose(stretch, rms, rtol=1e-4)
-    assert (THESIS_CAMERA.stretch(pixels) == 1).all()
+
+
+def test_beyond_where_the_polynomial_turns_back_the_stretch_stays_finite() -> None:
+    far = np.linspace(0, 4000, 400)
+    stretch = THESIS_CAMERA.stretch(np.stack([far, far], axis=1))
+    assert np.isfinite(stretch).all() and (stretch > 0).all()
 
 
 def test_rows_are_the_pictures() -> None:

@@ -159,7 +159,7 @@ def _world(tmp_path_factory) -> World:
         feature=np.zeros(len(image), np.int64),
         point=index,
         pixel_px=camera.undistort_to_pinhole(pixel),
-        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        camera=camera,
     )
     reconstruction = colmap.from_arrays(model, camera)
     adjustment.adjust(reconstruction, loss_px=1.0, threads=1)

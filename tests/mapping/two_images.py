@@ -25,7 +25,7 @@ def write(folder: Path) -> Path:
         feature=np.array([0, 0]),
         point=np.array([0, 0]),
         pixel_px=np.array([[395.0, 241.0], [229.0, 241.0]]),
-        pinhole=np.array([501.58, 505.57, 312.51, 241.21]),
+        camera=Camera(),
     )
     colmap.write(colmap.from_arrays(model, Camera()), folder)
     return folder

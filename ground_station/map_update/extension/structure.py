@@ -63,6 +63,7 @@ class Structure:
         self.position = np.full((tracks.count, 3), np.nan)
         self.landmark = np.full(tracks.count, -1, np.int64)
         camera = map_.info.camera
+        self._camera = camera
         self._pinhole = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
         self._depth = np.full(len(frames), np.nan)
         self._anchors = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64))]
@@ -177,7 +178,7 @@ class Structure:
             feature=feature,
             point=point.ravel(),
             pixel_px=self._pixels(frame, feature, depth),
-            pinhole=self._pinhole,
+            camera=self._camera,
         )
 
     # Growing

@@ -119,7 +119,7 @@ def build_map(
             "reprojection_px": float(np.linalg.norm(landmarks.residuals_px(model), axis=1).mean()),
             "observations": len(model.point),
             "pairs_verified": len(pairs),
-            "sparse_camera": "PINHOLE; key points are undistorted, the lens is in [camera]",
+            "sparse_camera": "the one in [camera]; key points are those of the pictures",
             "threads": threads,
             "workers": workers.name,
             **({"cache": asdict(cache.figures)} if cache else {}),

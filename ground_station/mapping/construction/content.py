@@ -42,7 +42,7 @@ class KeyPoints(Protocol):
         ...
 
 
-_FEATURES, _PAIR, _STRUCTURE = b"blimp features 2\n", b"blimp pair 1\n", b"blimp structure 3\n"
+_FEATURES, _PAIR, _STRUCTURE = b"blimp features 2\n", b"blimp pair 1\n", b"blimp structure 4\n"
 """Counted on when the same input gives another result: what was made before is then made again."""
 
 

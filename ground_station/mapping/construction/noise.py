@@ -58,7 +58,7 @@ def matched_neighbours(images: Images, ratio: float, most: int) -> list[tuple[F6
 
 
 def measured(images: Images, camera: Camera, ratio: float) -> Noise | None:
-    """The noise of neighbours' matches, in undistorted pixels; None where no neighbours overlap."""
+    """The noise of neighbours' matches, pixels of the picture; None where none overlap."""
     limits = _LIMITS_PX * camera.width_px / 640
     # A random match lies so near to a line, per pixel of distance: both sides of the longest.
     w, h = camera.width_px, camera.height_px
@@ -70,6 +70,7 @@ def measured(images: Images, camera: Camera, ratio: float) -> Noise | None:
         distance = _distances(p, q, camera.matrix, float(limits[-1]) * 2 / 3)
         if distance is None:
             continue
+        distance /= np.sqrt(0.5 * (camera.stretch(p) ** 2 + camera.stretch(q) ** 2))
         n, k = len(distance), (distance[:, None] < limits).sum(axis=0)
         binomial = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
         false_alarms += binomial + k * np.log(chance)

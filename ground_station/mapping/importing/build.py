@@ -88,7 +88,7 @@ def import_model(
             "reprojection_px": float(np.linalg.norm(landmarks.residuals_px(found), axis=1).mean()),
             "observations": len(found.point),
             "pairs_verified": len(verified),
-            "sparse_camera": "PINHOLE; key points are undistorted, the lens is in [camera]",
+            "sparse_camera": "the one in [camera]; key points are those of the pictures",
             "threads": threads,
             "stage_s": {"import": round(time.monotonic() - started_s, 3)},
             "settings": asdict(settings),

@@ -40,7 +40,7 @@ class Graph:
     sigma_px: F64
 
     def error_px(self) -> F64:
-        """Reprojection errors of all observations (O,), pinhole pixels; inf behind the camera."""
+        """Reprojection errors of all observations (O,), picture pixels; inf behind the camera."""
         return np.asarray(np.linalg.norm(landmarks.residuals_px(self.model), axis=1))
 
     def group_of_observations(self) -> I64:
@@ -71,7 +71,7 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
         feature=np.zeros(len(observations), np.int64),
         point=np.concatenate([kf.landmark, *(f.landmark for f in flights)]).astype(np.int64),
         pixel_px=np.concatenate([pixel_px, *(f.pixel_px for f in flights)]),
-        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        camera=camera,
     )
     first = int(group.max(initial=0)) + 1
     groups = [group, *(np.full(len(f), first + k) for k, f in enumerate(flights))]

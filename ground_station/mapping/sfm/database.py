@@ -11,6 +11,7 @@ from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.colmap import pycolmap
+from ground_station.map.colmap_cameras import HALF_PIXEL
 from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
 
@@ -22,7 +23,7 @@ def write_database(
     keypoints_px: Sequence[F64],
     pairs: Mapping[tuple[int, int], TwoView],
 ) -> None:
-    """Writes a COLMAP database: one pinhole camera, images with id = index + 1, verified pairs.
+    """Writes a COLMAP database: one camera, images with id = index + 1, verified pairs.
 
     `keypoints_px[i]` (N, 2) are image i's undistorted pixels; `pairs[i, j]` with i < j. It is
     written beside and renamed.
@@ -32,10 +33,10 @@ def write_database(
     for left in part.parent.glob(part.name + "*"):  # SQLite's journals, too
         left.unlink()
     with pycolmap.Database.open(part) as database:
-        pinhole = colmap.pinhole_camera(camera)
-        database.write_camera(pinhole, use_camera_id=True)
+        taken_by = colmap.colmap_camera(camera)
+        database.write_camera(taken_by, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(pinhole.sensor_id)
+        rig.add_ref_sensor(taken_by.sensor_id)
         database.write_rig(rig, use_rig_id=True)
         for i, (name, pixels) in enumerate(zip(names, keypoints_px, strict=True)):
             image = pycolmap.Image(name=name, camera_id=colmap.CAMERA_ID, image_id=i + 1)
@@ -43,12 +44,10 @@ def write_database(
             frame.add_data_id(image.data_id)
             database.write_image(image, use_image_id=True)
             database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(i + 1, (pixels + colmap.HALF_PIXEL).astype(np.float32))
-        K = pinhole.calibration_matrix()
+            database.write_keypoints(i + 1, colmap.pixels_of(camera, pixels).astype(np.float32))
+        K = taken_by.calibration_matrix()
         K_inv = np.linalg.inv(K)
-        shift = np.array(
-            [[1.0, 0.0, colmap.HALF_PIXEL], [0.0, 1.0, colmap.HALF_PIXEL], [0.0, 0.0, 1.0]]
-        )
+        shift = np.array([[1.0, 0.0, HALF_PIXEL], [0.0, 1.0, HALF_PIXEL], [0.0, 0.0, 1.0]])
         kinds = pycolmap.TwoViewGeometryConfiguration
         for (i, j), view in pairs.items():
             geometry = pycolmap.TwoViewGeometry()

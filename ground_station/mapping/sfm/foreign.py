@@ -1,7 +1,4 @@
-"""Models that COLMAP or hloc made: their poses and camera in our conventions.
-
-The half pixel between COLMAP's corner of the picture and our first pixel's centre goes here.
-"""
+"""Models that COLMAP or hloc made: their poses and camera in our conventions."""
 
 from __future__ import annotations
 
@@ -17,24 +14,11 @@ from ground_station.arrays import F64
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens_models import MODELS
 from ground_station.map import colmap_files
-from ground_station.map.colmap import HALF_PIXEL
+from ground_station.map.colmap_cameras import camera_of
 from ground_station.map.colmap_files import NO_POINT, CameraEntry, ImageEntry
 from ground_station.mapping.sfm import colmap_text
-from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
-
-_ORDER = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-}
-"""COLMAP's parameters; the lens is OpenCV's polynomial or its fisheye."""
 
 
 @dataclass(frozen=True)
@@ -103,28 +87,3 @@ def _only_camera(folder: Path, cameras: dict[int, CameraEntry], images: list[Ima
         return camera_of(first)
     except (CameraError, ConfigError) as error:
         raise MapError(f"{folder}: camera {used[0]}: {error}") from None
-
-
-def camera_of(entry: CameraEntry) -> Camera:
-    """COLMAP's camera as ours; raises `CameraError` or `ConfigError` for what ours cannot be."""
-    given = dict(zip(_ORDER[entry.model].split(), entry.params, strict=True))
-    fisheye = entry.model == "OPENCV_FISHEYE"
-    others = () if fisheye else ("k4", "k5", "k6")
-    rational = {name: given.pop(name) for name in others if name in given}
-    if any(rational.values()):
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in rational.items())
-        raise CameraError(f"{entry.model} with {numbers}; only 0 can be taken over")
-    if "f" in given:
-        given["fx"] = given["fy"] = given.pop("f")
-    model = "fisheye" if fisheye else "opencv5"
-    lens = {name: given[name] for name in MODELS[model].NAMES if name in given}
-    values = {
-        "model": model,
-        "width_px": entry.width,
-        "height_px": entry.height,
-        "fx_px": given["fx"],
-        "fy_px": given["fy"],
-        "cx_px": given["cx"] - HALF_PIXEL,
-        "cy_px": given["cy"] - HALF_PIXEL,
-    }
-    return config.from_mapping(values | lens, Camera, where=entry.model)

@@ -16,6 +16,7 @@ import pycolmap
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
+from ground_station.map.colmap_cameras import HALF_PIXEL
 
 MAX_FEATURES = 2000
 """Of an image: about what a build of ours takes, too."""
@@ -50,8 +51,8 @@ def reconstruct(
         0.0,
         0.0,
     ]
-    lens[2] += colmap.HALF_PIXEL
-    lens[3] += colmap.HALF_PIXEL
+    lens[2] += HALF_PIXEL
+    lens[3] += HALF_PIXEL
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model, reader.camera_params = "FULL_OPENCV", ",".join(map(str, lens))
     extraction = pycolmap.FeatureExtractionOptions()

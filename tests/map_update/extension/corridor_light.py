@@ -130,7 +130,7 @@ def write_map(corridor: Corridor, folder: Path, seed=1) -> store.Map:
         feature=np.zeros(len(image), np.int64),
         point=new[index],
         pixel_px=CAMERA.undistort_to_pinhole(pixel),
-        pinhole=np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px]),
+        camera=CAMERA,
     )
     info = store.MapInfo("corridor", "c" * 64, DIMENSION, CAMERA, folder.name, "world", "m")
     info.registration = {"method": "observations", "points": 12}

@@ -61,7 +61,7 @@ def _seen(points, wTc, noise_px=0.0, seed=0):
         feature=point,
         point=point,
         pixel_px=pixel,
-        pinhole=pinhole,
+        camera=CAMERA,
     )
 
 

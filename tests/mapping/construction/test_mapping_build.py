@@ -52,19 +52,19 @@ def test_colmap_reads_the_same_positions_poses_and_projections(built):
         assert np.allclose(image.cam_from_world().inverse().matrix(), kf.wTc[k, :3], atol=1e-12)
         mine = kf.landmark[kf.offset[k] : kf.offset[k + 1]]
         local = poses.transform(poses.inverse(kf.wTc[k]), lm.position_m[mine])
-        ours = camera.undistort_to_pinhole(camera.project(local))
+        ours = camera.project(local)
         theirs = np.array([image.project_point(p) for p in lm.position_m[mine]])
         assert np.allclose(ours + 0.5, theirs, atol=1e-6)
 
 
-def test_colmap_observes_the_keyframes_pixels_undistorted_and_half_a_pixel_on(built):
+def test_colmap_observes_the_keyframes_pixels_half_a_pixel_on(built):
     model = pycolmap.Reconstruction(built.folder / "sparse")
     kf, lm = built.map.keyframes, built.map.landmarks
     image = next(image for image in model.images.values() if image.name == kf.names[4])
     rows = slice(kf.offset[4], kf.offset[5])
     theirs = {p.point3D_id: p.xy for p in image.points2D if p.has_point3D()}
     assert len(theirs) == rows.stop - rows.start
-    expected = built.scene.camera.undistort_to_pinhole(kf.pixel_px[rows]) + 0.5
+    expected = kf.pixel_px[rows] + 0.5
     got = [theirs[i] for i in lm.id[kf.landmark[rows]].tolist()]
     assert np.allclose(got, expected, atol=1e-3)  # the database keeps float32
 

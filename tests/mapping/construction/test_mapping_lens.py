@@ -73,7 +73,7 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
         feature=np.concatenate(feature)[keep],
         point=new[np.concatenate(point)[keep]],
         pixel_px=np.zeros((int(keep.sum()), 2)),
-        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        camera=camera,
     )
     names = model.names
     time_ns = np.arange(len(names)) * 100_000_000

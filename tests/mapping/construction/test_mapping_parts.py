@@ -169,7 +169,7 @@ def _united(scene, runs, pairs):
     names = [str(k) for k in range(len(wTc))]
     images = Images(names, np.arange(len(wTc)), [], pixels)
     cores = [np.array(run) for run in runs]
-    return uniting.unite(parts, cores, PLACES[:1] * len(runs), images, pairs)
+    return uniting.unite(parts, cores, PLACES[:1] * len(runs), images, pairs, CAMERA)
 
 
 def test_a_landmark_of_two_parts_is_one_with_all_its_observations():

@@ -111,9 +111,9 @@ def test_the_command_says_what_is_missing_and_keeps_the_rest(
 def test_a_maps_own_model_comes_back_with_the_lens_of_its_pictures(
     built, use_scene, scene_settings, tmp_path
 ):
-    """`sparse` is of undistorted key points: the pictures' camera is given beside it."""
     use_scene(built.scene)
     model = foreign.read(built.folder / "sparse")
+    assert model.camera == dataclasses.replace(built.scene.camera, readout_s=0.0)
     names = {frame.name: frame for frame in built.scene.frames()}
     again = import_model(
         model, [names[name] for name in model.names], built.scene.camera, scene_settings,

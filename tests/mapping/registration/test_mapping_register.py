@@ -243,7 +243,8 @@ def test_triangulation_scatters_as_its_covariance_says(built):
         image=np.arange(6),
         feature=np.zeros(6, np.int64),
         point=np.zeros(6, np.int64),
-        pixel_px=np.zeros((6, 2)),
-        pinhole=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        pixel_px=camera.undistort_to_pinhole(exact),
+        camera=camera,
     )
-    assert np.allclose(landmarks.covariances(model, 1.0)[0], predicted, rtol=1e-6)
+    # There a pixel of the picture is one on the plane, to a few parts in a hundred.
+    assert np.allclose(landmarks.covariances(model, 1.0)[0], predicted, rtol=0.1)

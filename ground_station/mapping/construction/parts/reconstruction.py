@@ -93,7 +93,7 @@ def _joined(
         if at is not None
     ]
     members, cores, places = (list(column) for column in zip(*inside, strict=True))
-    model = uniting.unite(members, cores, places, images, pairs)
+    model = uniting.unite(members, cores, places, images, pairs, camera)
     apart = [
         len(part.index) for part, at in zip(solved, joined.similarities, strict=True) if at is None
     ]

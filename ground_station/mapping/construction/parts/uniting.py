@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from ground_station.arrays import F64, I64
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
+from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.pairs import Pair
@@ -32,6 +33,7 @@ def unite(
     at: Sequence[Alignment],
     images: Images,
     pairs: Mapping[Pair, TwoView],
+    camera: Camera,
 ) -> Model:
     """The model of all parts, each moved by its similarity; images have id = index + 1.
 
@@ -58,13 +60,12 @@ def unite(
     edges = [np.stack([one[same], other[same]], axis=1)]
     holder = np.full(starts[-1], -1, dtype=np.int64)
     holder[seen] = point[first]
-    pinhole = np.median([part.pinhole for part in parts], axis=0)
     inside = _inside(parts, len(images.names))
     for (i, j), view in pairs.items():
         if row[i] >= 0 and row[j] >= 0 and not inside[i] & inside[j]:
             own = holder[starts[i] : starts[i + 1]], holder[starts[j] : starts[j + 1]]
             px = images.pinhole_px[i], images.pinhole_px[j]
-            edges.append(_in_place(own, view, position, wTc[row[[i, j]]], px, pinhole))
+            edges.append(_in_place(own, view, position, wTc[row[[i, j]]], px, parts[0].pinhole))
     ends = np.concatenate(edges)
     graph = coo_array((np.ones(len(ends), bool), tuple(ends.T)), shape=(len(position),) * 2)
     _, landmark = connected_components(graph, directed=False)
@@ -91,7 +92,7 @@ def unite(
         feature=feature,
         point=track,
         pixel_px=np.concatenate(pixels),
-        pinhole=pinhole,
+        camera=camera,
     )
 
 
