@@ -31,35 +31,35 @@ RUN_FILE = "station.json"
 class MapSettings:
     """Where poses are in."""
 
-    folder: str = key("maps/atrium", "a registered map")
-    shelf: str = key("maps", "folder of the maps that can be chosen")
-    camera: str = key("", "camera.toml of the payloads; empty: the map's")
+    folder: str = "maps/atrium"
+    shelf: str = "maps"
+    camera: str = ""
 
 
 @dataclass(frozen=True)
 class PayloadSettings:
     """Who is taken up."""
 
-    ids: list[str] = key([], "payloads that are taken up; empty: all")
-    most: int = key(4, "at once", low=1, high=16)
+    ids: list[str] = key([])
+    most: int = key(4, low=1, high=16)
 
 
 @dataclass(frozen=True)
 class VideoSettings:
     """Where the video comes in."""
 
-    host: str = key("127.0.0.1", "address that is listened on; 0.0.0.0: all")
-    port: int = key(video.PORT, "UDP port; 0: any free one", low=0, high=65535)
+    host: str = "127.0.0.1"
+    port: int = key(video.PORT, low=0, high=65535)
 
 
 @dataclass(frozen=True)
 class TelemetrySettings:
     """Zenoh with the payloads."""
 
-    listen: list[str] = key([LOCAL_ENDPOINT], "endpoints to listen on, tcp/ or tls/HOST:PORT")
-    connect: list[str] = key([], "payloads that listen themselves")
-    certificates: str = key("", "folder that `blimp keys ground` wrote; empty: loopback only")
-    discoverable: str = key("", "interface on which payloads find this station; empty: none")
+    listen: list[str] = key([LOCAL_ENDPOINT])
+    connect: list[str] = key([])
+    certificates: str = ""
+    discoverable: str = ""
 
     def __post_init__(self) -> None:
         for endpoint in (*self.listen, *self.connect):
@@ -73,7 +73,7 @@ class TelemetrySettings:
 class LocalizerSettings:
     """How poses are found."""
 
-    preset: str = key("default", "the localizer's settings: default, thesis or a .toml file")
+    preset: str = "default"
 
     def __post_init__(self) -> None:
         try:
@@ -86,38 +86,36 @@ class LocalizerSettings:
 class RecordingSettings:
     """The ground's recordings."""
 
-    folder: str = key("recordings", "where they go")
-    at_start: bool = key(False, "records from the start")
-    resume_s: float = key(
-        600.0, "one cut so long ago at most goes on; 0: none", unit="s", low=0, high=86_400
-    )
-    max_file_MB: int = key(1024, "a file ends at this size", unit="MB", low=1, high=4000)
-    max_file_s: float = key(3600.0, "and at this age", unit="s", low=10, high=86_400)
-    max_total_MB: int = key(20_000, "oldest are deleted beyond", unit="MB", low=1, high=10_000_000)
-    min_free_MB: int = key(1024, "left free on the disk", unit="MB", low=0, high=10_000_000)
-    sync_s: float = key(1.0, "the most that a power cut costs", unit="s", low=0.1, high=60)
+    folder: str = "recordings"
+    at_start: bool = False
+    resume_s: float = key(600.0, unit="s", low=0, high=86_400)
+    max_file_MB: int = key(1024, unit="MB", low=1, high=4000)
+    max_file_s: float = key(3600.0, unit="s", low=10, high=86_400)
+    max_total_MB: int = key(20_000, unit="MB", low=1, high=10_000_000)
+    min_free_MB: int = key(1024, unit="MB", low=0, high=10_000_000)
+    sync_s: float = key(1.0, unit="s", low=0.1, high=60)
 
 
 @dataclass(frozen=True)
 class HttpSettings:
     """The dashboard and the API."""
 
-    host: str = key("127.0.0.1", "address; other than loopback needs token_file")
-    port: int = key(8080, "TCP port; 0: any free one", low=0, high=65535)
-    token_file: str = key("", "file with the token, readable by its owner only")
-    names: list[str] = key([], "host names under which it is reached, besides its address")
-    video_rate_hz: float = key(15.0, "pictures for each viewer", unit="Hz", low=1, high=60)
-    jpeg_quality: int = key(80, "of these pictures", low=10, high=100)
-    viewers: int = key(8, "live connections at once", low=1, high=100)
+    host: str = "127.0.0.1"
+    port: int = key(8080, low=0, high=65535)
+    token_file: str = ""
+    names: list[str] = key([])
+    video_rate_hz: float = key(15.0, unit="Hz", low=1, high=60)
+    jpeg_quality: int = key(80, low=10, high=100)
+    viewers: int = key(8, low=1, high=100)
 
 
 @dataclass(frozen=True)
 class FoxgloveSettings:
     """The live channel for Foxglove."""
 
-    enabled: bool = key(True, "false: no such process")
-    host: str = key("127.0.0.1", "address; loopback only")
-    port: int = key(8765, "TCP port; 0: any free one", low=0, high=65535)
+    enabled: bool = True
+    host: str = "127.0.0.1"
+    port: int = key(8765, low=0, high=65535)
 
     def __post_init__(self) -> None:
         if self.host not in ("127.0.0.1", "::1", "localhost"):
@@ -131,7 +129,7 @@ class FoxgloveSettings:
 class StationSettings:
     """All of `station.toml`."""
 
-    name: str = key("main", "this station's name in reports")
+    name: str = "main"
     map: MapSettings = table(MapSettings)
     payloads: PayloadSettings = table(PayloadSettings)
     video: VideoSettings = table(VideoSettings)
@@ -154,11 +152,11 @@ class Run:
     """One run of the service as its processes read it: settings, and what is replayed with it."""
 
     station: StationSettings = table(StationSettings)
-    demo: bool = key(False, "the sample flight is played")
-    started_ns: int = key(0, "wall clock", unit="ns")
-    stepped: bool = key(False, "the payload waits for poses: each frame in its turn, none skipped")
-    start: str = key("", "TUM file with the first frame's pose; empty: found in the whole map")
-    landmarks: bool = key(False, "estimates tell which landmarks they were solved from")
+    demo: bool = False
+    started_ns: int = key(0, unit="ns")
+    stepped: bool = False
+    start: str = ""
+    landmarks: bool = False
 
 
 def load(path: Path | None, overrides: Iterable[str] = ()) -> StationSettings:

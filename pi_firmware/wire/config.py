@@ -27,7 +27,7 @@ _TOO_DEEP = re.compile(
 
 def key(
     default: Any,
-    doc: str,
+    doc: str = "",
     *,
     unit: str = "",
     low: float | None = None,
@@ -36,10 +36,10 @@ def key(
 ) -> Any:
     """A dataclass field that is one configuration key.
 
-    `low` and `high` bound numbers (inclusive), `choices` lists the only values allowed, `unit` and
-    `doc` are what the shipped file says in its comment.
+    `low` and `high` bound numbers (inclusive), `choices` lists the only values allowed. `doc` says
+    what it is where no shipped file does in a comment.
     """
-    meta = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices}
+    meta = {"unit": unit, "low": low, "high": high, "choices": choices}
     if isinstance(default, list | dict):
         return dataclasses.field(default_factory=lambda: type(default)(default), metadata=meta)
     return dataclasses.field(default=default, metadata=meta)
