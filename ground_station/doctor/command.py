@@ -9,6 +9,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ground_station.service import add_settings_arguments
+
 if TYPE_CHECKING:
     from ground_station.doctor.findings import Check, Finding
     from ground_station.service.settings import StationSettings
@@ -26,10 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
     parser.set_defaults(next="blimp init    (which step from payload to flight is next)")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file (default: defaults)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
-    )
+    add_settings_arguments(parser)
     parser.add_argument(
         "--lan", nargs="?", const="", metavar="INTERFACE", help="as of `blimp serve`"
     )

@@ -7,6 +7,8 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ground_station.service import add_settings_arguments
+
 if TYPE_CHECKING:
     from ground_station.service.settings import HttpSettings
     from ground_station.service.web.guide import Step
@@ -28,10 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
     parser.set_defaults(next="blimp serve --lan")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="as of `blimp serve`")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
-    )
+    add_settings_arguments(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the steps here, too")
 
 

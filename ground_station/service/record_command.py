@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ground_station.service import add_settings_arguments
 from pi_firmware.wire.text import printable
 
 if TYPE_CHECKING:
@@ -42,10 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera", metavar="CAMERA.toml", help="calibration that is put into the recordings"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="as of `blimp serve`")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
-    )
+    add_settings_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:

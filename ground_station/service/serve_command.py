@@ -6,6 +6,8 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+from ground_station.service import add_settings_arguments
+
 _EPILOG = """\
 examples:
   blimp serve --demo                      # the sample flight, played by the real firmware
@@ -20,11 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = _EPILOG
     parser.set_defaults(next="blimp init    (which step from payload to flight is next)")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file (default: defaults)")
+    add_settings_arguments(parser)
     parser.add_argument("--map", type=Path, metavar="MAP", help="folder of a registered map")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="overrides one key"
-    )
     parser.add_argument(
         "--demo", action="store_true", help="play the sample flight, over loopback only"
     )
