@@ -16,7 +16,7 @@ _COMMANDS = (
     (
         "payload",
         "ground_station.bench.payload",
-        "start, latency, memory and instructions a frame of the firmware",
+        "start, latency, memory and processor time a frame of the firmware",
         "Measures the payload's own program on this machine, streaming its test picture.",
     ),
     (

@@ -1,39 +1,20 @@
-"""The payload's figures: start, latency, memory and instructions a frame of the real program."""
+"""The payload's figures: start, latency, memory and processor time a frame of the real program."""
 
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
-import tomllib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ground_station.bench import callgrind as callgrind
 from ground_station.bench.flight import RATE_HZ, BenchFlight, FlightError, Ground, fly, picture
 
-KEPT = Path(__file__).with_name("kept.toml")
-"""Instructions a frame that were measured when the payload was last found good."""
-
-SENT = "all sent"
-_SEND_ALL = ("gate.enabled=false",)  # it measures all the same; the test picture moves too slowly
-_VARIANTS: dict[str, tuple[str, bool, tuple[str, ...]]] = {
-    # name: test picture, telemetry, settings
-    SENT: ("zone-plate", True, _SEND_ALL),
-    "no telemetry": ("zone-plate", False, _SEND_ALL),
-    "gate on": ("zone-plate", True, ()),
-    "all gated": ("black", True, ()),
-}
-# By default one thread can keep the others waiting until its queue to them is full.
-_VALGRIND = ("valgrind", "-q", "--tool=callgrind", "--fair-sched=yes")
-_WARM_UP_FRAMES = 30
+_SEND_ALL = "gate.enabled=false"  # it measures all the same; the test picture moves too slowly
 _START_LIMIT_S = 60.0
 _LIMIT_MB = 120.0
 _IMPORT = re.compile(r"import time: +(\d+) \| +\d+ \| +(\S+)")
@@ -93,7 +74,7 @@ def stream(seconds: float) -> dict[str, Any]:
     Latency is from a picture's capture to the arrival of its last packet at a socket here; the test
     picture is captured when it leaves its source. Processor time is of all threads.
     """
-    with Ground() as ground, fly(ground, [picture(seconds + _START_LIMIT_S), *_SEND_ALL]) as flight:
+    with Ground() as ground, fly(ground, [picture(seconds + _START_LIMIT_S), _SEND_ALL]) as flight:
         first_ns = _first_arrival_ns(ground, flight)
         used_s = _processor_s(flight.process.pid)
         count = len(ground.arrivals)
@@ -119,71 +100,6 @@ def stream(seconds: float) -> dict[str, Any]:
         "processor_ms": 1e3 * used_s / len(arrivals),
         **memory,
     }
-
-
-def instructions(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Instructions a captured frame, by object, of each variant; empty without valgrind.
-
-    Each variant flies twice, once for `frames` longer, and the difference counts: the start and the
-    first frames cancel. The test picture waits for a slow program, so that none is dropped; raises
-    `FlightError` if one was. What goes by the clock and not by the frame is counted at the pace of
-    valgrind, whose longer flight took `seconds`.
-    """
-    if shutil.which("valgrind") is None:
-        return {}
-    result: dict[str, Any] = {}
-    for name, (pattern, telemetry, settings) in _VARIANTS.items():
-        progress(f"instructions: {name}")
-        flown = (pattern, telemetry, settings)
-        short = _profile(_WARM_UP_FRAMES, *flown)
-        long = _profile(_WARM_UP_FRAMES + frames, *flown)
-        groups = {key: (long.groups[key] - short.groups[key]) / frames for key in long.groups}
-        result[name] = {
-            "groups": groups,
-            "total": sum(groups.values()),
-            "sent": long.sent,
-            "messages": long.messages,
-            "seconds": long.seconds,
-        }
-    return result
-
-
-def payload_alone(groups: dict[str, float]) -> float:
-    """Instructions without x264 and the test picture, which no payload with a camera executes."""
-    return sum(groups.values()) - groups.get("x264", 0.0) - groups.get("test picture", 0.0)
-
-
-def kept() -> dict[str, float]:
-    """The figures kept, by group."""
-    return dict(tomllib.loads(KEPT.read_text(encoding="utf-8"))["instructions"])
-
-
-class _Profile(NamedTuple):
-    groups: dict[str, float]
-    seconds: float
-    sent: int
-    messages: int
-
-
-def _profile(frames: int, pattern: str, telemetry: bool, settings: Sequence[str]) -> _Profile:
-    with tempfile.TemporaryDirectory() as folder, Ground(telemetry=telemetry) as ground:
-        out = Path(folder, "callgrind.out")
-        before = (*_VALGRIND, f"--callgrind-out-file={out}")
-        # A Pi Zero's one core gives BLAS no second thread, and one that waits would be counted.
-        blas = {"OPENBLAS_NUM_THREADS": "1"}
-        flown = [picture(frames / RATE_HZ, pattern), *settings]
-        with fly(ground, flown, before=before, environment=blas) as flight:
-            flight.end()
-            ended_ns = time.monotonic_ns()
-        captured, gated, sent = flight.counters()
-        if captured != frames or gated + sent != captured:
-            raise FlightError(
-                f"of {frames} frames under valgrind {captured} were captured, {gated} gated and"
-                f" {sent} sent; each must be gated or sent"
-            )
-        seconds = 1e-9 * (ended_ns - flight.begin_ns)
-        groups = callgrind.by_group(callgrind.read(out))
-        return _Profile(groups, seconds, sent, ground.messages)
 
 
 def _first_arrival_ns(ground: Ground, flight: BenchFlight) -> int:

@@ -11,15 +11,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 from ground_station.errors import GroundStationError
 from ground_station.stream import rtp, udp
 from ground_station.stream.counters import Counters
-from pi_firmware.wire import keys, sei
+from pi_firmware.wire import sei
 from pi_firmware.wire.telemetry import open_session
 
 RATE_HZ = 30.0
@@ -42,14 +41,13 @@ class Arrival:
 
 
 class Ground:
-    """A UDP port that takes the video and, with `telemetry`, an endpoint that takes the gate's.
+    """A UDP port that takes the video and, with `telemetry`, an endpoint to connect to.
 
     A context manager; `arrivals` fill on a thread of its own.
     """
 
     def __init__(self, *, telemetry: bool = True) -> None:
         self.arrivals: list[Arrival] = []
-        self.messages = 0
         self._closing = threading.Event()
         self._socket = udp.bind("127.0.0.1", 0, 0.1)
         self._thread = threading.Thread(target=self._receive, name="bench-video", daemon=True)
@@ -67,16 +65,13 @@ class Ground:
             f"telemetry.connect=[{','.join(endpoints)}]",
             "battery.uri=fake:",
             "wifi.interface=",
-            "supervision.frame_timeout_s=14",  # valgrind's start takes longer than a payload's
+            "supervision.frame_timeout_s=14",
         ]
 
     def __enter__(self) -> Ground:
         self._thread.start()
         if self._telemetry:
             self._session = open_session(listen=["tcp/127.0.0.1:0"])
-            self._subscriber = self._session.zenoh.declare_subscriber(
-                keys.key(_PAYLOAD_ID, keys.GATE), self._count
-            )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -85,9 +80,6 @@ class Ground:
         self._socket.close()
         if self._session is not None:
             self._session.close()
-
-    def _count(self, _: Any) -> None:
-        self.messages += 1
 
     def _receive(self) -> None:
         counters = Counters()
@@ -152,29 +144,24 @@ class BenchFlight:
 
 @contextlib.contextmanager
 def fly(
-    ground: Ground,
-    settings: Sequence[str],
-    *,
-    before: Sequence[str] = (),
-    python: Sequence[str] = (),
-    environment: Mapping[str, str] = MappingProxyType({}),
+    ground: Ground, settings: Sequence[str], *, python: Sequence[str] = ()
 ) -> Iterator[BenchFlight]:
     """Starts the program with `KEY=VALUE` settings and kills it at the block's end if need be.
 
-    `before` is what runs it, as valgrind; `python` are options of the interpreter.
+    `python` are options of the interpreter.
     """
     sets = [word for setting in (*ground.settings(), *settings) for word in ("--set", setting)]
     with tempfile.TemporaryDirectory() as folder:
         begin_ns = time.monotonic_ns()
         process = subprocess.Popen(
-            [*before, sys.executable, *python, "-m", "pi_firmware", *sets],
+            [sys.executable, *python, "-m", "pi_firmware", *sets],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             errors="replace",
             # Hashes are drawn at each start otherwise, and with them the cost of every dictionary.
-            env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder, **environment},
+            env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder},
         )
         flight = BenchFlight(process, begin_ns)
         for target in (flight._read_said, flight._read_errors):
@@ -191,6 +178,6 @@ def fly(
                 reader.join()
 
 
-def picture(seconds: float, pattern: str = "zone-plate") -> str:
+def picture(seconds: float) -> str:
     """The setting of a test picture that ends after `seconds` at `RATE_HZ`."""
-    return f"camera.uri=test:?pattern={pattern}&duration_s={seconds:.6f}"
+    return f"camera.uri=test:?pattern=zone-plate&duration_s={seconds:.6f}"

@@ -9,13 +9,11 @@ from typing import Any
 EPILOG = """\
 example:
   blimp bench payload --json out/bench-payload.json
-  blimp bench payload --parts instructions --frames 60
+  blimp bench payload --parts stream --seconds 60
 
-Instructions are of this machine's processor and libraries. x264's repeat within 5 %, those of
-Python and the bindings within a fifth: a clock that answers slowly is asked again. Times of two
-machines do not compare."""
+Times of two machines do not compare."""
 
-_PARTS = ("start", "stream", "instructions")
+_PARTS = ("start", "stream")
 
 
 def add_arguments(payload: argparse.ArgumentParser) -> None:
@@ -29,9 +27,6 @@ def add_arguments(payload: argparse.ArgumentParser) -> None:
         "--seconds", type=float, default=10.0, metavar="S",
         help="streamed before memory is read (10)",
     )  # fmt: skip
-    payload.add_argument(
-        "--frames", type=int, default=30, metavar="N", help="counted under valgrind (30)"
-    )
     payload.add_argument("--json", type=Path, metavar="F", help="write the figures, too")
 
 
@@ -47,7 +42,6 @@ def run(args: argparse.Namespace) -> int:
     for name, value, low in (
         ("--repetitions", args.repetitions, 1),
         ("--seconds", args.seconds, 0.5),
-        ("--frames", args.frames, 2),
     ):
         if not low <= value <= 3600:
             raise InputError(f"{name} is {value:g}; allowed are {low:g} to 3600")
@@ -65,10 +59,6 @@ def run(args: argparse.Namespace) -> int:
     if "stream" in args.parts:
         progress("stream")
         result["stream"] = figures.stream(args.seconds)
-    if "instructions" in args.parts:
-        result["frames"] = args.frames
-        result["instructions"] = figures.instructions(args.frames, progress)
-        result["kept"] = figures.kept()
     print("\n".join(report(result)))
     if args.json:
         write_json(args.json, result)
@@ -82,10 +72,6 @@ def report(result: dict[str, Any]) -> list[str]:
         lines += ["", *_start(result["start"])]
     if "stream" in result:
         lines += ["", *_stream(result["stream"])]
-    if result.get("instructions"):
-        lines += ["", *_instructions(result["instructions"], result["kept"], result["frames"])]
-    elif "instructions" in result:
-        lines += ["", "instructions: valgrind is not installed (Debian package valgrind)"]
     return lines
 
 
@@ -122,59 +108,3 @@ def _stream(stream: dict[str, Any]) -> list[str]:
         f"at most {stream['peak_mb']:.1f} (bound {stream['limit_mb']:.0f}); in",
         f"  {', '.join(mappings)}",
     ]
-
-
-def _instructions(
-    variants: dict[str, dict[str, Any]], kept: dict[str, float], frames: int
-) -> list[str]:
-    from ground_station.bench.figures import SENT, payload_alone
-    from ground_station.presentation.text import columns
-
-    base = variants[SENT]
-    rows = [["thousand instructions a frame", *variants, "share", "kept", "over kept"]]
-    for group in base["groups"]:
-        rows.append(
-            [
-                group,
-                *(f"{row['groups'][group] / 1e3:.0f}" for row in variants.values()),
-                f"{100 * base['groups'][group] / base['total']:.1f} %",
-                *_kept(base["groups"][group], kept.get(group)),
-            ]
-        )
-    rows.append(
-        [
-            "total",
-            *(f"{row['total'] / 1e3:.0f}" for row in variants.values()),
-            "",
-            *_kept(base["total"], sum(kept.values())),
-        ]
-    )
-    alone = {name: payload_alone(row["groups"]) for name, row in variants.items()}
-    rows.append(
-        [
-            "without x264 and test picture",
-            *(f"{value / 1e3:.0f}" for value in alone.values()),
-            f"{100 * alone[SENT] / base['total']:.1f} %",
-            *_kept(alone[SENT], payload_alone(kept)),
-        ]
-    )
-    rows.append(
-        [
-            "  over the first",
-            *(f"{value / alone[SENT]:.2f}" for value in alone.values()),
-            "",
-            "",
-            "",
-        ]
-    )
-    return [
-        *columns(rows),
-        f"{frames} frames, {base['seconds']:.0f} s under valgrind; at 30 Hz the payload alone "
-        f"executes {30 * alone[SENT] / 1e6:.0f} million instructions a second",
-    ]
-
-
-def _kept(value: float, kept: float | None) -> tuple[str, str]:
-    if kept is None:
-        return "-", "-"
-    return f"{kept / 1e3:.0f}", f"{value / kept:.2f}" if kept >= 1e4 else "-"
