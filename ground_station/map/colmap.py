@@ -21,9 +21,8 @@ import pycolmap as pycolmap  # others have it from here, after zlib
 from ground_station.arrays import F64, I64
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry.camera import Camera
-from ground_station.map import colmap_files
-from ground_station.map.colmap_cameras import HALF_PIXEL, camera_of, entry_of
-from ground_station.map.colmap_files import CameraEntry
+from ground_station.map.colmap_cameras import HALF_PIXEL, camera_of, described
+from ground_station.map.colmap_files import check
 from ground_station.map.model import Model
 from pi_firmware.wire.errors import ConfigError
 
@@ -40,13 +39,13 @@ def quiet() -> None:
 
 def colmap_camera(ours: Camera, level: float = 1.0, camera_id: int = CAMERA_ID) -> pycolmap.Camera:
     """Our camera as COLMAP's, with pixels that are 1 / `level` as large."""
-    entry = entry_of(ours)
+    model, params = described(ours)
     return pycolmap.Camera(
         camera_id=camera_id,
-        model=entry.model,
-        width=int(np.ceil(level * entry.width)),
-        height=int(np.ceil(level * entry.height)),
-        params=[level * value for value in entry.params[:4]] + list(entry.params[4:]),
+        model=model,
+        width=int(np.ceil(level * ours.width_px)),
+        height=int(np.ceil(level * ours.height_px)),
+        params=[level * value for value in params[:4]] + params[4:],
         has_prior_focal_length=True,
     )
 
@@ -152,10 +151,8 @@ def to_arrays(model: Reconstruction) -> Model:
 
 
 def _our_camera(model: Reconstruction) -> Camera:
-    found = model.cameras[CAMERA_ID]
-    entry = CameraEntry(found.model.name, found.width, found.height, tuple(found.params))
     try:
-        return camera_of(entry)
+        return camera_of(model.cameras[CAMERA_ID])
     except (CameraError, ConfigError) as error:
         raise MapError(f"camera {CAMERA_ID}: {error}") from None
 
@@ -247,10 +244,14 @@ def reread(folder: Path) -> Reconstruction:
 
 
 def read(folder: Path) -> Reconstruction:
-    """Reads a model; raises `MapError` with one line."""
-    colmap_files.check(folder)
-    try:
-        return reread(folder)
-    except (ValueError, RuntimeError, OSError, IndexError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise MapError(f"{folder}: not a COLMAP model: {reason}") from None
+    """Reads a map's model; raises `MapError` with one line."""
+    check(folder)
+    model = reread(folder)
+    if CAMERA_ID not in model.cameras:
+        raise MapError(f"{folder}: not a map's model: it has no camera {CAMERA_ID}")
+    for number, camera in model.cameras.items():
+        if camera.model.name != "PINHOLE":
+            raise MapError(
+                f"{folder}: camera {number} has the model {camera.model.name}; a map's is PINHOLE"
+            )
+    return model

@@ -5,11 +5,15 @@ The half pixel between COLMAP's corner of the picture and our first pixel's cent
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ground_station.errors import CameraError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens_models import MODELS
-from ground_station.map.colmap_files import CameraEntry
 from pi_firmware.wire import config
+
+if TYPE_CHECKING:
+    import pycolmap
 
 HALF_PIXEL = 0.5
 
@@ -28,33 +32,36 @@ _RATIONAL = ("k4", "k5", "k6")
 """Of `FULL_OPENCV`, what our five-parameter lens does not have."""
 
 
-def camera_of(entry: CameraEntry) -> Camera:
+def camera_of(theirs: pycolmap.Camera) -> Camera:
     """COLMAP's camera as ours; raises `CameraError` or `ConfigError` for what ours cannot be."""
-    given = dict(zip(_ORDER[entry.model].split(), entry.params, strict=True))
-    fisheye = entry.model == "OPENCV_FISHEYE"
+    name = theirs.model.name
+    if name not in _ORDER:
+        raise CameraError(f"it has the model {name}; what can be taken over is {', '.join(_ORDER)}")
+    given = dict(zip(_ORDER[name].split(), theirs.params, strict=True))
+    fisheye = name == "OPENCV_FISHEYE"
     others = () if fisheye else _RATIONAL
-    rational = {name: given.pop(name) for name in others if name in given}
+    rational = {k: given.pop(k) for k in others if k in given}
     if any(rational.values()):
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in rational.items())
-        raise CameraError(f"{entry.model} with {numbers}; only 0 can be taken over")
+        numbers = ", ".join(f"{k} {value:.3g}" for k, value in rational.items())
+        raise CameraError(f"{name} with {numbers}; only 0 can be taken over")
     if "f" in given:
         given["fx"] = given["fy"] = given.pop("f")
     model = "fisheye" if fisheye else "opencv5"
-    lens = {name: given[name] for name in MODELS[model].NAMES if name in given}
+    lens = {k: given[k] for k in MODELS[model].NAMES if k in given}
     values = {
         "model": model,
-        "width_px": entry.width,
-        "height_px": entry.height,
+        "width_px": theirs.width,
+        "height_px": theirs.height,
         "fx_px": given["fx"],
         "fy_px": given["fy"],
         "cx_px": given["cx"] - HALF_PIXEL,
         "cy_px": given["cy"] - HALF_PIXEL,
     }
-    return config.from_mapping(values | lens, Camera, where=entry.model)
+    return config.from_mapping(values | lens, Camera, where=name)
 
 
-def entry_of(camera: Camera) -> CameraEntry:
-    """Our camera as COLMAP's, of the model that has its lens; the readout has no place there."""
+def described(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's model that has our camera's lens, and its parameters; the readout has no place."""
     values = {
         "fx": camera.fx_px,
         "fy": camera.fy_px,
@@ -62,5 +69,4 @@ def entry_of(camera: Camera) -> CameraEntry:
         "cy": camera.cy_px + HALF_PIXEL,
     } | dict(zip(camera.lens.NAMES, camera.distortion.tolist(), strict=True))
     model = "PINHOLE" if camera.is_pinhole else _OURS[camera.model]
-    params = [values.get(name, 0.0) for name in _ORDER[model].split()]
-    return CameraEntry(model, camera.width_px, camera.height_px, tuple(params))
+    return model, [values.get(name, 0.0) for name in _ORDER[model].split()]

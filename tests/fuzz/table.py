@@ -33,8 +33,6 @@ READERS = (
     Reader("resuming", "recordings that were cut, looked at by a service that starts"),
     Reader("video", "raw H.264 and video containers", 8192),
     Reader("maps", "map.toml, landmarks and keyframes"),
-    Reader("colmap", "COLMAP's binary models"),
-    Reader("foreign", "COLMAP models of others, binary and text"),
     Reader("observations", "a flight's observations for the refinement"),
     Reader("weights", "weights of torch and safetensors, and networks built from them", 8192),
     Reader("model", "learned models: ONNX files", 32768),

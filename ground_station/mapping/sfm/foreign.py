@@ -8,16 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from ground_station.arrays import F64
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.map import colmap_files
+from ground_station.map import colmap, colmap_files
+from ground_station.map.colmap import pycolmap
 from ground_station.map.colmap_cameras import camera_of
-from ground_station.map.colmap_files import NO_POINT, CameraEntry, ImageEntry
-from ground_station.mapping.sfm import colmap_text
 from pi_firmware.wire.errors import ConfigError
 
 
@@ -42,30 +40,32 @@ def read(folder: str | Path) -> ForeignModel:
     several cameras.
     """
     folder = Path(folder)
-    if (folder / "cameras.bin").exists():
-        cameras, images = colmap_files.read(folder)
-    elif (folder / "cameras.txt").exists():
-        cameras, images = colmap_text.read(folder)
-    else:
+    if not any((folder / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
         raise MapError(f"{folder}: not a COLMAP model: no cameras.bin or cameras.txt in it")
+    colmap_files.check(folder)
+    model = colmap.reread(folder)
+    images = sorted(model.images.values(), key=lambda image: image.name)
     if not images:
         raise MapError(f"{folder}: the model has no images")
-    _check_names(folder, images)
-    entries = sorted(images.values(), key=lambda image: image.name)
-    values = np.array([entry.pose for entry in entries])
-    cRw = Rotation.from_quat(np.roll(values[:, :4], -1, axis=1)).as_matrix()
-    seen = [np.unique(entry.points[entry.points != NO_POINT]) for entry in entries]
+    names = [image.name for image in images]
+    _check_names(folder, names)
+    cTw = np.tile(np.eye(4), (len(images), 1, 1))
+    cTw[:, :3] = [image.cam_from_world().matrix() for image in images]
     return ForeignModel(
-        names=[entry.name for entry in entries],
-        wTc=poses.inverse(poses.pose(cRw, values[:, 4:])),
-        camera=_only_camera(folder, cameras, entries),
-        points=seen,
+        names=names,
+        wTc=poses.inverse(cTw),
+        camera=_only_camera(folder, model, images),
+        points=[_points_of(image) for image in images],
     )
 
 
-def _check_names(folder: Path, images: dict[int, ImageEntry]) -> None:
-    times = Counter(image.name for image in images.values())
-    for name, count in times.items():
+def _points_of(image: pycolmap.Image) -> npt.NDArray[np.uint64]:
+    seen = image.get_observation_points2D()
+    return np.unique(np.array([point.point3D_id for point in seen], np.uint64))
+
+
+def _check_names(folder: Path, names: list[str]) -> None:
+    for name, count in Counter(names).items():
         if count > 1:
             raise MapError(f"{folder}: the model has two images named {name!r:.80}")
         parts = Path(name).parts
@@ -73,17 +73,23 @@ def _check_names(folder: Path, images: dict[int, ImageEntry]) -> None:
             raise MapError(f"{folder}: the model has an image named {name!r:.80}")
 
 
-def _only_camera(folder: Path, cameras: dict[int, CameraEntry], images: list[ImageEntry]) -> Camera:
+def _only_camera(
+    folder: Path, model: colmap.Reconstruction, images: list[pycolmap.Image]
+) -> Camera:
     """Also that of a model that repeats it for every image."""
-    used = sorted({image.camera for image in images})
-    first = cameras[used[0]]
-    for number in used[1:]:
-        if cameras[number] != first:
+    used = sorted({image.camera_id for image in images})
+    cameras = [_told(model.cameras[number]) for number in used]
+    for number, camera in zip(used, cameras, strict=True):
+        if camera != cameras[0]:
             raise MapError(
                 f"{folder}: the model's images are of {len(used)} cameras ({used[0]} and {number} "
                 "differ); a map is of one: let COLMAP take one camera for all images"
             )
     try:
-        return camera_of(first)
+        return camera_of(model.cameras[used[0]])
     except (CameraError, ConfigError) as error:
         raise MapError(f"{folder}: camera {used[0]}: {error}") from None
+
+
+def _told(camera: pycolmap.Camera) -> tuple[object, ...]:
+    return camera.model, camera.width, camera.height, *camera.params

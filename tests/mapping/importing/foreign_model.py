@@ -23,8 +23,8 @@ def colmap_camera(camera, model="OPENCV", number=1):
 
 
 def image_name(k):
-    """Of picture k, in a subfolder and with a space."""
-    return f"db/walk {k:02d}.png"
+    """Of picture k, in a subfolder."""
+    return f"db/walk-{k:02d}.png"
 
 
 def foreign_model(scene, cameras=None):
