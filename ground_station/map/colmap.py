@@ -249,9 +249,8 @@ def read(folder: Path) -> Reconstruction:
     model = reread(folder)
     if CAMERA_ID not in model.cameras:
         raise MapError(f"{folder}: not a map's model: it has no camera {CAMERA_ID}")
-    for number, camera in model.cameras.items():
-        if camera.model.name != "PINHOLE":
-            raise MapError(
-                f"{folder}: camera {number} has the model {camera.model.name}; a map's is PINHOLE"
-            )
+    try:
+        _our_camera(model)
+    except MapError as error:
+        raise MapError(f"{folder}: {error}") from None
     return model
