@@ -84,12 +84,12 @@ def test_a_count_that_takes_for_ever_is_refused_when_its_time_is_over(copy: Path
         colmap.read(copy)
 
 
-def test_a_maps_model_has_the_pinhole_of_a_map(copy: Path) -> None:
+def test_a_maps_model_has_a_lens_that_a_map_can_have(copy: Path) -> None:
     model = colmap.reread(copy)
-    model.cameras[1].model = colmap.pycolmap.CameraModelId.SIMPLE_RADIAL
-    model.cameras[1].params = [500.0, 320.0, 240.0, 0.1]
+    model.cameras[1].model = colmap.pycolmap.CameraModelId.FOV
+    model.cameras[1].params = [500.0, 500.0, 320.0, 240.0, 0.1]
     model.write(copy)
-    with pytest.raises(MapError, match="SIMPLE_RADIAL; a map's is PINHOLE"):
+    with pytest.raises(MapError, match=r"^[^\n]*model FOV; what can be taken over is [^\n]*$"):
         colmap.read(copy)
 
 
