@@ -22,7 +22,7 @@ from scenarios.hostile_steps import Garbage
 from scenarios.judge import OFF_M, poses
 from scenarios.link_steps import Loss, Outage
 from scenarios.matrix import BRIEF, MATRIX
-from scenarios.payload_run import UNBORN_S, PayloadRun
+from scenarios.payload_run import UNBORN_S, PayloadRun, Watch
 from scenarios.play import _end
 from scenarios.recordings import CUT_S, NOISE_S, Came, Recorded, lacking, read
 from scenarios.step import KINDS, Scenario, Step, StepError, as_json, from_json
@@ -65,7 +65,7 @@ def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
     status: int, out: str, ended_s: float, unborn: bool
 ) -> None:
     process: Any = None
-    run = PayloadRun(1, Camera("test:", None), process, 100.0, Path())
+    run = PayloadRun(Camera("test:", None), process, 100.0, Watch("blimp-1", bytes(30)), [])
     assert not run.unborn
     run.ended, run.ended_s = Ended(status, out, "", ended_s), 100.0 + ended_s
     assert run.unborn is unborn

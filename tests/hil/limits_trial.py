@@ -238,7 +238,8 @@ def serve(trial: Trial) -> Outcome:
     names = [f"blimp-{number + 1}" for number in range(trial.payloads)]
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        service = stack.enter_context(Service(folder, f"payloads.most={trial.payloads}"))
+        most = f"payloads.most={trial.payloads}"
+        service = stack.enter_context(Service(folder, most, payloads=names))
         heard = Heard(stack.enter_context(service.bus()))
         for name in names:
             stack.enter_context(service.fly(name, folder / name, rate_hz=trial.rate_hz))

@@ -83,8 +83,8 @@ def measure(seconds: float, payloads: int, rate_hz: float, *, browser: bool) -> 
     """The service with so many payloads, two viewers, and a browser beside if wanted."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        service = stack.enter_context(Service(folder))
         names = [f"blimp-{number + 1}" for number in range(payloads)]
+        service = stack.enter_context(Service(folder, payloads=names))
         flying: list[Process | None] = []
         for name in names:
             one = stack.enter_context(service.fly(name, folder / name, rate_hz=rate_hz))

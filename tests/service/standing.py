@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,13 @@ from payload_process import PayloadProcess, free_port
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from ground_station.keys.authority import Authority
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
 
+PAYLOADS = ("blimp-1", "blimp-2")
+"""Those with a certificate, where a test names no others."""
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"
 START_S = 60.0
 STOP_S = 10.0
@@ -108,18 +111,25 @@ def _name(command: list[str]) -> str:
 class Service:
     """`blimp serve` on ports and in folders of its own; a context manager that checks its end.
 
-    `place` is the private folder in memory in which a run's folder lies. What the service writes is
-    kept over all its starts.
+    It flies as it is installed: with an authority of its own, so that telemetry is mutual TLS and
+    video SRTP; only the demo is without. `place` is the private folder in memory in which a run's
+    folder lies. What the service writes is kept over all its starts.
     """
 
-    def __init__(self, folder: Path, *settings: str, demo: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *settings: str,
+        payloads: Sequence[str] = PAYLOADS,
+        demo: bool = False,
+    ) -> None:
         self.folder = folder
         self.recordings = folder / "recordings"
         self.place = Path(tempfile.mkdtemp(prefix="service-", dir="/dev/shm"))
         self.video, self.foxglove = free_udp_port(), free_port(socket.SOCK_STREAM)
         self.http = free_port(socket.SOCK_STREAM)
         telemetry = free_port(socket.SOCK_STREAM)
-        self.endpoint = f"tcp/127.0.0.1:{telemetry}"
+        self.endpoint = f"{'tcp' if demo else 'tls'}/127.0.0.1:{telemetry}"
         self._tcp = (self.http, self.foxglove, telemetry)
         self.url = f"http://127.0.0.1:{self.http}"
         blimp = str(Path(sys.executable).with_name("blimp"))
@@ -134,6 +144,12 @@ class Service:
             *settings,
         ):
             self.command += ["--set", setting]
+        if not demo:
+            self.authority = Authority.create(folder / "keys")
+            self.certificates = self.authority.add("ground", "main")
+            for payload_id in payloads:
+                self.authority.add("payload", payload_id)
+            self.command += ["--set", f"telemetry.certificates={self.certificates}"]
         self.client = httpx.Client(base_url=self.url, timeout=20.0)
         self.seen: set[Process] = set()
         """All processes that it was ever seen to have."""
@@ -286,6 +302,7 @@ class Service:
             f"camera.rate_hz={rate_hz:g}",
             f"link.port={port or self.video}",
             f"telemetry.connect={json.dumps([self.endpoint])}",
+            f"telemetry.certificates={self.authority.of(f'payload.{payload_id}')}",
         )
 
 

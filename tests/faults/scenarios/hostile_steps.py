@@ -9,6 +9,7 @@ import random
 import socket
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from numbered_flight import encoded, packets, stamped
@@ -54,9 +55,16 @@ class Peer(Step):
         world.say(f"{type(self).__name__}: {peer.acts} times, {peer.failure or 'all sent'}")
 
 
-def _client(world: World) -> Session:
-    """A session whose words the station hands on to its payloads, as `blimp command` has one."""
-    return open_session(connect=[world.service.endpoint], client_timeout_s=_TIMEOUT_S)
+def _client(world: World, certificates: Path) -> Session:
+    """A session of a second program with some machine's certificate, linked with the station.
+
+    With the station's own it is as `blimp command`'s: its words are handed on to the payloads.
+    """
+    return open_session(
+        connect=[world.service.endpoint],
+        certificates=certificates,
+        client_timeout_s=_TIMEOUT_S,
+    )
 
 
 def _datagrams(world: World, next_one: Any, rate_hz: float) -> Background:
@@ -154,13 +162,16 @@ def _twisted(draw: random.Random) -> tuple[str, bytes]:
 
 @dataclass(frozen=True)
 class BadTelemetry(Peer):
-    """Messages that are not as agreed, under the payload's name, others', and no one's."""
+    """Messages that are not as agreed, from a second program with the payload's certificate.
+
+    They are in its name, which is heard, in others' and in no one's, which must not be.
+    """
 
     rate_hz: float = 50.0
 
     def begin(self, world: World) -> Background:
         draw = world.draw()
-        session = _client(world)
+        session = _client(world, world.certificates)
 
         def act() -> bool:
             kind, text = _twisted(draw)
@@ -181,7 +192,7 @@ class CommandFlood(Peer):
 
     def begin(self, world: World) -> Background:
         draw = world.draw()
-        session = _client(world)
+        session = _client(world, world.service.certificates)
         bodies = (
             messages.encode(messages.Command(time_ns=1)),
             messages.encode(messages.Command(time_ns=1, arguments={"kbps": 1e9})),

@@ -99,8 +99,7 @@ def frames_accounted(world: World) -> list[str]:
 
 def _one_intake(world: World, run: PayloadRun) -> bool:
     """Whether the same intake took all of a payload's last stream."""
-    same = [other for other in world.runs if other.ssrc == run.ssrc]
-    return len(same) == 1 and not any(run.began_s < at_s for at_s in world.intake_anew_s)
+    return not any(run.began_s < at_s for at_s in world.intake_anew_s)
 
 
 def _before_intake(world: World, run: PayloadRun) -> tuple[int, int]:
@@ -233,4 +232,6 @@ def in_order(world: World) -> list[str]:
         world.service.assert_no_accident()
     except AssertionError as error:
         complaints.append(f"service: {str(error)[-900:]}")
+    heard = {who for who, _, _ in world.heard.payloads} | set(world.heard.shown)
+    complaints += [f"service: it heard {who}" for who in sorted(heard - {NAME})]
     return complaints

@@ -38,7 +38,6 @@ MATRIX: tuple[Scenario, ...] = (
     # The payload.
     _one("payload killed", payload.PayloadKilled(0, 2)),
     _one("payload restarted", payload.PayloadRestarted(0, 1)),
-    _one("payload restarted, same SSRC", payload.PayloadRestarted(0, 1, True)),
     _one("payload stopped", payload.PayloadStopped(0, 4)),
     _one("payload's clock forward", payload.PayloadClock(0, 8, HOUR_S)),
     _one("payload's clock back", payload.PayloadClock(0, 8, -HOUR_S)),

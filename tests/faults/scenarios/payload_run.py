@@ -4,35 +4,41 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from payload_process import Ended, PayloadProcess
 from witness import Witness
 
 from ground_station.stream import rtp
+from ground_station.stream.srtp import Unprotector
 from scenarios.camera import Camera
 
 UNBORN_S = 2.0
 """An interpreter that has not come to the program's first line by then hangs."""
 _KEPT_PACKETS = 2000
+_SSRC = re.compile(r" ssrc (\d+)\n")
 
 
 class Watch(Witness):
-    """The tap of a link for one payload: also keeps when each frame left, and the last packets."""
+    """The tap of a link for one payload, which it hears with its SRTP key.
 
-    def __init__(self) -> None:
+    It also keeps when each frame left, and the last packets, encrypted.
+    """
+
+    def __init__(self, payload_id: str, key: bytes) -> None:
         super().__init__()
+        self._unprotector = Unprotector({payload_id: key})
         self.at_s: list[float] = []
         """When each frame of `left` had left whole, `time.monotonic`."""
         self.recent: deque[tuple[float, bytes]] = deque(maxlen=_KEPT_PACKETS)
 
     def __call__(self, datagram: bytes, lost: bool) -> None:
         self.recent.append((time.monotonic(), datagram))
-        super().__call__(datagram, lost)
+        super().__call__(self._unprotector.unprotect(datagram) or b"", lost)
 
     def _follow(self, packet: rtp.Packet, lost: bool) -> None:
         super()._follow(packet, lost)
@@ -44,17 +50,23 @@ class Watch(Witness):
 class PayloadRun:
     """From its start to its end, which may have been a SIGKILL (`killed`)."""
 
-    ssrc: int
     camera: Camera
     process: PayloadProcess
     began_s: float
-    folder: Path
-    watch: Watch = field(default_factory=Watch)
+    watch: Watch
+    card: list[str]
+    """Files on the card when it began: the others are its own."""
     ended: Ended | None = None
     killed: bool = False
     ended_s: float = float("inf")
-    card: list[str] = field(default_factory=list)
-    """Files on the card when it began: the others are its own."""
+    _ssrc: int = field(default=0, init=False)
+
+    @property
+    def ssrc(self) -> int:
+        """Its stream's, which it draws and says; 0 before."""
+        if not self._ssrc and (said := _SSRC.search(self.process.written())):
+            self._ssrc = int(said[1])
+        return self._ssrc
 
     @property
     def unborn(self) -> bool:

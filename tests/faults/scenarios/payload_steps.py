@@ -44,23 +44,18 @@ class PayloadKilled(Step):
 
 @dataclass(frozen=True)
 class PayloadRestarted(Step):
-    """It ends in order and starts as another session, with another SSRC or the same."""
+    """It ends in order and starts as another session."""
 
-    same_ssrc: bool = False
     STARTS: ClassVar[bool] = True
 
     def lacking(self, world: World) -> str:
-        return "" if world.runs[-2 if self.same_ssrc else -1].ended else "it flies on"
+        return "" if world.run.ended else "it flies on"
 
     def inject(self, world: World) -> None:
-        if self.same_ssrc:
-            world.configure(self, {"ssrc": str(world.run.ssrc)})
-        else:
-            world.hold_payload(self)
+        world.hold_payload(self)
 
     def fix(self, world: World) -> None:
-        if not self.same_ssrc:
-            world.let_payload(self)
+        world.let_payload(self)
 
 
 @dataclass(frozen=True)

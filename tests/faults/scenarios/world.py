@@ -19,10 +19,11 @@ from payload_process import PayloadProcess
 from shims import Shim
 from standing import Process, Service
 
+from pi_firmware.wire.srtp import KEY_FILE, read_key
 from scenarios import disk
 from scenarios.camera import Cameras
 from scenarios.heard import Heard
-from scenarios.payload_run import PayloadRun
+from scenarios.payload_run import PayloadRun, Watch
 from scenarios.payload_steps import NAME
 from scenarios.recordings import Window
 from scenarios.tcp_wire import TcpWire
@@ -104,6 +105,7 @@ class World:
             "recording.at_start=true",
             env=env,
         )
+        self.certificates = self.service.authority.of(f"payload.{NAME}")
         self.disk = disk.mount(self.service.recordings, disk_MB) if disk_MB else None
 
     def __enter__(self) -> World:
@@ -217,11 +219,10 @@ class World:
             self.run.kill()
 
     def _fly(self) -> None:
-        options = {"camera": "flight", "ssrc": str(self._draw.randrange(1, 1 << 32))}
+        options = {"camera": "flight"}
         for more in self._options.values():
             options |= more
         camera = self.cameras.get(options.pop("camera"))
-        ssrc = int(options.pop("ssrc"))
         rate_hz = self._rate_hz / SPEED  # of the recording's own seconds
         flies = camera.uri.startswith("replay:")
         pace = f"&rate_hz={rate_hz:g}&speed={SPEED:g}" if flies else ""
@@ -232,9 +233,9 @@ class World:
             "camera.rate_hz": f"{self._rate_hz:g}",
             "link.correction": "0",
             "link.port": str(self.link.port),
-            "link.ssrc": str(ssrc),
             "link.history_s": "0",  # what the link loses stays lost: each frame can be told
-            "telemetry.connect": json.dumps([f"tcp/127.0.0.1:{self.wire.port}"]),
+            "telemetry.connect": json.dumps([f"tls/127.0.0.1:{self.wire.port}"]),
+            "telemetry.certificates": str(self.certificates),
             "recording.folder": str(self.card),
             "recording.at_start": "true",
             "recording.min_free_MB": "0",
@@ -244,7 +245,8 @@ class World:
         process = PayloadProcess(
             folder, *(f"{name}={value}" for name, value in settings.items()), env=self._env()
         )
-        self.runs.append(PayloadRun(ssrc, camera, process, time.monotonic(), folder, card=card))
+        watch = Watch(NAME, read_key(self.certificates / KEY_FILE))
+        self.runs.append(PayloadRun(camera, process, time.monotonic(), watch, card))
 
     def _env(self) -> dict[str, str]:
         env: dict[str, str] = {}
