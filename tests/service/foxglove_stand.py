@@ -202,6 +202,9 @@ class Client:
             wanted = told.keys() & self.received.keys()
             if new := [topic for topic in wanted if told[topic]["id"] not in self._topics]:
                 self._ask(new)
+        elif said["op"] == "unadvertise":
+            ended = set(said["channelIds"])
+            self.channels = {t: c for t, c in self.channels.items() if c["id"] not in ended}
         return True
 
     def _decode(self, topic: str, data: bytes) -> Any:

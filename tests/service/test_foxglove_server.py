@@ -34,6 +34,7 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.foxglove.inbox import Inbox
 from ground_station.service.foxglove.log import RateLimitedHandler
+from ground_station.service.foxglove.process import PAYLOADS
 from ground_station.service.foxglove.topics import json_topic
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from pi_firmware.wire import messages
@@ -416,3 +417,21 @@ def test_a_full_inbox_loses_the_oldest_and_counts_them() -> None:
     assert seen == list(range(3, 2003)) and inbox.dropped == 3
     assert frames["a"].sequence == 2 and inbox.skipped == 2
     assert inbox.take(0.0) == ([], {})
+
+
+def test_a_payload_that_is_gone_gives_its_place_to_a_new_one(tmp_path: Path) -> None:
+    """The 33rd of an evening had no topics until a restart."""
+    station = Station(tmp_path)
+    try:
+        with server(station.folder) as (_, port), Client(port) as client:
+            for number in range(PAYLOADS + 2):
+                name = f"flown-{number}"
+                for alive in (True, False):
+                    note = PayloadMessage(alive, 0)
+                    station.bus.publish(bus_messages.PAYLOAD, name, note)
+                topic = f"/{name}/status"
+                client.until(lambda topic=topic: topic in client.channels, topic)
+            client.until(lambda: "/flown-1/status" not in client.channels, "the end of its topics")
+            assert f"/flown-{PAYLOADS + 1}/status" in client.channels
+    finally:
+        station.close()

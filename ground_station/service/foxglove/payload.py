@@ -54,7 +54,7 @@ class Payload:
         self._trail = Trail()
         self._last: tuple[Solved, int] | None = None
         self._state = ""
-        self._was_solved = self._alive = False
+        self._was_solved = self.alive = False
         self._told: dict[str, Message] = {}
         root = f"/{payload_id}"
 
@@ -83,6 +83,12 @@ class Payload:
             *self._messages.values(),
         )  # fmt: skip
 
+    def close(self) -> None:
+        """Ends its topics, and lets go of its pictures."""
+        for topic in self.topics:
+            topic.close()
+        self._pictures.close()
+
     def wants(self, note: FrameMessage) -> bool:
         """Whether a frame is of use, from any thread: someone looks, or its size is another."""
         return self._image.wanted or (note.width_px, note.height_px) != self._size
@@ -107,7 +113,7 @@ class Payload:
     def estimate(self, note: EstimateMessage) -> None:
         """A frame's pose, or why there is none."""
         time_ns, pose = conversion.stamp_ns(note), conversion.solved(note)
-        self._state, self._alive = note.state, True
+        self._state, self.alive = note.state, True
         if pose is not None:
             begins = not self._was_solved or note.relocalized
             self._trail.add(time_ns, pose.position_m, begins=begins)
@@ -136,10 +142,10 @@ class Payload:
                 self._told[name] = (document, now_ns)
                 for make, log_ns in self._recall(name):
                     self._messages[name].say(make, log_ns)
-        if self._alive and not note.alive:
+        if self.alive and not note.alive:
             self._scene.say(lambda: drawing.gone(now_ns), now_ns)
             self._was_solved = False
-        self._alive = note.alive
+        self.alive = note.alive
 
     def _recall(self, name: str) -> Iterator[tuple[Make, int]]:
         if name in self._told:
@@ -157,7 +163,7 @@ class Payload:
         if self._last is not None:
             _, time_ns = self._last
             yield lambda: self._line(time_ns), time_ns
-            if self._alive:
+            if self.alive:
                 yield lambda: self._marker(time_ns), time_ns
 
     def _marker(self, time_ns: int) -> Any:

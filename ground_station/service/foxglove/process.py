@@ -151,7 +151,7 @@ class Publishing:
             check_payload_id(payload_id)
         except TelemetryError:
             return None
-        if len(self._payloads) >= PAYLOADS:
+        if len(self._payloads) >= PAYLOADS and not self._free():
             self._complain("payloads", f"{payload_id}: more than {PAYLOADS} payloads")
             return None
         made = self._payloads[payload_id] = Payload(
@@ -159,6 +159,18 @@ class Publishing:
         )
         self._topics |= {topic.id: topic for topic in made.topics}
         return made
+
+    def _free(self) -> bool:
+        """Forgets the first payload that is gone; False where none is."""
+        gone = next((name for name, one in self._payloads.items() if not one.alive), None)
+        if gone is None:
+            return False
+        payload = self._payloads.pop(gone)
+        for topic in payload.topics:
+            del self._topics[topic.id]
+        payload.close()
+        self._flown.pop(gone, None)
+        return True
 
     @functools.cached_property
     def _calibrated(self) -> Camera | None:

@@ -42,6 +42,10 @@ class Topic:
             message = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
         self._channel.log(message, log_time=log_ns, sink_id=client)
 
+    def close(self) -> None:
+        """Nobody can subscribe to it any more."""
+        self._channel.close()
+
     def greet(self, client: int) -> None:
         """Tells a new subscriber what was said before it came and still holds."""
         for make, log_ns in self._kept() if self._kept else ():
