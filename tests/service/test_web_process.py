@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import resource
 import signal
 import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import httpx
 import pytest
@@ -70,6 +73,34 @@ def test_it_serves_what_the_bus_says_beats_and_ends(folder):
         # Asked for are 3 s; a shared machine gets more.
         assert time.monotonic() - begin_s < 10.0
         assert process.stderr is not None and process.stderr.read() == ""
+
+
+def test_without_descriptors_it_lives_says_so_once_and_serves_again(folder):
+    """It ended with a panic, after a traceback for each place in the queue, again each second."""
+    write_run(folder, station.run_of(folder))
+    with (
+        Bus(folder, "test") as bus,
+        station.web_process(folder) as (process, port),
+        contextlib.ExitStack() as held,
+    ):
+        beats = bus.newest(bus_messages.PROCESS, ProcessMessage)
+        url = f"http://127.0.0.1:{port}/healthz"
+        assert httpx.get(url).is_success
+        _, hard = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        few = len(list(Path(f"/proc/{process.pid}/fd").iterdir())) + 2
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (few, hard))
+        for _ in range(40):
+            held.enter_context(socket.create_connection(("127.0.0.1", port)))
+        began_s = beats.take(30).uptime_s
+        while beats.take(30).uptime_s < began_s + 3:
+            pass
+        held.close()
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (hard, hard))
+        assert httpx.get(url, timeout=30.0).is_success
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20.0) == 0
+        said = "web: no connection is taken: Too many open files\n"
+        assert process.stderr is not None and process.stderr.read() == said
 
 
 def test_nobody_answers_is_said_in_time(folder):

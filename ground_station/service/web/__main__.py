@@ -39,19 +39,25 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
+def _print(_: str, text: str) -> None:
+    print(f"web: {text}", file=sys.stderr, flush=True)
+
+
 async def _serve(folder: Path) -> None:
     from ground_station.service import processes
     from ground_station.service.bus import Bus
+    from ground_station.service.localizing.rate_limited_log import RateLimitedLog
     from ground_station.service.settings import load_run
     from ground_station.service.web.access import is_loopback, read_token
     from ground_station.service.web.app import build
-    from ground_station.service.web.server import listen, server
+    from ground_station.service.web.server import complain, listen, server
 
     run = load_run(folder)
     http = run.station.http
     token = read_token(http)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
+    loop.set_exception_handler(complain(RateLimitedLog(_print)))
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     with listen(http.host, http.port) as socket, Bus(folder, processes.WEB) as bus:

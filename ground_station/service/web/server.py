@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import uvicorn
@@ -19,6 +20,8 @@ from ground_station.errors import GroundStationError
 CONNECTIONS = 256
 _REQUEST_S = 10.0
 _MESSAGE_BYTES = 8192
+_BACKLOG = 128
+_EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class ListenError(GroundStationError):
@@ -64,6 +67,22 @@ class Server(uvicorn.Server):
         yield
 
 
+def complain(say: Callable[[str, str], object]) -> Callable[..., None]:
+    """A handler of a loop's exceptions: that no connection can be taken is one line to `say`.
+
+    asyncio would tell it with a traceback for each place in the queue, again each second.
+    """
+
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if isinstance(error, OSError) and error.errno in _EXHAUSTED:
+            say("connections", f"no connection is taken: {error.strerror}")
+        else:
+            loop.default_exception_handler(context)
+
+    return handle
+
+
 def server(app: ASGIApp) -> Server:
     """A server of an application, for a socket of `listen`."""
     return Server(
@@ -71,6 +90,7 @@ def server(app: ASGIApp) -> Server:
             app,
             http=_Http,
             ws=_WebSocket,
+            backlog=_BACKLOG,
             ws_max_size=_MESSAGE_BYTES,
             ws_ping_interval=20.0,
             ws_ping_timeout=20.0,
@@ -93,7 +113,7 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]
-        return socket.create_server(address[:2], family=family, backlog=128)
+        return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
         raise ListenError(f"http {host}:{port}: {reason}") from None
