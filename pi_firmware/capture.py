@@ -280,7 +280,7 @@ class Capture:
         now_s = self._clock()
         limit_s = self._settings.supervision.frame_timeout_s
         frame_s = 1.5 / self._settings.camera.rate_hz
-        if media.encoded and self._in_a_row:
+        if media.encoded and media.alive and self._in_a_row:
             self._in_a_row = 0
             self._announce(messages.EVENT_STREAMING_AGAIN, str(self.counters))
         waiting_s = media.waiting_since_s
@@ -291,7 +291,7 @@ class Capture:
             if now_s - self._started_s > limit_s + frame_s:
                 self._fail(_CAMERA, StreamError(f"the camera gave no first frame in {limit_s:g} s"))
         elif now_s - media.last_captured_s > limit_s + frame_s:
-            self._fail(_CAMERA, StreamError(f"the camera gave no frame for {limit_s:g} s"))
+            self._fail(_CAMERA, StreamError(f"the camera gave no new frame for {limit_s:g} s"))
 
     def _fail(self, what: str, error: BlimpError) -> None:
         """Closes both; they are opened again after a pause, or `UnrecoverableError` is raised."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pi_firmware import encoder, gstreamer, measuring
-from pi_firmware.gate import Decision, Gate, Verdict, measure
+from pi_firmware.gate import Decision, Gate, Measure, Verdict, measure
 from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
 from pi_firmware.wire import annexb, sei
@@ -88,13 +88,17 @@ class Media:
         self.encoded = 0
         """Frames that left the encoder since `play`."""
         self.last_captured_s: float | None = None
-        """When the camera last delivered, on `time.monotonic`'s clock; None before it did."""
+        """When the camera last delivered a picture that was not the one before, on
+        `time.monotonic`'s clock; None before it did."""
+        self.alive = False
+        """Whether its picture has changed since `play`."""
         self._settings = settings
         self._source = source
         self._decided, self._leave = decided, leave
         self._gate = Gate(settings.gate)
         self._gst = gstreamer.load()
         self._verdict: Verdict | None = None
+        self._last: Measure | None = None
         self._in_encoder: dict[int, tuple[sei.FrameInfo, float]] = {}
         self._last_idr_ns = 0
         self._last_passed_ns: int | None = None
@@ -211,16 +215,29 @@ class Media:
         )
         self.counters.captured += 1
         self.counters.heartbeats += info.heartbeat
-        self.last_captured_s = time.monotonic()
+        now_s = time.monotonic()
+        if not self._repeats(measured):
+            self.alive = self.last_captured_s is not None
+            self.last_captured_s = now_s
         if verdict.decision is Decision.GATED:
             self.counters.gated += 1
         else:
             if self._source.window is not None:
                 self._source.window.passed(info.sequence)
-            self._in_encoder[running_ns] = info, self.last_captured_s
+            self._in_encoder[running_ns] = info, now_s
             self._keep_idr_interval(running_ns)
         self._decided(info, verdict)
         return verdict
+
+    def _repeats(self, measured: Measure) -> bool:
+        """Whether a picture is the one before, bit by bit: a camera that hangs and says nothing.
+
+        A sensor's noise is never twice the same, but in a picture too dark or too bright to have
+        any, which the gate's entropy tells.
+        """
+        before, self._last = self._last, measured
+        rich = measured.entropy_bits >= self._settings.gate.min_entropy_bits
+        return rich and before is not None and np.array_equal(before.blocks, measured.blocks)
 
     def _keep_idr_interval(self, running_ns: int) -> None:
         """Asks for an IDR after a gap, and where gated frames or losses want one sooner."""

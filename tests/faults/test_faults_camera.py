@@ -133,6 +133,30 @@ def test_a_flight_that_ends_while_the_encoder_gives_nothing_accounts_for_what_it
     assert account.ended.counts["discarded"] > 1
 
 
+def test_the_same_picture_for_ever_is_no_fresh_frame(tmp_path: Path) -> None:
+    """A camera whose driver repeats its last buffer is opened anew, and then the process is."""
+    patience = ("gate.enabled=true", "supervision.restarts=2")
+    with Ground(numbered=False) as ground:
+        still = "test:?pattern=gradient"
+        with Flight(tmp_path, ground, None, *SMALL, *patience, camera=still) as flight:
+            ended = flight.payload.end(None)
+        assert ended.status == HOPELESS, ended.err
+        assert "gave no new frame for 1 s" in ended.err and "2 restarts" in ended.err
+        assert events_of(ground).count(messages.EVENT_CAMERA_RESTARTED) == 2
+        assert messages.EVENT_STREAMING_AGAIN not in events_of(ground)
+
+
+def test_a_lens_that_is_covered_is_no_camera_that_hangs(tmp_path: Path) -> None:
+    dark = ("gate.heartbeat_s=0.2", "gate.enabled=true")
+    with Ground(numbered=False) as ground:
+        black = "test:?pattern=black"
+        with Flight(tmp_path, ground, None, *SMALL, *dark, camera=black) as flight:
+            flight.wait_streaming(LIMIT_S)
+            time.sleep(3.0)  # thrice the camera's limit
+            flight.finish().ended.assert_in_order()
+        assert messages.EVENT_CAMERA_RESTARTED not in events_of(ground)
+
+
 def test_an_encoder_that_never_comes_back_ends_the_process_for_a_new_one(tmp_path: Path) -> None:
     """What hangs inside a call cannot be closed: status 3, the counters right, and the next."""
     encoder = Shim(tmp_path, "encoder_fault")

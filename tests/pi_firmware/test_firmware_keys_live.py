@@ -216,7 +216,7 @@ def test_it_says_its_name(live: Live) -> None:
 def test_its_camera_is_the_one_named_and_is_started_anew_in_time(live: Live) -> None:
     """Only the camera of this URI hangs."""
     assert "hang_at_s" in str(live.asked["camera.uri"])
-    said = f"the camera gave no frame for {live.asked['supervision.frame_timeout_s']} s"
+    said = f"the camera gave no new frame for {live.asked['supervision.frame_timeout_s']} s"
     assert any(said in event.text for event in live.events("camera-restarted"))
 
 

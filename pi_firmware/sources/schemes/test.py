@@ -1,4 +1,4 @@
-"""`test:`, a moving test picture as a live camera would deliver it."""
+"""`test:`, a moving test picture as a live camera would deliver it; `gradient` never changes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pi_firmware.sources.faults import OPTIONS, Faults
 from pi_firmware.sources.live import LiveSource, caps, check_exposure
 from pi_firmware.uri import Uri
 
-PATTERNS = ("zone-plate", "smpte", "ball", "black", "snow")
+PATTERNS = ("zone-plate", "smpte", "ball", "black", "snow", "gradient")
 
 
 class PatternSource(LiveSource):

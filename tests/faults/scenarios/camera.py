@@ -15,7 +15,7 @@ from standing import ATRIUM
 from pi_firmware.wire.recording import TRUTH_TOPIC, PoseSample, RecordingReader, RecordingWriter
 
 FLIGHT = ATRIUM / "flight.mcap"
-NAMES = ("flight", "black", "frozen", "gone", "hangs", "pattern")
+NAMES = ("flight", "black", "frozen", "gone", "hangs", "stuck", "pattern")
 _EVERY, _FRAMES = 3, 120
 """Of the flight's 30 Hz, so that a stretch of 12 s is made within seconds."""
 _FAULT = range(40, 80)
@@ -73,6 +73,7 @@ class Cameras:
         faults = {
             "gone": "gone_at_s=2&gone_for_s=3",
             "hangs": "hang_at_s=2&hang_for_s=60",
+            "stuck": "pattern=gradient",
             "pattern": "",
         }
         return Camera(f"test:?{faults[name]}".rstrip("?"), None)
