@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from deploy.board.releases.places import sync_folder
 from deploy.errors import DeployError
 
 _KEY_DIGITS = 16
@@ -33,8 +34,8 @@ def made(target: Path) -> Iterator[Path | None]:
     """Makes `target`, a file or a folder, unless it is there.
 
     Gives None where it is there, else a new folder beside it: what stands in it under the target's
-    own name when the block ends is renamed to it. One process makes, others wait for it. Left by
-    an exception, Ctrl-C included, nothing remains.
+    own name when the block ends is brought to the disk and renamed to it. One process makes,
+    others wait for it. Left by an exception, Ctrl-C included, nothing remains.
 
     Raises:
         DeployError: the cache cannot be written.
@@ -53,7 +54,9 @@ def made(target: Path) -> Iterator[Path | None]:
         work = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
         try:
             yield work
+            os.sync()  # all that was made, of which there may be thousands of files
             (work / target.name).rename(target)
+            sync_folder(target.parent)
         finally:
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
