@@ -27,11 +27,16 @@ class Shim:
         subprocess.run(
             [compiler, "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True
         )
-        number.write_bytes(bytes(8))
+        number.write_bytes(bytes(16))
         with number.open("r+b") as file:
-            self._number = mmap.mmap(file.fileno(), 8)
+            self._numbers = mmap.mmap(file.fileno(), 16)
         self.env = {"LD_PRELOAD": str(library), name.upper(): str(number)}
 
     def set(self, number: int) -> None:
         """From now on it is this number; 0 at first."""
-        self._number[:] = struct.pack("=q", number)
+        self._numbers[:8] = struct.pack("=q", number)
+
+    @property
+    def befell(self) -> int:
+        """How often it made a fault, where it counts them."""
+        return int(struct.unpack_from("=q", self._numbers, 8)[0])

@@ -32,13 +32,16 @@ from soaking.measures import CLOCK, LATENCY, MEMORY, Measure, Windows
 from soaking.processes import Watch
 from soaking.table import Row
 from soaking.trend import trend
+from witness import Witness
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "stream"))
 
 from receiving import Receiver
 
 from ground_station.errors import GroundStationError
+from ground_station.keys.authority import Authority
 from ground_station.stream.feedback import Feedback
+from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 
 RATE_HZ = 30.0
@@ -55,6 +58,7 @@ TRUE_S = 0.001
 """How far capture and wall clock may drift apart over the flight: what capture times promise."""
 _SEED = 4
 
+NAME = "blimp-1"
 PAYLOAD, HERE = "payload", "this program"
 # What would matter, an hour. A payload of 512 MB and 1,024 descriptors that stays on for a day: 24
 # MB and 192 descriptors. (Of a slow counter half an hour tells no less than 7 an hour from 0.)
@@ -100,10 +104,14 @@ def fly(flown: Flown, options: Any, interrupted: threading.Event) -> None:
     duration_s, account = 3600.0 * options.hours, flown.account
     windows = Windows(SAMPLE_S)
     with contextlib.ExitStack() as stack:
-        listener = stack.enter_context(TelemetryListener(["tcp/127.0.0.1:0"]))
-        receiver = stack.enter_context(Receiver(0, queue_frames=1024))
-        link = stack.enter_context(ImpairedLink(receiver.port, seed=_SEED, tap=account.witness))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        authority = Authority.create(folder / "keys")
+        ground, certificates = authority.add("ground", "main"), authority.add("payload", NAME)
+        keys = load_keys(ground)
+        account.witness = Witness(keys)
+        listener = stack.enter_context(TelemetryListener(["tls/127.0.0.1:0"], certificates=ground))
+        receiver = stack.enter_context(Receiver(0, queue_frames=1024, srtp_keys=keys))
+        link = stack.enter_context(ImpairedLink(receiver.port, seed=_SEED, tap=account.witness))
         payload = stack.enter_context(
             PayloadProcess(
                 folder,
@@ -112,7 +120,9 @@ def fly(flown: Flown, options: Any, interrupted: threading.Event) -> None:
                 f"link.port={link.port}",
                 "link.correction=0",
                 "link.history_s=0",  # what the link loses stays lost: each frame can be told
+                f"payload_id={NAME}",
                 f"telemetry.connect={json.dumps(listener.endpoints)}",
+                f"telemetry.certificates={certificates}",
                 prefix=("setsid",),  # a Ctrl-C is ours: the flight ends as it always does
             )
         )

@@ -65,7 +65,7 @@ def test_only_an_interpreter_that_was_just_starting_may_end_without_a_word(
     status: int, out: str, ended_s: float, unborn: bool
 ) -> None:
     process: Any = None
-    run = PayloadRun(Camera("test:", None), process, 100.0, Watch("blimp-1", bytes(30)), [])
+    run = PayloadRun(Camera("test:", None), process, 100.0, Watch({"blimp-1": bytes(30)}), [])
     assert not run.unborn
     run.ended, run.ended_s = Ended(status, out, "", ended_s), 100.0 + ended_s
     assert run.unborn is unborn

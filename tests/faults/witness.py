@@ -7,11 +7,12 @@ against it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
+from ground_station.stream.srtp import Unprotector
 from pi_firmware.wire import annexb, sei
 
 _BESIDE = {annexb.NAL_SEI, annexb.NAL_SPS, annexb.NAL_PPS}
@@ -40,9 +41,13 @@ class _Stream:
 
 
 class Witness:
-    """The tap of an `ImpairedLink`; streams are told apart by SSRC."""
+    """The tap of an `ImpairedLink`; streams are told apart by SSRC.
 
-    def __init__(self) -> None:
+    With `keys`, SRTP keys by payload, it hears what is sent with them, and that only.
+    """
+
+    def __init__(self, keys: Mapping[str, bytes] | None = None) -> None:
+        self._unprotector = None if keys is None else Unprotector(keys)
         self.gaps = 0
         """Packets that were missing before the link: the sender's or this machine's doing."""
         self.strangers = 0
@@ -51,6 +56,8 @@ class Witness:
         self._lock = threading.Lock()
 
     def __call__(self, datagram: bytes, lost: bool) -> None:
+        if self._unprotector is not None:
+            datagram = self._unprotector.unprotect(datagram) or b""
         packet = rtp.parse(datagram, 0)
         with self._lock:
             if packet is None:

@@ -2,16 +2,15 @@
 
 import datetime
 import json
-import shutil
 import threading
 import time
 from pathlib import Path
 
 import pytest
 import zenoh
+from short_certificates import certify
 
 from ground_station.keys.authority import Authority
-from ground_station.keys.certificates import Pair, make_certificate
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
@@ -125,20 +124,6 @@ def test_a_revoked_payload_is_refused(tmp_path: Path) -> None:
         session = open_session(connect=listener.endpoints, certificates=stolen)
         assert not heard(listener, session, "blimp-1", PATIENCE_S)
         assert listener.payloads() == []
-
-
-def certify(authority: Authority, name: str, to: Path, lasts: datetime.timedelta) -> Path:
-    """A copy of a member's folder whose certificate, of the same authority, ends then."""
-    shutil.copytree(authority.of(name), to)
-    signer = authority.folder / "authorities"
-    pair = make_certificate(
-        name,
-        Pair((signer / "1.pem").read_bytes(), (signer / "1.key").read_bytes()),
-        (datetime.datetime.now(datetime.UTC) + lasts).replace(microsecond=0),
-    )
-    (to / "certificate.pem").write_bytes(pair.certificate)
-    (to / "key.pem").write_bytes(pair.key)
-    return to
 
 
 @pytest.mark.parametrize("expired", ["payload.blimp-1", "ground.main"])

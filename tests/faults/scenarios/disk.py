@@ -11,6 +11,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+ERRORS = {"bad": errno.EIO, "read-only": errno.EROFS, "stalls": -1}
+"""What `file_fault` is told for a disk that fails without being full."""
+KINDS = ("full", *ERRORS)
+STALLS = "stalls"
 _CLONE_NEWNS = 0x00020000  # sched.h
 _BLOCK = bytes(1 << 16)
 

@@ -6,19 +6,25 @@ import contextlib
 import itertools
 import json
 import random
+import resource
 import socket
+import ssl
+import struct
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from intake_stand import eventually
 from numbered_flight import encoded, packets, stamped
+from soaking.processes import descriptors
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import BlimpError
-from pi_firmware.wire.telemetry import Session, open_session
+from scenarios import flood
 from scenarios.background import Background
 from scenarios.step import Step
 
@@ -26,6 +32,12 @@ if TYPE_CHECKING:
     from scenarios.world import World
 
 _TIMEOUT_S = 2.0
+_LEAST_FLOOD_HZ = 2000.0
+"""On a machine that is busy, too: 20 Mbit/s."""
+_GIVEN_BACK_S = 20.0
+_SPARE_DESCRIPTORS = 3
+_MORE_DESCRIPTORS = 10
+"""What a process may have more after than before, with those who really look at it."""
 
 
 class Peer(Step):
@@ -53,18 +65,6 @@ class Peer(Step):
             return
         peer.end()
         world.say(f"{type(self).__name__}: {peer.acts} times, {peer.failure or 'all sent'}")
-
-
-def _client(world: World, certificates: Path) -> Session:
-    """A session of a second program with some machine's certificate, linked with the station.
-
-    With the station's own it is as `blimp command`'s: its words are handed on to the payloads.
-    """
-    return open_session(
-        connect=[world.service.endpoint],
-        certificates=certificates,
-        client_timeout_s=_TIMEOUT_S,
-    )
 
 
 def _datagrams(world: World, next_one: Any, rate_hz: float) -> Background:
@@ -129,6 +129,159 @@ class OldPackets(Peer):
         return _datagrams(world, one, 50.0)
 
 
+@dataclass(frozen=True)
+class AirReplayed(Peer):
+    """The station is killed and starts, and all the while what it was sent before comes again."""
+
+    STARTS: ClassVar[bool] = True
+
+    def begin(self, world: World) -> Background:
+        world.hold_service(self)
+        recorded = itertools.cycle([data for _, data in world.run.watch.recent])
+        return _datagrams(world, lambda: next(recorded), 300.0)
+
+    def inject(self, world: World) -> None:
+        super().inject(world)
+        world.let_service(self)
+
+
+@dataclass(frozen=True)
+class Flood(Step):
+    """Datagrams at line rate: one of `flood.KINDS`."""
+
+    kind: str = "garbage"
+
+    def inject(self, world: World) -> None:
+        told = world.folder / f"flood-{id(self)}.txt"
+        port, ssrc = str(world.service.video), str(world.run.ssrc)
+        with told.open("w") as out:
+            command = [sys.executable, flood.__file__, port, self.kind, ssrc]
+            world.kept[id(self)] = (subprocess.Popen(command, stdout=out), told)
+
+    def lacking(self, world: World) -> str:
+        flooding, told = world.kept[id(self)]
+        if flooding.poll() is not None:
+            return f"it ended with {flooding.returncode}"
+        sent = int((told.read_text().split() or ["0"])[-1])
+        rate_hz = sent / self.for_s
+        world.say(f"Flood: {sent} datagrams, {rate_hz:.0f} a second")
+        return "" if rate_hz > _LEAST_FLOOD_HZ else f"{rate_hz:.0f} datagrams a second only"
+
+    def fix(self, world: World) -> None:
+        flooding, _ = world.kept.pop(id(self))
+        flooding.kill()
+        flooding.wait()
+
+
+@dataclass(frozen=True)
+class Aborting(Peer):
+    """Who begins to speak HTTP or TLS and resets the connection, after each number of bytes."""
+
+    rate_hz: float = 50.0
+
+    def begin(self, world: World) -> Background:
+        ports = world.service.http, int(world.service.endpoint.rpartition(":")[2])
+        host = f"Host: 127.0.0.1:{ports[0]}\r\n"
+        recordings = sorted(path.name for path in world.service.recordings.glob("*.mcap"))
+        whole = [
+            (ports[0], f"GET /api/state HTTP/1.1\r\n{host}\r\n".encode()),
+            (ports[1], _client_hello()),
+        ]
+        for name in recordings[:1]:
+            request = f"GET /api/recordings/{name} HTTP/1.1\r\n{host}\r\n"
+            whole.append((ports[0], request.encode()))
+        tries = itertools.cycle(
+            (port, data[: size % (len(data) + 1)]) for size in range(600) for port, data in whole
+        )
+
+        def act() -> bool:
+            port, part = next(tries)
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", port), _TIMEOUT_S) as one,
+            ):
+                one.sendall(part)
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                return True
+            return False
+
+        world.kept[-id(self)] = self._open(world)
+        return Background(act, 1.0 / self.rate_hz)
+
+    def fix(self, world: World) -> None:
+        super().fix(world)
+        before = world.kept.pop(-id(self), None)
+
+        def given_back() -> bool:
+            return all(
+                now <= before.get(name, 0) + _MORE_DESCRIPTORS
+                for name, now in self._open(world).items()
+            )
+
+        if before is not None:
+            try:
+                eventually(given_back, _GIVEN_BACK_S)
+            except AssertionError:
+                world.complain(f"{self}: descriptors before {before}, after {self._open(world)}")
+
+    @staticmethod
+    def _open(world: World) -> dict[str, int]:
+        return {
+            name: descriptors(one.pid) or 0
+            for name in ("intake", "web")
+            if (one := world.child(name)) is not None
+        }
+
+
+def _client_hello() -> bytes:
+    """The first bytes of a TLS client."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    out = ssl.MemoryBIO()
+    with contextlib.suppress(ssl.SSLWantReadError):
+        context.wrap_bio(ssl.MemoryBIO(), out).do_handshake()
+    return out.read()
+
+
+@dataclass(frozen=True)
+class Descriptors(Step):
+    """A process of the service has no descriptors left, as those who connect take all."""
+
+    process: str = "web"
+    count: int = 40
+
+    def inject(self, world: World) -> None:
+        found = world.child(self.process)
+        held: list[socket.socket] = []
+        world.kept[id(self)] = (found, held)
+        if found is None:
+            return
+        most = (descriptors(found.pid) or 0) + _SPARE_DESCRIPTORS
+        limits = resource.prlimit(found.pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(found.pid, resource.RLIMIT_NOFILE, (most, limits[1]))
+        world.kept[id(self)] = (found, held, limits, most)
+        telemetry = int(world.service.endpoint.rpartition(":")[2])
+        port = world.service.http if self.process == "web" else telemetry
+        for _ in range(self.count):
+            with contextlib.suppress(OSError):
+                held.append(socket.create_connection(("127.0.0.1", port), _TIMEOUT_S))
+
+    def lacking(self, world: World) -> str:
+        found, held, *limited = world.kept[id(self)]
+        if found is None or not limited:
+            return f"no {self.process}"
+        now = descriptors(found.pid) or 0
+        world.say(f"Descriptors: {now} of {limited[1]}, {len(held)} connected")
+        return "" if now >= limited[1] else f"{now} of {limited[1]} descriptors"
+
+    def fix(self, world: World) -> None:
+        found, held, *limited = world.kept.pop(id(self))
+        for one in held:
+            one.close()
+        if limited and found.living:
+            resource.prlimit(found.pid, resource.RLIMIT_NOFILE, limited[0])
+
+
 NONSENSE = ("", "null", "[]", "{", "\x00\xff", '{"schema": 3}', "[" * 3000, '{"a":' * 500)
 """JSON texts that are no message."""
 
@@ -171,7 +324,7 @@ class BadTelemetry(Peer):
 
     def begin(self, world: World) -> Background:
         draw = world.draw()
-        session = _client(world, world.certificates)
+        session = world.client(world.certificates)
 
         def act() -> bool:
             kind, text = _twisted(draw)
@@ -192,7 +345,7 @@ class CommandFlood(Peer):
 
     def begin(self, world: World) -> Background:
         draw = world.draw()
-        session = _client(world, world.service.certificates)
+        session = world.client(world.service.certificates)
         bodies = (
             messages.encode(messages.Command(time_ns=1)),
             messages.encode(messages.Command(time_ns=1, arguments={"kbps": 1e9})),

@@ -22,7 +22,16 @@ OFF_M = 0.5
 """No pose called TRACKING is farther from the truth."""
 _ON_ITS_WAY = 5
 """Frames that had left and not come when an intake was killed."""
-INVARIANTS = ("accounts", "poses", "recordings", "recovery", "order")
+MOST_MB = {
+    "payload": 200.0,
+    "station": 150.0,
+    "intake": 350.0,
+    "localizer": 700.0,
+    "web": 250.0,
+    "foxglove": 350.0,
+}
+"""Resident memory that no process exceeds, whatever others send: what `deploy/README.md` says."""
+INVARIANTS = ("accounts", "poses", "recordings", "recovery", "memory", "order")
 
 
 @dataclass
@@ -56,12 +65,18 @@ def judge(verdict: Verdict, world: World) -> None:
     broken["poses"] += wrong
     broken["recordings"] += recorded(world)
     broken["order"] += world.complaints + in_order(world)
+    broken["memory"] += [
+        f"{name}: {peak_MB:.0f} MB, allowed {MOST_MB[name]:g}"
+        for name, peak_MB in world.peaks_MB.items()
+        if peak_MB > MOST_MB[name]
+    ]
     states = Counter(told.note.state for told in heard.estimates())
     verdict.figures |= {
         "frames": sum(len(frames) for frames in heard.shown.values()),
         "estimates": dict(states),
         "off_m": round(off_m, 3),
         "payloads": len(world.runs),
+        "peaks_MB": {name: round(peak_MB, 1) for name, peak_MB in world.peaks_MB.items()},
         "services": world.service_runs,
         "recordings": len(list(world.service.recordings.glob("*.mcap"))),
         "link": vars(world.link.counts),
@@ -233,5 +248,5 @@ def in_order(world: World) -> list[str]:
     except AssertionError as error:
         complaints.append(f"service: {str(error)[-900:]}")
     heard = {who for who, _, _ in world.heard.payloads} | set(world.heard.shown)
-    complaints += [f"service: it heard {who}" for who in sorted(heard - {NAME})]
+    complaints += [f"service: it heard {who}" for who in sorted(heard - world.guests - {NAME})]
     return complaints

@@ -8,13 +8,13 @@ import re
 import signal
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from payload_process import Ended, PayloadProcess
 from witness import Witness
 
 from ground_station.stream import rtp
-from ground_station.stream.srtp import Unprotector
 from scenarios.camera import Camera
 
 UNBORN_S = 2.0
@@ -24,21 +24,17 @@ _SSRC = re.compile(r" ssrc (\d+)\n")
 
 
 class Watch(Witness):
-    """The tap of a link for one payload, which it hears with its SRTP key.
+    """The tap of a link for one payload: also keeps when each frame left, and the last packets."""
 
-    It also keeps when each frame left, and the last packets, encrypted.
-    """
-
-    def __init__(self, payload_id: str, key: bytes) -> None:
-        super().__init__()
-        self._unprotector = Unprotector({payload_id: key})
+    def __init__(self, keys: Mapping[str, bytes]) -> None:
+        super().__init__(keys)
         self.at_s: list[float] = []
         """When each frame of `left` had left whole, `time.monotonic`."""
         self.recent: deque[tuple[float, bytes]] = deque(maxlen=_KEPT_PACKETS)
 
     def __call__(self, datagram: bytes, lost: bool) -> None:
         self.recent.append((time.monotonic(), datagram))
-        super().__call__(self._unprotector.unprotect(datagram) or b"", lost)
+        super().__call__(datagram, lost)
 
     def _follow(self, packet: rtp.Packet, lost: bool) -> None:
         super()._follow(packet, lost)

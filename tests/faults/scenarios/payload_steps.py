@@ -82,13 +82,13 @@ class PayloadClock(Step):
     by_s: float = 3600.0
 
     def inject(self, world: World) -> None:
-        world.disturb(self, "stepped_clock", int(1e9 * self.by_s))
+        world.disturb(self, "payload", "stepped_clock", int(1e9 * self.by_s))
 
     def lacking(self, world: World) -> str:
-        return "" if "stepped_clock" in world.shims else "no shim sets it"
+        return "" if world.shims else "no shim sets it"
 
     def fix(self, world: World) -> None:
-        world.disturb(self, "stepped_clock", 0)
+        world.disturb(self, "payload", "stepped_clock", 0)
 
 
 @dataclass(frozen=True)
@@ -137,31 +137,46 @@ class EncoderStalls(Step):
     STARTS: ClassVar[bool] = True
 
     def inject(self, world: World) -> None:
-        world.disturb(self, "encoder_fault", _ENCODER_GIVES_NONE)
+        world.disturb(self, "payload", "encoder_fault", _ENCODER_GIVES_NONE)
 
     def lacking(self, world: World) -> str:
         silent_s = time.monotonic() - max(world.run.watch.at_s, default=0.0)
         return "" if silent_s > self.for_s / 2 else f"it gave a frame {silent_s:.1f} s ago"
 
     def fix(self, world: World) -> None:
-        world.disturb(self, "encoder_fault", 0)
+        world.disturb(self, "payload", "encoder_fault", 0)
 
 
 @dataclass(frozen=True)
-class CardFull(Step):
-    """The payload's card takes no more; with the fault the recording ends, and it flies on."""
+class CardFault(Step):
+    """The payload's card fails: one of `disk.KINDS`.
+
+    The recording ends with it, but for a card that stalls, and it flies on.
+    """
+
+    kind: str = "full"
 
     def inject(self, world: World) -> None:
-        world.kept[id(self)] = (world.run, world.end_recording("card"))
-        disk.limit_files(world.run.process.pid, disk.size_now(world.card))
+        window = world.end_recording("card") if self.kind != disk.STALLS else [0.0, 0.0]
+        world.kept[id(self)] = (world.run, window, world.befell("payload"))
+        if self.kind in disk.ERRORS:
+            world.disturb(self, "payload", "file_fault", disk.ERRORS[self.kind])
+        else:
+            disk.limit_files(world.run.process.pid, disk.size_now(world.card))
 
     def lacking(self, world: World) -> str:
+        if self.kind in disk.ERRORS and world.befell("payload") == world.kept[id(self)][2]:
+            return "it wrote nothing"
         note = world.heard.payload(NAME)
         file = note.recording if note is not None else ""
+        if self.kind == disk.STALLS:
+            return "" if file else "it does not record any more"
         return f"it records into {file}" if file else ""
 
     def fix(self, world: World) -> None:
-        run, window = world.kept.pop(id(self))
+        run, window, _ = world.kept.pop(id(self))
         window[1] = time.monotonic()
+        world.disturb(self, "payload", "file_fault", 0)
         if run.ended is None:
             disk.limit_files(run.process.pid, None)
+        world.command("record-start")

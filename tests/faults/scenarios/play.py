@@ -106,6 +106,7 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
         + [(step.until_s, 1, n) for n, step in enumerate(scenario.steps)]
     )
     begun: set[int] = set()
+    left, shown = _frames(world)
     for due_s, ends, number in happenings:
         step = scenario.steps[number]
         while time.monotonic() < began_s + due_s:
@@ -129,6 +130,14 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
     still_s = time.monotonic() + _STILL_S
     while time.monotonic() < still_s:
         tick(world)
+    left_by_now, shown_by_now = _frames(world)
+    gone = left_by_now - left - (shown_by_now - shown)
+    verdict.figures |= {"left": left_by_now - left, "lost": max(0, gone)}
+
+
+def _frames(world: World) -> tuple[int, int]:
+    """How many frames have left the payload so far, and how many the ground has shown."""
+    return sum(len(run.watch.at_s) for run in world.runs), len(world.heard.frames(NAME))
 
 
 def _end(world: World, step: Step, *, alone: bool) -> None:
@@ -160,7 +169,7 @@ def recovery(world: World, since_s: float, bound_s: float) -> Back:
             return Back(now_s - since_s, burden.factor)
         if now_s - looked_s > _LOOK_S:
             looked_s = now_s
-            burden.look(world.pids())
+            burden.look(world.pids().values())
         tick(world)
     return Back(None, burden.factor)
 

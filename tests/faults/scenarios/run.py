@@ -193,15 +193,21 @@ def _chosen(arguments: argparse.Namespace) -> list[Scenario]:
 
 
 def _table(verdicts: Sequence[Verdict]) -> None:
-    rows = [["scenario", *INVARIANTS, "back", "burden", "off"]]
+    rows = [["scenario", *INVARIANTS, "back", "lost", "burden", "off"]]
     for verdict in verdicts:
         back_s = verdict.figures.get("recovery_s")
         back = "never" if back_s is None else f"{back_s:.1f} s"
         off = f"{verdict.figures.get('off_m', float('nan')):.2f} m"
         burden = f"{verdict.figures.get('burden', 1.0):.1f}"
         held = ("BROKEN" if verdict.broken[name] else "ok" for name in INVARIANTS)
-        rows.append([verdict.name[:42], *held, back, burden, off])
+        lost = f"{verdict.figures.get('lost', '?')} of {verdict.figures.get('left', '?')}"
+        rows.append([verdict.name[:42], *held, back, lost, burden, off])
     print("", *columns(rows), sep="\n")
+    peaks_MB: dict[str, float] = {}
+    for verdict in verdicts:
+        for name, peak_MB in verdict.figures.get("peaks_MB", {}).items():
+            peaks_MB[name] = max(peak_MB, peaks_MB.get(name, 0.0))
+    print("most memory, MB:", *(f"{name} {peak:.0f}" for name, peak in peaks_MB.items()))
     holding = sum(verdict.holds for verdict in verdicts)
     print(
         f"{holding} of {len(verdicts)} hold; bounds: 0.5 m, back within {RECOVERED_S:g} s, or"

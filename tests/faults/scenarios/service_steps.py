@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from intake_stand import eventually
 from standing import is_stopped
 
 from scenarios import disk
@@ -17,12 +18,18 @@ from scenarios.step import Step
 if TYPE_CHECKING:
     from scenarios.world import World
 
+_GONE_S = 2.0
+
 
 @dataclass(frozen=True)
 class Killed(Step):
-    """SIGKILL for one of the service's processes, which its parent restarts."""
+    """A signal for one of the service's processes, which its parent restarts.
+
+    SIGKILL is what it gets when memory ends, SIGSEGV when its decoder does what it must not.
+    """
 
     process: str = "intake"
+    signal: str = "SIGKILL"
     STARTS: ClassVar[bool] = True
 
     def inject(self, world: World) -> None:
@@ -34,10 +41,15 @@ class Killed(Step):
             world.end_recording("ground")
             world.intake_anew_s.append(time.monotonic())
         with contextlib.suppress(ProcessLookupError):
-            os.kill(found.pid, signal.SIGKILL)
+            os.kill(found.pid, signal.Signals[self.signal])
 
     def lacking(self, world: World) -> str:
-        return "" if world.kept[id(self)] else f"no {self.process} to kill"
+        found = world.kept[id(self)]
+        if found is None:
+            return f"no {self.process} to kill"
+        with contextlib.suppress(AssertionError):
+            eventually(lambda: not found.living, _GONE_S)
+        return "it lives" if found.living else ""
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,30 @@ class Stopped(Step):
         found = world.kept.pop(id(self))
         if found is not None and found.living:
             os.kill(found.pid, signal.SIGCONT)
+
+
+@dataclass(frozen=True)
+class Asleep(Step):
+    """The laptop sleeps: nothing of the service runs; with `GroundClock` it wakes an hour later."""
+
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        names = ("station", "intake", "web", "localizer")
+        found = [one for name in names if (one := world.child(name)) is not None]
+        world.kept[id(self)] = found
+        for one in found:
+            os.kill(one.pid, signal.SIGSTOP)
+
+    def lacking(self, world: World) -> str:
+        found = world.kept[id(self)]
+        awake = [one.name for one in found if not is_stopped(one.pid)]
+        return f"awake: {awake}" if awake or not found else ""
+
+    def fix(self, world: World) -> None:
+        for one in reversed(world.kept.pop(id(self))):
+            if one.living:
+                os.kill(one.pid, signal.SIGCONT)
 
 
 @dataclass(frozen=True)
@@ -95,32 +131,45 @@ class GroundClock(Step):
     by_s: float = 3600.0
 
     def inject(self, world: World) -> None:
-        world.disturb(self, "ground_clock", int(1e9 * self.by_s))
+        world.disturb(self, "ground", "stepped_clock", int(1e9 * self.by_s))
 
     def lacking(self, world: World) -> str:
-        return "" if "ground_clock" in world.shims else "no shim sets it"
+        return "" if world.shims else "no shim sets it"
 
     def fix(self, world: World) -> None:
-        world.disturb(self, "ground_clock", 0)
+        world.disturb(self, "ground", "stepped_clock", 0)
 
 
 @dataclass(frozen=True)
-class DiskFull(Step):
-    """The disk of the ground's recordings takes no more; then there is room, and it records."""
+class DiskFault(Step):
+    """The disk of the ground's recordings fails: one of `disk.KINDS`; then it takes more again.
+
+    One that stalls ends no recording.
+    """
+
+    kind: str = "full"
 
     def inject(self, world: World) -> None:
-        found = None
-        if world.disk is not None:
+        found, befell = None, world.befell("ground")
+        if self.kind in disk.ERRORS:
+            world.disturb(self, "ground", "file_fault", disk.ERRORS[self.kind])
+        elif world.disk is not None:
             world.disk.fill()
         elif found := world.child("intake"):
             disk.limit_files(found.pid, disk.size_now(world.service.recordings))
-        world.kept[id(self)] = (found, world.end_recording("ground"))
+        window = world.end_recording("ground") if self.kind != disk.STALLS else [0.0, 0.0]
+        world.kept[id(self)] = (found, window, befell)
 
     def lacking(self, world: World) -> str:
+        if self.kind in disk.ERRORS and world.befell("ground") == world.kept[id(self)][2]:
+            return "it wrote nothing"
+        if self.kind == disk.STALLS:
+            return "" if world.recording() else "it does not record any more"
         return "it records" if world.recording() else ""
 
     def fix(self, world: World) -> None:
-        found, window = world.kept.pop(id(self))
+        found, window, _ = world.kept.pop(id(self))
+        world.disturb(self, "ground", "file_fault", 0)
         if world.disk is not None:
             world.disk.free()
         elif found is not None and found.living:

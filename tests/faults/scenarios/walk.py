@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 
+from scenarios import disk, flood
 from scenarios import hostile_steps as hostile
 from scenarios import link_steps as link
 from scenarios import payload_steps as payload
@@ -34,19 +35,26 @@ DRAWS: tuple[Draw, ...] = (
     lambda d, at, t: hostile.CommandFlood(at, t),
     lambda d, at, t: hostile.SlowViewers(at, t, d.randint(1, 8)),
     lambda d, at, t: hostile.HostileHttp(at, t),
+    lambda d, at, t: hostile.AirReplayed(at, t),
+    lambda d, at, t: hostile.Flood(at, t, d.choice(flood.KINDS)),
+    lambda d, at, t: hostile.Aborting(at, t),
+    lambda d, at, t: hostile.Descriptors(at, t, d.choice(("intake", "web"))),
     lambda d, at, t: payload.PayloadKilled(at, t),
     lambda d, at, t: payload.PayloadRestarted(at, t),
     lambda d, at, t: payload.PayloadStopped(at, t),
     lambda d, at, t: payload.PayloadClock(at, t, round(d.uniform(-5000, 5000), 1)),
-    lambda d, at, t: payload.CameraFault(at, t, d.choice(("black", "frozen", "gone", "pattern"))),
+    lambda d, at, t: payload.CameraFault(
+        at, t, d.choice(("black", "frozen", "gone", "pattern", "stuck"))
+    ),
     lambda d, at, t: payload.EncoderStalls(at, min(t, 4.0)),
     lambda d, at, t: payload.GaugeFault(at, t, d.choice(tuple(payload.GAUGES))),
-    lambda d, at, t: payload.CardFull(at, t),
+    lambda d, at, t: payload.CardFault(at, t, d.choice(disk.KINDS)),
     lambda d, at, t: service.Killed(at, 0.0, d.choice(("intake", "localizer", "web"))),
     lambda d, at, t: service.Stopped(at, t, d.choice(("intake", "localizer", "web", "station"))),
+    lambda d, at, t: service.Asleep(at, t),
     lambda d, at, t: service.ServiceKilled(at, t / 2),
     lambda d, at, t: service.GroundClock(at, t, round(d.uniform(-5000, 5000), 1)),
-    lambda d, at, t: service.DiskFull(at, t),
+    lambda d, at, t: service.DiskFault(at, t, d.choice(disk.KINDS)),
     lambda d, at, t: service.FolderTaken(at, t),
 )
 

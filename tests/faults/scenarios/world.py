@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import random
+import re
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -19,7 +20,10 @@ from payload_process import PayloadProcess
 from shims import Shim
 from standing import Process, Service
 
+from ground_station.stream.commands import ask
+from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.srtp import KEY_FILE, read_key
+from pi_firmware.wire.telemetry import Session, open_session
 from scenarios import disk
 from scenarios.camera import Cameras
 from scenarios.heard import Heard
@@ -31,10 +35,14 @@ from scenarios.tcp_wire import TcpWire
 RATE_HZ = 10.0
 SPEED = 0.5
 """Of the recorded flight: a machine that is busy, too, skips frames and still tracks."""
-_TICK_S, _LOOK_S = 0.05, 0.5
+_PEAK = re.compile(r"VmHWM:\s+(\d+) kB")
+_TICK_S, _LOOK_S, _TIMEOUT_S = 0.05, 0.5, 2.0
 HOPELESS = 3
 """The payload's exit status by which systemd starts it again."""
-_SHIMS = ("stepped_clock", "encoder_fault")
+_SHIMS = {
+    "payload": ("stepped_clock", "encoder_fault", "file_fault"),
+    "ground": ("stepped_clock", "file_fault"),
+}
 
 
 class Station(Service):
@@ -71,6 +79,10 @@ class World:
         """What happened and when, for a person."""
         self.complaints: list[str] = []
         """What did not end or begin as it should."""
+        self.guests: set[str] = set()
+        """Payloads beside ours that a step lets be heard."""
+        self.peaks_MB: dict[str, float] = {}
+        """The most resident memory of each process so far, and of those before it."""
         self.ended_s: dict[str, list[Window]] = {"ground": [], "card": []}
         """When something ended a recording, and until when it may have, by whose it was."""
         self.intake_anew_s: list[float] = []
@@ -83,29 +95,30 @@ class World:
         self._rate_hz = rate_hz
         self._draw = random.Random(seed)
         self._options: dict[int, dict[str, str]] = {}
-        self._shimmed: dict[str, dict[int, int]] = {}
+        self._shimmed: dict[tuple[str, str], dict[int, int]] = {}
         self._impairments: dict[int, Impairment] = {}
         self._held: dict[str, set[int]] = {"payload": set(), "service": set()}
         self._stack = contextlib.ExitStack()
         self._bus = contextlib.ExitStack()
         self._began_s = time.monotonic()
         self.card = folder / "card"
-        self.shims: dict[str, Shim] = {}
+        self.shims: dict[tuple[str, str], Shim] = {}
+        """By whose they are, `payload` or `ground`, and their name."""
         folder.mkdir(parents=True, exist_ok=True)
         self.card.mkdir()
-        if shims_there():
-            self.shims = {name: Shim(folder, name) for name in _SHIMS}
-            ground = folder / "ground"
-            ground.mkdir()
-            self.shims["ground_clock"] = Shim(ground, "stepped_clock")
-        env = self.shims["ground_clock"].env if self.shims else {}
+        for whose, names in _SHIMS.items() if shims_there() else ():
+            (folder / whose).mkdir()
+            for name in names:
+                self.shims[whose, name] = Shim(folder / whose, name)
         self.service = Station(
             folder,
             f"foxglove.enabled={json.dumps(foxglove)}",
             "recording.at_start=true",
-            env=env,
+            env=self._env("ground"),
         )
         self.certificates = self.service.authority.of(f"payload.{NAME}")
+        self.second = self.service.authority.add("ground", "second")
+        """The folder of another station that the payload lists, too."""
         self.disk = disk.mount(self.service.recordings, disk_MB) if disk_MB else None
 
     def __enter__(self) -> World:
@@ -118,6 +131,7 @@ class World:
             )
             port = int(self.service.endpoint.rpartition(":")[2])
             self.wire = self._stack.enter_context(TcpWire(port))
+            self.endpoints = [f"tls/127.0.0.1:{self.wire.port}"]
             self._fly()
         except BaseException:
             self.close()
@@ -186,7 +200,7 @@ class World:
 
     def tend(self) -> None:
         """What an init system does: a payload that has ended, and is wanted, is started."""
-        self._follow_intake()
+        self._look()
         run = self.run
         if run.ended is None and not run.process.running:
             run.note_end()
@@ -198,12 +212,18 @@ class World:
         if run.ended is not None and not self._held["payload"]:
             self._fly()
 
-    def _follow_intake(self) -> None:
-        """Its parent ends one that a busy machine keeps silent for long, whatever is injected."""
+    def _look(self) -> None:
+        """Follows the processes' memory, and the intake.
+
+        Its parent ends one that a busy machine keeps silent for long, whatever is injected.
+        """
         now_s = time.monotonic()
         if now_s - self._looked_s < _LOOK_S:
             return
         self._looked_s = now_s
+        for name, pid in self.pids().items():
+            kind = name.partition("/")[0]
+            self.peaks_MB[kind] = max(self.peaks_MB.get(kind, 0.0), peak_MB(pid))
         found, before = self.child("intake"), self._intake
         if before is not None and found != before[0]:
             self.say("the intake's process ended")
@@ -234,7 +254,7 @@ class World:
             "link.correction": "0",
             "link.port": str(self.link.port),
             "link.history_s": "0",  # what the link loses stays lost: each frame can be told
-            "telemetry.connect": json.dumps([f"tls/127.0.0.1:{self.wire.port}"]),
+            "telemetry.connect": json.dumps(self.endpoints),
             "telemetry.certificates": str(self.certificates),
             "recording.folder": str(self.card),
             "recording.at_start": "true",
@@ -243,15 +263,16 @@ class World:
         }
         card = sorted(path.name for path in self.card.iterdir())
         process = PayloadProcess(
-            folder, *(f"{name}={value}" for name, value in settings.items()), env=self._env()
+            folder,
+            *(f"{name}={value}" for name, value in settings.items()),
+            env=self._env("payload"),
         )
-        watch = Watch(NAME, read_key(self.certificates / KEY_FILE))
+        watch = Watch({NAME: read_key(self.certificates / KEY_FILE)})
         self.runs.append(PayloadRun(camera, process, time.monotonic(), watch, card))
 
-    def _env(self) -> dict[str, str]:
+    def _env(self, whose: str) -> dict[str, str]:
         env: dict[str, str] = {}
-        for name in _SHIMS if self.shims else ():
-            one = self.shims[name].env
+        for one in (shim.env for (owner, _), shim in self.shims.items() if owner == whose):
             preload = ":".join(filter(None, (env.get("LD_PRELOAD"), one["LD_PRELOAD"])))
             env |= one | {"LD_PRELOAD": preload}
         return env
@@ -259,13 +280,37 @@ class World:
     def _tap(self, datagram: bytes, lost: bool) -> None:
         self.run.watch(datagram, lost)
 
-    def disturb(self, step: object, name: str, number: int) -> None:
-        """A step sets a shim's number, 0 no more; times of several steps add up."""
-        numbers = self._shimmed.setdefault(name, {})
+    def disturb(self, step: object, whose: str, name: str, number: int) -> None:
+        """A step sets a shim's number, 0 no more; times of several steps add up.
+
+        Of several faults at once it is the first that still is one.
+        """
+        numbers = self._shimmed.setdefault((whose, name), {})
         numbers[id(step)] = number
-        if name in self.shims:
-            together = max if name == "encoder_fault" else sum
-            self.shims[name].set(together(numbers.values()))
+        if shim := self.shims.get((whose, name)):
+            faults = [one for one in numbers.values() if one]
+            shim.set(sum(faults) if name == "stepped_clock" else (faults or [0])[0])
+
+    def client(self, certificates: Path) -> Session:
+        """A session of a second program with some machine's certificate, linked with the station.
+
+        With the station's own it is as `blimp command`'s: its words are handed on to the payloads.
+        """
+        at = [self.service.endpoint]
+        return open_session(connect=at, certificates=certificates, client_timeout_s=_TIMEOUT_S)
+
+    def command(self, name: str) -> None:
+        """Has the payload do something, if it is there."""
+        with contextlib.suppress(TelemetryError):
+            session = self.client(self.service.certificates)
+            try:
+                ask(session, NAME, name)
+            finally:
+                session.close()
+
+    def befell(self, whose: str) -> int:
+        """How often a disk has failed so far, the payload's card or the ground's."""
+        return self.shims[whose, "file_fault"].befell if self.shims else 0
 
     def heard_up_to_s(self) -> float:
         """The payload's uptime in the newest of its health that the ground has; 0 without."""
@@ -304,12 +349,13 @@ class World:
             self.service.start()
             self._listen()
 
-    def pids(self) -> list[int]:
-        """All processes that fly or serve now."""
-        served = [] if self.service.process.poll() is not None else [self.service.process.pid]
-        if served:
-            served += [one.pid for one in self.service.processes().values()]
-        return [*served, self.run.process.pid]
+    def pids(self) -> dict[str, int]:
+        """All processes that fly or serve now, by their names."""
+        pids = {"payload": self.run.process.pid}
+        if self.service.process.poll() is None:
+            pids["station"] = self.service.process.pid
+            pids |= {name: one.pid for name, one in self.service.processes().items()}
+        return pids
 
     def child(self, name: str) -> Process | None:
         """A process of the service now: by its name, `localizer` for the payload's, `station`."""
@@ -389,6 +435,14 @@ def combined(impairments: list[Impairment]) -> Impairment:
             reorder_by=max(result.reorder_by, one.reorder_by),
         )
     return result
+
+
+def peak_MB(pid: int) -> float:
+    """The most memory that a process was resident with (proc(5), VmHWM); 0 when it has gone."""
+    with contextlib.suppress(OSError):
+        found = _PEAK.search(Path(f"/proc/{pid}/status").read_text())
+        return 1.024e-3 * int(found[1]) if found else 0.0
+    return 0.0
 
 
 def tick(world: World) -> None:
