@@ -162,13 +162,15 @@ class Client:
     def until(
         self, condition: Callable[[], bool], what: str, again: Callable[[], object] | None = None
     ) -> None:
-        """Receives until something holds; does something `again` meanwhile."""
+        """Receives until something holds; does something `again` whenever nothing more waits.
+
+        Sooner, what is asked for could be dropped from a queue that only grows.
+        """
         deadline_s = time.monotonic() + LIMIT_S
         while not condition():
             assert time.monotonic() < deadline_s, f"{what} did not come"
-            if again is not None:
+            if not self.receive(0.1) and again is not None:
                 again()
-            self.receive(0.1)
 
     def first(self, topic: str, again: Callable[[], object] | None = None) -> tuple[int, Any]:
         """The first message on a topic: its log time, ns, and what it says."""
