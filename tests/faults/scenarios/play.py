@@ -105,16 +105,18 @@ def _befall(world: World, scenario: Scenario, verdict: Verdict) -> None:
         [(step.at_s, 0, n) for n, step in enumerate(scenario.steps)]
         + [(step.until_s, 1, n) for n, step in enumerate(scenario.steps)]
     )
-    begun: set[int] = set()
+    begun_s: dict[int, float] = {}
     left, shown = _frames(world)
     for due_s, ends, number in happenings:
         step = scenario.steps[number]
-        while time.monotonic() < began_s + due_s:
+        # One that was late, because another's end took long, still lasts as long as it should.
+        least_s = begun_s.get(number, 0.0) + step.for_s if ends else 0.0
+        while time.monotonic() < max(began_s + due_s, least_s):
             tick(world)
-        if ends and number in begun:
+        if ends and number in begun_s:
             _end(world, step, alone=scenario.alone(step))
         else:
-            begun.add(number)
+            begun_s[number] = time.monotonic()
             verdict.injected.append(str(step))
             _do(world, str(step), step.inject)
     mended_s = time.monotonic()
