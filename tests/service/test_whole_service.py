@@ -183,7 +183,7 @@ def refuses_a_port_in_use(service: Service) -> None:
             "http.port=0",
             "foxglove.port=0",
             f"video.port={free_udp_port()}",
-            'telemetry.listen=["tls/127.0.0.1:0"]',
+            'telemetry.listen=["tcp/127.0.0.1:0"]',
             setting,
         ]
         command = list(service.command)
