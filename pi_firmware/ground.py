@@ -14,7 +14,8 @@ from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.messages import LinkReport
 
 _SILENT_S = 5.0
-_IDR_GAP_S = 0.1  # an IDR is a few frames' size: no ground station gets more than ten a second
+IDR_GAP_S = 0.04
+"""An IDR is a few frames' size: no ground station has every frame of 30 a second made one."""
 _LOWEST_PORT, _HIGHEST_PORT = 1, 65_535
 
 
@@ -77,7 +78,7 @@ class Ground:
             if report.ssrc != self._ssrc:
                 return
             if report.wants_idr:
-                wanted = now_s - self._idr_s >= _IDR_GAP_S
+                wanted = now_s - self._idr_s >= IDR_GAP_S
                 self._idr_s = now_s if wanted else self._idr_s
             self._seen = Seen(report.ground, report.lost, report.round_trip_s, now_s)
         if report.wants_idr:  # of an IDR, and not of the link

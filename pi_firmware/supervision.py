@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pi_firmware.autopilot import Autopilot
 from pi_firmware.capture import Capture
-from pi_firmware.ground import Ground
+from pi_firmware.ground import IDR_GAP_S, Ground
 from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi, memory
 from pi_firmware.recording import Recorder
 from pi_firmware.release import Release, of_environment
@@ -174,6 +174,7 @@ class Supervision:
             release=self.release.how,
             release_reason=self.release.reason,
             early_reports=True,
+            idr_gap_s=IDR_GAP_S,
             rtx_ssrc=ground.link.rtx_ssrc,
             correction_ssrc=ground.link.correction_ssrc,
             **asdict(self._board.read()),

@@ -85,6 +85,11 @@ class Assembly:
         self._first_arrival_ns: int | None = None
 
     @property
+    def holds(self) -> bool:
+        """Whether packets wait for what is missing before them."""
+        return self._reorderer.holds
+
+    @property
     def problem(self) -> str | None:
         """Why the stream cannot be shown, in words; None while it can."""
         if self._first_arrival_ns is None or self._decoder.saw_parameter_sets:
@@ -127,6 +132,7 @@ class Assembly:
     def _assemble(self, packet: rtp.Packet, missing: int) -> Iterator[ReceivedFrame]:
         for unit in self._depacketizer.push(packet, missing):
             self._counters.access_units += 1
+            unit = self._decoder.with_sets(unit)
             picture = self._decoder.decode(unit)
             if picture is None:
                 continue

@@ -19,6 +19,7 @@ class Counters:
     Every access unit of which anything arrived is one of `decoded` (as it was sent), `damaged` (in
     parts, which are known), `withheld` (nothing of it can be shown before the next IDR), `failed`
     (the decoder refused it) or `unstamped` (without capture time).
+    `idrs` are those of them that were an IDR, as far as what came tells.
     `overrun` packets were thrown away unread because those before them took too long to decode;
     they come to be lost.
     """
@@ -37,6 +38,7 @@ class Counters:
     replayed: int = 0
     malformed: int = 0
     access_units: int = 0
+    idrs: int = 0
     decoded: int = 0
     damaged: int = 0
     withheld: int = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import av
 import numpy as np
@@ -13,9 +13,11 @@ from ground_station.arrays import Bools
 from ground_station.recording.h264 import grey
 from ground_station.stream import damage
 from ground_station.stream.counters import Counters
-from ground_station.stream.rtp import AccessUnit
+from ground_station.stream.rtp import MAX_JUMP, AccessUnit
 from ground_station.stream.slices import ParameterSets, SliceHeader, parameter_sets, slice_header
 from pi_firmware.wire import annexb, sei
+
+_OF_IDR = {annexb.NAL_SPS, annexb.NAL_PPS, annexb.NAL_IDR}
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,21 @@ class Decoder:
         self._damaged: deque[Bools] | None = None
         """Cells of the last pictures, of as many as one may be predicted from; None: none are."""
 
+    def with_sets(self, unit: AccessUnit) -> AccessUnit:
+        """The unit; with the parameter sets that are known where it is an IDR that lost its own.
+
+        A payload's sets stay for as long as its stream: those of another begin far off.
+        """
+        if unit.complete or self._sets is None or unit.missing_before >= MAX_JUMP:
+            return unit
+        here = [*annexb.nal_units(unit.data)]
+        sets = [nal for nal in here if annexb.nal_type(nal) in (annexb.NAL_SPS, annexb.NAL_PPS)]
+        known = self._sets.units
+        if len(sets) > 1 or not annexb.is_idr(unit.data) or not set(sets) <= set(known):
+            return unit
+        nals = (*known, *(nal for nal in here if nal not in sets))
+        return replace(unit, data=b"".join(annexb.START_CODE + nal for nal in nals))
+
     def decode(self, unit: AccessUnit) -> Picture | None:
         """The picture; None when withheld."""
         missing = self._missing(unit)
@@ -75,6 +92,7 @@ class Decoder:
         """Which rows of its macroblocks are missing, None: none; settles whether it is trusted."""
         before, self._last = self._last, unit.data
         types = annexb.nal_types(unit.data)
+        self._counters.idrs += not _OF_IDR.isdisjoint(types)
         if annexb.NAL_SPS in types and annexb.NAL_PPS in types:
             sets, self.saw_parameter_sets = parameter_sets(unit.data), True
             if sets != self._sets:

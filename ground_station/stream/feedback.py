@@ -20,8 +20,12 @@ from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import keys, messages
 
 PERIOD_S = 1.0
-_LOOK_S = 0.01
+_LOOK_S = 0.004
+"""A frame of 30 Hz has 33 ms: what is lost in one is to be asked for before the next is encoded."""
 _IDR_GAP_S = 0.1
+"""What an older payload leaves between two IDRs, and how long one is awaited."""
+_JITTER_S = 0.01
+"""A wish that comes to a payload by so much sooner than it left after the one before is heard."""
 WINDOW_S = 2.0
 EARLY_S = 0.2
 _EARLY_LOOK_S = 0.04
@@ -200,6 +204,15 @@ def _tally(counters: Counters, frames: int) -> Tally:
     return Tally(in_time, counters.packets_lost, frames, mended, corrected, again)
 
 
+@dataclass
+class _Short:
+    """Frames of a payload that an IDR was asked for, IDRs that had come by then, and when."""
+
+    frames: int
+    idrs: int
+    asked_s: float = float("-inf")
+
+
 class Feedback:
     """Publishes a `messages.LinkReport` a second to each living payload; a context manager.
 
@@ -218,7 +231,7 @@ class Feedback:
         self._video_of = video_of
         self._period_s = period_s
         self._accounts: dict[str, StreamAccount] = {}
-        self._withheld: dict[str, tuple[int, float]] = {}
+        self._short: dict[str, _Short] = {}
         self._urgencies: dict[str, Urgency] = {}
         self._publishers: dict[str, Any] = {}
         self._closing = threading.Event()
@@ -270,17 +283,23 @@ class Feedback:
     def _wants_idr(self, payload_id: str, video: Video, now_s: float) -> bool:
         """Whether frames came since the last look that only an IDR lets be shown again.
 
-        Whole again, that is. Those that wait for what was asked for again are not among them.
+        Whole again, that is. Those that wait for what was asked for again are not among them. The
+        next wish waits until the IDR of the one before has come, or must have been lost.
         """
         counters = video.counters
-        withheld = counters.withheld + counters.damaged
-        before, asked_s = self._withheld.get(payload_id, (withheld, float("-inf")))
-        wanted = withheld > before and now_s - asked_s >= _IDR_GAP_S
-        if wanted or withheld < before:
-            self._withheld[payload_id] = (withheld, now_s if wanted else asked_s)
-        elif payload_id not in self._withheld:
-            self._withheld[payload_id] = (withheld, asked_s)
-        return wanted
+        frames = counters.withheld + counters.damaged
+        short = self._short.setdefault(payload_id, _Short(frames, counters.idrs))
+        if frames < short.frames:  # another receiver
+            short.frames, short.idrs = frames, counters.idrs
+        gap_s = _IDR_GAP_S
+        if counters.idrs > short.idrs:
+            state = self._listener.state(payload_id)
+            if state is not None and state.health is not None:
+                gap_s = min(gap_s, state.health.idr_gap_s)
+        if frames == short.frames or now_s - short.asked_s < gap_s + _JITTER_S:
+            return False
+        self._short[payload_id] = _Short(frames, counters.idrs, now_s)
+        return True
 
     def _report(self, payload_id: str, video: Video) -> messages.LinkReport:
         state = self._listener.state(payload_id)

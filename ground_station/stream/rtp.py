@@ -115,6 +115,11 @@ class Reorderer:
         """When the newest correction came."""
         self._jumped: Packet | None = None
 
+    @property
+    def holds(self) -> bool:
+        """Whether packets wait for what is missing before them."""
+        return bool(self._held)
+
     def push(self, packet: Packet) -> Iterator[tuple[Packet, int]]:
         """Packets that can go on, each with how many before it are missing."""
         if packet.again:

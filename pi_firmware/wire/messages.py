@@ -204,6 +204,7 @@ class Health(Message):
     release: str = ""  # how it came: factory, update, fell back; empty: it runs on no card
     release_reason: str = ""  # why an update did not stay
     early_reports: bool = False  # it takes link reports between those of each second
+    idr_gap_s: float = 0.1  # a wish for an IDR sooner than this after another is not heard
     rtx_ssrc: int | None = None  # what is asked for again comes with it; None: nothing does
     correction_ssrc: int | None = None  # forward correction comes with it; None: none ever does
 

@@ -118,7 +118,8 @@ def test_a_ground_that_cannot_show_frames_gets_an_idr_but_not_a_flood_of_them() 
     for _ in range(100):
         following.report(wants_idr=True, lost=0.5)
         following.now_s += 0.01
-    assert following.capture.idrs == 10
+    assert 10 < following.capture.idrs <= 25  # no second frame in a row
+    asked = following.capture.idrs
     assert following.capture.reports == []  # the bit rate follows the report of each second
     following.report(ssrc=SSRC + 1, wants_idr=True)
-    assert following.capture.idrs == 10
+    assert following.capture.idrs == asked

@@ -163,6 +163,27 @@ def test_two_idrs_in_a_row_of_which_one_is_lost_are_told_from_none() -> None:
     assert [frame.sequence for frame in frames] == [0, *range(16, FRAMES + 1)]
 
 
+@pytest.mark.parametrize("lost", [(0,), (1,), (0, 1), (0, 1, 2)])
+def test_parameter_sets_that_are_known_need_not_come_again(lost: tuple[int, ...]) -> None:
+    sent = units()
+    hit = in_frame(sent, 15)
+    frames, counters = received(packets(sent), [hit[n] for n in lost])
+    assert [frame.sequence for frame in frames] == list(range(FRAMES))
+    assert counters.decoded == FRAMES and counters.idrs == 3
+    truth = pictures(sent)
+    assert all(is_true(frame, truth[frame.sequence]) for frame in frames)
+    # A recording may begin with it.
+    assert len(pictures([frames[15].access_unit])) == 1
+
+
+def test_other_parameter_sets_are_not_replaced_by_known_ones() -> None:
+    sent = [*units()[:15], *units(more=VARIETY)[15:]]
+    hit = in_frame(sent, 15)
+    frames, counters = received(packets(sent), [hit[1]])
+    assert [frame.sequence for frame in frames] == [*range(15), *range(30, FRAMES)]
+    assert counters.withheld == 15
+
+
 def test_an_idr_that_is_cut_shows_what_of_it_came() -> None:
     sent = units()
     frames, _ = received(packets(sent), [in_frame(sent, 5)[1], in_frame(sent, 15)[-1]])

@@ -290,6 +290,25 @@ def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryL
     ear.close()
 
 
+@pytest.mark.parametrize(("gap_s", "asked"), [(0.1, [1, 7]), (0.0, [1, 2, 3, 4, 6, 7, 8, 9, 10])])
+def test_once_an_idr_has_come_the_next_is_asked_for_as_soon_as_its_payload_takes_it(
+    listener: TelemetryListener, gap_s: float, asked: list[int]
+) -> None:
+    ear = Ear(listener, "one")
+    ear.telemetry.publish(messages.Health(1, 1.0, idr_gap_s=gap_s))
+    assert listener.wait("one", lambda state: state.health is not None, LIMIT_S)
+    video = Video(ssrc=5, counters=Counters(packets=10))
+    feedback = Feedback(listener, lambda _: video, period_s=1000.0)
+    feedback.close()  # the clock is ours
+    wishes = []
+    for step in range(11):  # a frame is lost each 20 ms; the fourth IDR comes a step late
+        video.counters = Counters(packets=20, withheld=1 + step, idrs=step - (step > 4))
+        if feedback._wants_idr("one", video, 10 + 0.02 * step):
+            wishes.append(step)
+    assert wishes == asked
+    ear.close()
+
+
 def test_an_idr_is_asked_for_when_mending_failed_and_not_before(
     listener: TelemetryListener,
 ) -> None:
