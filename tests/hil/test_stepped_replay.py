@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomli_w
+from links.proxy import ProxyLink
 
 from ground_station.localization.settings import preset_file
 from ground_station.map import store
+from ground_station.replay.cases.case import Link
 from ground_station.replay.replay import ReplayResult, replay, settings_for
+from ground_station.replay.rig import LOOPBACK, Rig
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 FLOWN_S = 3.0
 
 
-def stepped(*payload: str, preset: str = "default") -> ReplayResult:
+def stepped(*payload: str, preset: str = "default", rig: Rig = LOOPBACK) -> ReplayResult:
     """The sample flight's first seconds."""
     how = settings_for(
         preset, SAMPLE / "flight.mcap", duration_s=FLOWN_S, stepped=True, payload=payload
     )
-    return replay(store.load(SAMPLE), how)
+    return replay(store.load(SAMPLE), how, rig)
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +67,13 @@ def test_the_payloads_settings_are_the_firmwares_own(once: ReplayResult) -> None
     """Half the bit rate: other pictures, so other poses of the same frames."""
     other = stepped("encoder.bitrate_kbps=1000")
     assert len(poses(other)) == len(poses(once)) and poses(other) != poses(once)
+
+
+def test_frames_that_never_come_hold_nothing_up() -> None:
+    """More of them in a row than may be on their way: no pose comes back for any."""
+    link = ProxyLink(Link(kind="proxy", seed=1, loss=0.3))
+    unmended = "link.history_s=0", "link.correction=0"
+    flown = stepped(*unmended, rig=replace(LOOPBACK, link=link)).live
+    accounts = flown.accounts()
+    assert flown.complete and accounts["captured"] == accounts["sent"] == round(30 * FLOWN_S)
+    assert accounts["received"] < accounts["sent"] / 2

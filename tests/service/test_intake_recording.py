@@ -35,7 +35,7 @@ from ground_station.geometry.camera import Camera, load_camera
 from ground_station.recording.flight import trajectory_of
 from ground_station.recording.open import open_input
 from ground_station.service import bus_messages
-from ground_station.service.bus_messages import EstimateMessage, EventMessage
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, PayloadMessage
 from ground_station.service.intake import files as files_module
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
@@ -157,11 +157,16 @@ def test_damaged_frames_are_told_and_their_video_is_left_out(tmp_path: Path) -> 
         hit = 5 <= k < GOP
         made.frame("blimp-1", replace(frame(k), damaged=part if hit else None), log_ns(k))
         made.estimate("blimp-1", estimate(k, damaged=0.25 if hit else 0.0))
+    for damaged, withheld in ((3, 1), (13, 4), (1, 1), (4, 2)):  # the third: a session begins
+        counts = {"damaged": damaged, "withheld": withheld, "received": 100}
+        made.note("payload", "blimp-1", PayloadMessage(True, 1, frames=counts))
     made.close()
     (path,) = recorded(tmp_path)
     whole = [*range(5), *range(GOP, GOP + 5)]
     assert sequences(path) == whole
     assert [number_in(f.image) for f in open_input(path)] == whole
+    (listed,) = Recordings(tmp_path, lambda: "").list()
+    assert listed["lacks"] == {"damaged": 14, "withheld": 5, "lost": 0}
     told = [state["damaged"] for _, state in RecordingReader(path).json("/estimate/state")]
     assert told == [0.25 if 5 <= k < GOP else 0.0 for k in range(GOP + 5)]
 
@@ -333,7 +338,10 @@ def test_sigterm_ends_the_recording_in_order(tmp_path: Path) -> None:
         reader = RecordingReader(path)
         counts = reader.topics()
         assert not reader.cut and counts[VIDEO_TOPIC] == ended["sent"]
-        assert reader.metadata["recording_end"] == {"frames": str(ended["sent"]), "left_out": "0"}
+        assert reader.metadata["recording_end"] == {
+            "frames": str(ended["sent"]), "left_out": "0",
+            "damaged": "0", "withheld": "0", "lost": "0",
+        }  # fmt: skip
         for kind in (keys.BATTERY, keys.HEALTH, keys.GATE, keys.EVENT):
             assert counts[f"/blimp/blimp-1/{kind}"]
         # The first ones may be said before anyone is connected: a gate's message waits for nobody.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -27,6 +28,8 @@ from pi_firmware.wire.recording import CALIBRATION_TOPIC, ESTIMATE_TOPIC
 
 ESTIMATE_STATE_TOPIC = "/estimate/state"
 """JSON: the whole estimate but for the pixels of its points."""
+LACKS = ("damaged", "withheld", "lost")
+"""Frames that were sent and are in no recording, by why; in the table `recording_end`."""
 STATION_TOPIC = "/station"
 """Before what the service says: /station/event, /station/blimp-1/payload."""
 MAP_TABLE = "map "
@@ -46,6 +49,8 @@ class Said:
     schema: str
     log_ns: int
     text: bytes
+    account: tuple[str, dict[str, int]] | None = None
+    """Of a payload: its frames by fate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +92,8 @@ class GroundRun(run.Run):
         self._turned_s = time.monotonic()
         self._due_s: float | None = None
         self._maps: dict[str, str] = {}
+        self._told_before: dict[str, dict[str, int]] = {}
+        self._lacking: Counter[str] = Counter()
         if camera is not None:
             self._head[CAMERA_TABLE] = {"readout_s": repr(camera.readout_s)}
 
@@ -108,6 +115,8 @@ class GroundRun(run.Run):
             elif self._current.size_bytes > self._folder.file_limit_bytes + run.OVERRUN_BYTES:
                 return
         if isinstance(item, Said):
+            if item.account is not None:
+                self._count(*item.account)
             self._say(item.topic, item.schema, item.log_ns, item.text)
         elif isinstance(item, Estimated):
             # Numbers that are none are a localizer's error, and no reason to end a recording.
@@ -141,6 +150,19 @@ class GroundRun(run.Run):
             self._left_out += 1
             return
         stream.file.unit(unit.info, unit.data, idr=idr, prefix=stream.prefix, log_ns=log_ns)
+
+    def _count(self, payload_id: str, told: dict[str, int]) -> None:
+        """A payload's counts begin again with its session; its first are of before the file."""
+        before = self._told_before.get(payload_id, told)
+        self._told_before[payload_id] = told
+        for fate in LACKS:
+            now, then = told.get(fate, 0), before.get(fate, 0)
+            self._lacking[fate] += now - then if now >= then else now
+
+    def _lacks(self) -> dict[str, str]:
+        told = {fate: str(self._lacking[fate]) for fate in LACKS}
+        self._lacking.clear()
+        return told
 
     def _begin(self, payload_id: str) -> _Stream:
         """A payload's first frame: its topics, told in this file and all that follow."""

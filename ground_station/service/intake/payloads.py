@@ -52,7 +52,7 @@ class Payload:
         self._lock = threading.Lock()  # two streams overlap for a moment when it restarts
         self._frame_s = float("-inf")
         self._first: tuple[int, int, int] | None = None
-        self._last_sequence = -1
+        self.last_sequence = -1
         self._base = Counters()
         """Of the stream, before the payload's newest session: one may keep its SSRC."""
         self._before: int | None = None
@@ -80,7 +80,7 @@ class Payload:
                 self._base = dataclasses.replace(counters, **before)
                 self._first = (frame.ssrc, frame.sequence, 1)
                 self._before, self._dropped, self._shown = None, 0, 0
-            self._last_sequence = frame.sequence
+            self.last_sequence = frame.sequence
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
         self._recorder.frame(self.id, frame, log_ns)
@@ -93,7 +93,7 @@ class Payload:
         """
         silent = self._frame_s - before_s > _RESTART_S
         said = silent and before_s < self.started_s <= self._frame_s
-        return said or frame.sequence <= self._last_sequence
+        return said or frame.sequence <= self.last_sequence
 
     def _show(self, frame: ReceivedFrame, capture_ns: int | None) -> None:
         if self._pictures is None:

@@ -55,6 +55,10 @@ class PoseFeed:
         with contextlib.suppress(zenoh.ZError):
             self._publishers[payload_id].put(messages.encode(message))
 
+    def newest(self, payload_id: str) -> messages.Pose | None:
+        """What a payload was told last."""
+        return self._newest.get(payload_id)
+
     def again(self) -> None:
         """Sends each payload its newest once more: one that waits for it may not have had it."""
         for payload_id, message in list(self._newest.items()):

@@ -32,6 +32,7 @@ from pi_firmware.wire.errors import TelemetryError
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
 _IDR_S = 1.0
+_LOST_S = 0.5
 _NAME_LENGTH, _TEXT_LENGTH = 64, 500
 _TOLD = 256
 _EARLY, _EARLY_S = 64, 3.0
@@ -83,6 +84,7 @@ class Intake:
         self._announced = Announced()
         self._roster = Roster(settings.payloads, self._announced, self._make)
         self._told: dict[str, str] = {}
+        self._stands: dict[str, tuple[float, int]] = {}
         self._early: deque[tuple[float, str, messages.Event]] = deque(maxlen=_EARLY)
         self._due_s = {"payloads": 0.0, "recording": 0.0}
         self._stack = contextlib.ExitStack()
@@ -149,9 +151,11 @@ class Intake:
         """
         if self.video.failure:
             raise IntakeError(self.video.failure)
+        now_s = time.monotonic()
         if self._stepped:
             self._feed.again()
-        now_s = time.monotonic()
+            for payload in self._roster.all():
+                self._answer_lost(payload, now_s)
         if now_s >= self._due_s["payloads"]:
             self._due_s["payloads"] = now_s + _PAYLOADS_S
             self._follow()
@@ -240,6 +244,21 @@ class Intake:
                 self._pass_on(payload_id, event)
             elif time.monotonic() - at_s < _EARLY_S:
                 self._early.append((at_s, payload_id, event))
+
+    def _answer_lost(self, payload: Payload, now_s: float) -> None:
+        """Where all that came of one that waits is answered and no more comes, that is lost."""
+        state, told = self._listener.state(payload.id), self._feed.newest(payload.id)
+        if state is None or state.gate is None:
+            return
+        answered, newest = told.sequence if told is not None else -1, state.gate.sequence
+        if self._stands.get(payload.id, (0.0, -1))[1] != newest:
+            self._stands[payload.id] = now_s, newest
+        elif (
+            payload.last_sequence <= answered < newest
+            and now_s - self._stands[payload.id][0] > _LOST_S
+        ):
+            pose = messages.Pose(time.time_ns(), state.gate.capture_ns, newest, "LOST")
+            self._feed.send(payload.id, pose)
 
     def _follow(self) -> None:
         """Looks after each payload, and says how it is."""

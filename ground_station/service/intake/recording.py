@@ -12,7 +12,13 @@ from pathlib import Path
 
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
-from ground_station.service.bus_messages import EstimateMessage, Level, Message, RecordingMessage
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    Level,
+    Message,
+    PayloadMessage,
+    RecordingMessage,
+)
 from ground_station.service.intake.files import STATION_TOPIC, Estimated, GroundRun, Said
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
@@ -118,7 +124,8 @@ class GroundRecorder(Recorder):
             place = "" if payload_id == bus_messages.STATION else f"/{payload_id}"
             topic = f"{STATION_TOPIC}{place}/{kind}"
             text = bus_messages.encode(note)
-            said = Said(topic, f"blimp.station.{kind}", time.time_ns(), text)
+            account = (payload_id, note.frames) if isinstance(note, PayloadMessage) else None
+            said = Said(topic, f"blimp.station.{kind}", time.time_ns(), text, account)
             active.queue.put(said, len(text))
 
     def state(self) -> RecordingMessage:

@@ -261,4 +261,5 @@ class RecordingModel(BaseModel):
     started_ns: int | None
     duration_s: float | None
     maps: list[str]
+    lacks: dict[str, int] | None = None
     active: bool

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
 import stat
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
+from mcap.records import MetadataIndex
 from starlette.exceptions import HTTPException
 
 from ground_station.errors import GroundStationError
-from ground_station.service.intake.files import MAP_TABLE
+from ground_station.service.intake.files import LACKS, MAP_TABLE
 from ground_station.service.web.models import FILE_PATTERN, AnswerModel, FileName, RecordingModel
 from ground_station.service.web.problems import Busy, NotFound, problems
 from pi_firmware.wire.errors import BlimpError
@@ -26,6 +28,8 @@ _FILES = 500
 _PIECE_BYTES = 256 * 1024
 _NAME = re.compile(FILE_PATTERN)
 _MAPS_SHOWN = 8
+_RECORD_HEAD_BYTES, _TABLE_BYTES = 9, 4096
+_MOST = 10**9
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
@@ -35,6 +39,8 @@ class _Told(NamedTuple):
     started_ns: int | None = None
     duration_s: float | None = None
     maps: Sequence[str] = ()
+    lacks: Mapping[str, int] | None = None
+    """Frames that were sent and are not in it, by why; None where it does not say."""
 
 
 class Recordings:
@@ -164,7 +170,23 @@ def _summed_up(path: Path) -> _Told:
     tables = sorted({index.name for index in summary.metadata_indexes})
     maps = [name.removeprefix(MAP_TABLE)[:128] for name in tables if name.startswith(MAP_TABLE)]
     duration_s = round(1e-9 * (figures.message_end_time - started_ns), 3)
-    return _Told(started_ns, duration_s, maps[:_MAPS_SHOWN])
+    return _Told(started_ns, duration_s, maps[:_MAPS_SHOWN], _lacks(path, summary.metadata_indexes))
+
+
+def _lacks(path: Path, tables: Sequence[MetadataIndex]) -> dict[str, int] | None:
+    """What a recording's end says; its table alone is read, whatever size the file has."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Metadata
+
+    for table in tables:
+        if table.name != "recording_end" or table.length > _TABLE_BYTES:
+            continue
+        # A stranger's table may be anything; one from before it said this lacks the keys.
+        with contextlib.suppress(Exception), path.open("rb") as file:
+            file.seek(table.offset + _RECORD_HEAD_BYTES)
+            said = Metadata.read(ReadDataStream(io.BytesIO(file.read(table.length)))).metadata
+            return {fate: min(max(0, int(said[fate])), _MOST) for fate in LACKS}
+    return None
 
 
 def _portion(header: str | None, size: int) -> tuple[int, int] | None:

@@ -127,6 +127,10 @@ class Run(ABC):
         """What a file's name says behind its number; nothing where the clock may be wrong."""
         return ""
 
+    def _lacks(self) -> Mapping[str, str]:
+        """What else an ending file says of the frames that it has not, by why."""
+        return {}
+
     def _before_end(self) -> None:  # noqa: B027  # what a file needs at its end, if anything
         """All of the queue is written; what else there is goes into the file now."""
 
@@ -226,7 +230,7 @@ class Run(ABC):
     def _end_file(self, file: RecordingFile, reason: str) -> None:
         with contextlib.suppress(RecordingError):  # its index may lie in what is to be left free
             self._folder.make_room(file.size_bytes, 0)
-        end = {"frames": str(file.frames), "left_out": str(self.left_out)}
+        end = {"frames": str(file.frames), "left_out": str(self.left_out), **self._lacks()}
         try:
             file.close({**end, "reason": reason} if reason else end)
         finally:

@@ -41,7 +41,9 @@ export class RecordingsDialog {
     const began_ms = (file.started_ns ?? file.modified_ns) / 1e6;
     const length = file.active ? "being written" : file.duration_s == null ? "cut, no index" : stopwatch(file.duration_s);
     const where = file.maps.join(", ") || (file.duration_s == null ? "" : "no map");
-    const facts = [where, length, size(file.size_MB)].filter(Boolean).join(" · ");
+    const lacks = Object.entries(file.lacks ?? {}).filter(([, count]) => count);
+    const without = lacks.length ? `without ${lacks.map(([why, count]) => `${count} ${why}`).join(", ")}` : "";
+    const facts = [where, length, size(file.size_MB), without].filter(Boolean).join(" · ");
     const [path, name] = [api.recordingPath(file.file), make("b", "", dateTime(began_ms))];
     name.title = file.file;
     const row = make("li", "", make("div", "", name, make("small", "", facts), make("small", "", file.file)));

@@ -111,6 +111,7 @@
  * @property {number|null} started_ns null where it was cut
  * @property {number|null} duration_s
  * @property {string[]} maps in which it was localized
+ * @property {Record<string, number>|null} lacks frames that were sent and are not in it, by why
  * @property {boolean} active
  *
  * @typedef {object} MapSummary
