@@ -37,9 +37,9 @@ def key(
     """A dataclass field that is one configuration key.
 
     `low` and `high` bound numbers (inclusive), `choices` lists the only values allowed. `doc` says
-    what it is where no shipped file does in a comment.
+    what it is, where no shipped file does, and in files that are made of the dataclass.
     """
-    meta = {"unit": unit, "low": low, "high": high, "choices": choices}
+    meta = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices}
     if isinstance(default, list | dict):
         return dataclasses.field(default_factory=lambda: type(default)(default), metadata=meta)
     return dataclasses.field(default=default, metadata=meta)
