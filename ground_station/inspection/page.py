@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +15,53 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
+from ground_station import presentation
 from ground_station.arrays import F64
 from ground_station.geometry import poses
-from ground_station.inspection import scripts, tables
+from ground_station.inspection import tables
 from ground_station.inspection.localizability import LocalizabilityMap
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.store import Map
 from ground_station.map.summary import describe, figures, sigma
 from ground_station.presentation.pages import data_uri, write_page
+
+# The views share their modules with the dashboard: the same orbit, gestures and shaders.
+
+_OWN = Path(__file__).parent / "web"
+_SHARED = Path(presentation.__file__).parent / "web" / "js"
+_IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:class|const|function) (\w+))", re.MULTILINE)
+
+
+def bundle(entry: str) -> str:
+    """The module `entry` after all that it imports, each in a scope of its own.
+
+    Understood is what these modules use: named imports on one line and named exports.
+    """
+    done: list[str] = []
+    parts = ['"use strict";']
+
+    def add(name: str) -> None:
+        if name in done:
+            return
+        path = next(p for p in (_OWN / f"{name}.js", _SHARED / f"{name}.js") if p.is_file())
+        text = path.read_text(encoding="utf-8")
+        for _, needed in _IMPORT.findall(text):
+            add(needed)
+        done.append(name)
+        exported = ", ".join(_EXPORT.findall(text))
+        text = _EXPORT.sub("", _IMPORT.sub(r"const {\1} = module_\2;", text))
+        parts.append(f"const module_{name} = (() => {{\n{text}\nreturn {{ {exported} }};\n}})();")
+
+    add(entry)
+    return "\n".join(parts)
+
+
+def policy(script: str) -> str:
+    """The Content-Security-Policy source that allows this one script."""
+    digest = hashlib.sha256(script.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
 
 MOST_POINTS, MOST_CAMERAS = 150_000, 4_000
 """Of more, one in so many is drawn: a browser's graphics memory, and the file's size."""
@@ -60,7 +101,7 @@ def write(path: str | Path, map_: Map, plan: FloorPlan | None, found: Localizabi
     }
     bounds = _bounds(map_, plan)
     scale = _scale(*bounds)
-    script = scripts.bundle("main")
+    script = bundle("main")
     write_page(
         path,
         _TEMPLATE,
@@ -68,7 +109,7 @@ def write(path: str | Path, map_: Map, plan: FloorPlan | None, found: Localizabi
         map=document,
         info=map_.info,
         script=Markup(script),
-        policy=scripts.policy(script),
+        policy=policy(script),
         figures=_figures(map_, plan, found, bounds, scale),
         arrays=_arrays(map_, found, step, scale),
         plan_picture=_picture(plan) if plan is not None else None,

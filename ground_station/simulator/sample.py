@@ -4,11 +4,92 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
+import yaml
+
+from ground_station.arrays import U8
+from ground_station.files import write_bytes
 from ground_station.progress import Progress
 from ground_station.simulator import scenes
-from ground_station.simulator.floorplan import write_floorplan
-from ground_station.simulator.scene import SimulatorError
+from ground_station.simulator.scene import Footprint, Scene, SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, simulate
+
+_RESOLUTION_M = 0.025
+_MARGIN_M = 0.75
+_FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+# What a wheel or an ankle meets is occupied; stairs and the balcony's edge are drawn as lines.
+_FILLED = ("wall", "pillar", "furniture", "glass")
+
+
+def draw_floorplan(scene: Scene) -> tuple[U8, tuple[float, float, float]]:
+    """The plan (H, W), 254 free, 0 occupied, 205 unknown, and the origin map_server wants.
+
+    Rows go down as y falls; the origin is the world pose (x, y, yaw) of the lower left corner of
+    the lower left pixel.
+    """
+    width, height = (
+        round((s + 2 * _MARGIN_M) / _RESOLUTION_M) for s in (scene.size_m[0], scene.size_m[1])
+    )
+    plan = np.full((height, width), _UNKNOWN, np.uint8)
+
+    def corner(x_m: float, y_m: float) -> tuple[int, int]:
+        column = round((x_m + _MARGIN_M) / _RESOLUTION_M)
+        return column, height - round((y_m + _MARGIN_M) / _RESOLUTION_M)
+
+    def fill(f: Footprint, value: int) -> None:
+        (left, bottom), (right, top) = corner(*f.bounds_m[:2]), corner(*f.bounds_m[2:])
+        if f.disc:
+            centre = ((left + right) // 2, (top + bottom) // 2)
+            cv2.circle(plan, centre, (right - left) // 2, value, -1)
+        else:
+            plan[max(0, top) : bottom, max(0, left) : right] = value
+
+    hall = Footprint((0.0, 0.0, scene.size_m[0], scene.size_m[1]), "floor")
+    fill(hall, _FREE)
+    for f in scene.footprints:
+        if f.kind in _FILLED:
+            fill(f, _OCCUPIED)
+        elif f.kind == "stairs":
+            (left, bottom), (right, top) = corner(*f.bounds_m[:2]), corner(*f.bounds_m[2:])
+            for y in np.linspace(top, bottom, 21).round().astype(int).tolist():
+                cv2.line(plan, (left, y), (right, y), _OCCUPIED, 1)
+            cv2.rectangle(plan, (left, top), (right, bottom), _OCCUPIED, 1)
+        elif f.kind == "balcony":  # its edge is overhead: dashed
+            (left, bottom), (right, _) = corner(*f.bounds_m[:2]), corner(*f.bounds_m[2:])
+            for x in range(left, right, 16):
+                cv2.line(plan, (x, bottom), (min(x + 7, right), bottom), _UNKNOWN, 2)
+    return plan, (-_MARGIN_M, -_MARGIN_M, 0.0)
+
+
+def write_floorplan(folder: str | Path, scene: Scene) -> list[Path]:
+    """Writes `floorplan.png` and `floorplan.yaml`, each beside and renamed; returns their paths."""
+    folder = Path(folder)
+    plan, origin = draw_floorplan(scene)
+    fine, png = cv2.imencode(".png", plan, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    if not fine:
+        raise SimulatorError(f"{folder}: the floor plan cannot be encoded as PNG")
+    document = {
+        "image": "floorplan.png",
+        "resolution": _RESOLUTION_M,
+        "origin": list(origin),
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    made = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in (
+            ("floorplan.png", png.tobytes()),
+            ("floorplan.yaml", yaml.safe_dump(document, sort_keys=False).encode()),
+        ):
+            write_bytes(folder / name, data)
+            made.append(folder / name)
+    except OSError as error:
+        raise SimulatorError(f"{folder}: {error.strerror or error}") from None
+    return made
+
 
 MAX_FILE_BYTES = 6_000_000
 _TEXELS_PER_M = 150.0

@@ -4,13 +4,144 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from pi_firmware.recording.flight import FlightRun, Telemetry
 from pi_firmware.settings import RecordingSettings
-from pi_firmware.wire import messages, sei
-from pi_firmware.wire.recorder import recorder
+from pi_firmware.wire import annexb, messages, sei
+from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.recorder import recorder, run
 from pi_firmware.wire.recorder.durable import DurableFile, OpenFile
+from pi_firmware.wire.recorder.file import RecordingFile
+from pi_firmware.wire.recorder.queue import Unit
+
+TELEMETRY_ROOT = "/blimp"
+_CLOCK_STEP_S = 5.0
+_HELD = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """A message of one kind, and when it came, by the monotonic clock."""
+
+    kind: str
+    message: messages.Message
+    arrived_s: float
+
+
+class FlightFile(RecordingFile):
+    """A file with telemetry beside the video."""
+
+    def message(self, kind: str, message: messages.Message, shift_ns: int) -> None:
+        """Adds a telemetry message, `shift_ns` after its own time.
+
+        Raises `TelemetryError` for what JSON cannot say.
+        """
+        text = messages.encode(message)
+        self.writer.write_json_text(
+            f"{TELEMETRY_ROOT}/{kind}",
+            message.time_ns + shift_ns,
+            text,
+            schema_name=message.SCHEMA,
+        )
+        self.added(len(text))
+
+
+class FlightRun(run.Run):
+    """Takes `Unit` and `Telemetry`; times rise within each of its files."""
+
+    file_type = FlightFile
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self._held: deque[Telemetry] = deque()
+        self._restart = False
+        self._last: Unit | None = None
+        self._shift_ns = 0
+
+    def _put(self, item: object) -> None:
+        if isinstance(item, Telemetry):
+            self._telemetry(item)
+        elif isinstance(item, Unit):
+            try:
+                self._unit(item)
+            except Exception:
+                self._left_out += 1
+                raise
+
+    def _unit(self, unit: Unit) -> None:
+        """Into the file of now, or as the first of the next one."""
+        if unit.info.time_ns not in run.TIMES_NS:
+            self._left_out += 1
+            return
+        idr = annexb.is_idr(unit.data)
+        self._restart = self._restart or self._clock_was_set(unit)
+        self._last = unit
+        self._shift_ns = unit.info.time_ns - unit.info.clock_ns
+        file, limit_bytes = self._current, self._folder.file_limit_bytes
+        if not idr:
+            if file.size_bytes > limit_bytes + run.OVERRUN_BYTES:
+                self._restart = True
+            if self._restart or file.size_bytes > limit_bytes:
+                self._ask_for_idr()
+            if self._restart or not file.begun:
+                self._left_out += file.begun  # nothing is missing before the first
+                return
+        elif file.begun and (self._restart or file.is_full(limit_bytes)):
+            self._end_earlier(file)
+            self._turn()
+            file = self._current
+            self._say_what_waited()
+        self._restart = self._restart and not idr
+        file.unit(unit.info, unit.data, idr=idr)
+
+    def _clock_was_set(self, unit: Unit) -> bool:
+        """A file's times rise: readers play it by them."""
+        if self._last is None:
+            return False
+        rises = unit.info.time_ns > self._last.info.time_ns
+        return not rises or self._is_of_another_clock(unit.info.time_ns, unit.arrived_s)
+
+    def _is_of_another_clock(self, time_ns: int, arrived_s: float) -> bool:
+        """Whether a time lies elsewhere than those of the frames."""
+        if self._last is None:
+            return False
+        expected_ns = self._last.info.time_ns + 1e9 * (arrived_s - self._last.arrived_s)
+        return abs(time_ns - expected_ns) > 1e9 * _CLOCK_STEP_S
+
+    def _telemetry(self, item: Telemetry) -> None:
+        """With the video's times, where a replay's are not the clock's.
+
+        What was said after the clock was set, before a frame tells of it, waits for the next file.
+        """
+        time_ns = item.message.time_ns + self._shift_ns
+        if self._is_of_another_clock(time_ns, item.arrived_s):
+            if len(self._held) == _HELD:
+                self._say_what_waited()
+            self._held.append(item)
+        elif self._current.size_bytes <= self._folder.file_limit_bytes + run.OVERRUN_BYTES:
+            self._say(item)
+
+    def _say(self, item: Telemetry) -> None:
+        if item.message.time_ns + self._shift_ns not in run.TIMES_NS:
+            return
+        file = self._current
+        assert isinstance(file, FlightFile)
+        try:
+            file.message(item.kind, item.message, self._shift_ns)
+        except RecordingError:
+            raise
+        except Exception:  # not JSON: its sender's error, and no reason to end a recording
+            return
+
+    def _before_end(self) -> None:
+        self._say_what_waited()
+
+    def _say_what_waited(self) -> None:
+        while self._held:
+            self._say(self._held.popleft())
 
 
 class Recorder(recorder.Recorder):

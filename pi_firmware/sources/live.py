@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
+import time
 from fractions import Fraction
 from typing import Any
 
-from pi_firmware import clocks, gstreamer
+from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Stamp
 from pi_firmware.sources.shutter import Mark, to_middle_ns
 from pi_firmware.sources.window import Window
 from pi_firmware.uri import Uri
 from pi_firmware.wire.errors import BlimpError
+
+_GOOD_NS = 100_000  # a tenth of the millisecond that capture times are good for
+_ATTEMPTS = 5
+
+
+def wall_at(pipeline: Any, running_ns: int) -> int:
+    """The wall clock, ns since 1970, when the pipeline's running time was `running_ns`.
+
+    The two clocks cannot be read at once, and the thread may be held between: of up to five tries
+    the one counts whose reading of the wall clock is framed most tightly. A wall clock that was set
+    again since shifts the result by as much: it is the wall clock of now that is meant.
+    """
+    clock = pipeline.get_clock()
+    best_ns, offset_ns = 1 << 62, 0
+    for _ in range(_ATTEMPTS):
+        before_ns = clock.get_time()
+        wall_ns = time.time_ns()
+        after_ns = clock.get_time()
+        if after_ns - before_ns < best_ns:
+            best_ns = after_ns - before_ns
+            offset_ns = wall_ns - (before_ns + after_ns) // 2
+        if best_ns < _GOOD_NS:
+            break
+    return int(pipeline.get_base_time() + running_ns + offset_ns)
 
 
 def caps(camera: CameraSettings, formats: str = "{I420,NV12}") -> str:
@@ -85,7 +110,7 @@ class LiveSource:
     def stamp(self, running_ns: int) -> Stamp:
         self._stamped += 1
         exposure_s, gain = self.told()
-        marked_ns = clocks.wall_at(self._pipeline, running_ns)
+        marked_ns = wall_at(self._pipeline, running_ns)
         captured_ns = marked_ns + to_middle_ns(self._mark, exposure_s, self._readout_s)
         return Stamp(captured_ns, captured_ns, exposure_s, gain)
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ground_station import cli
 from ground_station.bench.maps import study
-from ground_station.bench.maps.folds import is_silent_fold, judge, said
+from ground_station.bench.maps.study import is_silent_fold, judge, said
 from ground_station.geometry import poses
 
 NAMES = [f"frame-{k:06d}" for k in range(30)]

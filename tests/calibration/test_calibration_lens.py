@@ -9,8 +9,7 @@ from board_views import Waypoints, carried, pose_of
 from observed import BOARD, gathered, observed
 from scipy.spatial.transform import Rotation
 
-from ground_station.calibration.calibrate import Result, calibrate
-from ground_station.calibration.certainty import at_corners_px
+from ground_station.calibration.calibrate import Result, at_corners_px, calibrate
 from ground_station.calibration.detection import BoardFinder, BoardObservation
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.selection import CORNERS

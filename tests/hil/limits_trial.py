@@ -259,7 +259,7 @@ def serve(trial: Trial) -> Outcome:
 
 def main(path: str) -> int:
     """Reads the trial, flies it, says the result."""
-    from ground_station.replay.firmware import FirmwareError
+    from ground_station.replay.rig import FirmwareError
     from pi_firmware.wire.errors import BlimpError, StreamError
 
     # Whoever started this ends it so: everything that it began is ended as after a flight.

@@ -23,8 +23,8 @@ from limits_trial import SEAM_S, SETTLE_S, Outcome, Round, Trial, due, judge, ro
 
 from ground_station.errors import InputError
 from ground_station.localization.estimate import State
-from ground_station.replay.firmware import FirmwareError
 from ground_station.replay.live import LiveFrame
+from ground_station.replay.rig import FirmwareError
 from pi_firmware.wire.errors import StreamError
 
 ATRIUM = Path(__file__).parents[2] / "maps" / "atrium"

@@ -13,7 +13,7 @@ import pytest
 from rooms_map import two_rooms
 
 from ground_station.errors import GroundStationError
-from ground_station.inspection import page, scripts, view_command
+from ground_station.inspection import page, view_command
 from ground_station.inspection.localizability import localizability
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled
@@ -159,7 +159,7 @@ def test_names_are_text_and_the_policy_allows_one_script(pages):
     policy = next(pairs["content"] for _, pairs in found.tags if "http-equiv" in pairs)
     assert policy == (
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
-        f"script-src {scripts.policy(scripts.bundle('main'))}"
+        f"script-src {page.policy(page.bundle('main'))}"
     )
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
     assert "\u202e" not in text and "\x07" not in text

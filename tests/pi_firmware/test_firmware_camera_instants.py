@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pi_firmware import clocks, gstreamer, uri
+from pi_firmware import gstreamer, uri
 from pi_firmware.settings import CameraSettings
+from pi_firmware.sources import live
 from pi_firmware.sources.live import LiveSource
 from pi_firmware.sources.schemes import v4l2
 from pi_firmware.sources.shutter import Mark, to_middle_ns
@@ -51,7 +52,7 @@ def test_an_unknown_exposure_counts_as_none_and_a_global_shutter_has_no_readout(
 
 
 def test_a_live_sources_stamp_is_brought_to_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clocks, "wall_at", lambda *_: 10**18)
+    monkeypatch.setattr(live, "wall_at", lambda *_: 10**18)
     source = LiveSource(CameraSettings(), "", mark=Mark.READOUT_END, readout_s=0.016)
     stamp = source.stamp(0)
     assert stamp.time_ns == stamp.clock_ns == 10**18 - 8_000_000

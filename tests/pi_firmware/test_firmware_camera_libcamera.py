@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from receiving import Receiver
 
-from pi_firmware import clocks, gstreamer, uri
+from pi_firmware import gstreamer, uri
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources import open_source
+from pi_firmware.sources import live, open_source
 from pi_firmware.sources.schemes import libcamera
 from pi_firmware.sources.schemes.libcamera import LibcameraSource
 from pi_firmware.wire.errors import SourceError
@@ -77,7 +77,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def build(element: Element, text: str = "libcamera:", **settings: float) -> LibcameraSource:
         monkeypatch.setattr(gstreamer, "require", lambda *_: None)
-        monkeypatch.setattr(clocks, "wall_at", lambda *_: CAPTURED_NS)
+        monkeypatch.setattr(live, "wall_at", lambda *_: CAPTURED_NS)
         monkeypatch.setattr(libcamera, "post_error", lambda to, text: to.posted.append(text))
         camera = dataclasses.replace(CameraSettings(), **settings)
         source = LibcameraSource(uri.parse(text, "camera.uri"), camera)

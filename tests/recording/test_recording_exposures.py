@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from numbered_video import PERIOD_NS, START_NS
 
-from ground_station.recording.exposures import Exposures
+from ground_station.recording.flight import Exposures
 from ground_station.recording.frames import plausible_exposure_s
 from ground_station.recording.open import open_input, parse_range
 from pi_firmware.wire import annexb, sei

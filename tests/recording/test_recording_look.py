@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from ground_station.errors import CameraError
-from ground_station.recording import quicktime
+from ground_station.recording import look as quicktime
 from ground_station.recording.look import check_one_lens, look
 from ground_station.recording.open import open_input
 

@@ -32,9 +32,7 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
-from ground_station.service.foxglove.inbox import Inbox
-from ground_station.service.foxglove.log import RateLimitedHandler
-from ground_station.service.foxglove.process import PAYLOADS
+from ground_station.service.foxglove.process import PAYLOADS, Inbox, RateLimitedHandler
 from ground_station.service.foxglove.topics import json_topic
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from pi_firmware.wire import messages

@@ -33,7 +33,7 @@ from localizing_stand import (
 from ground_station.localization.localizer import Localizer
 from ground_station.recording.flight import FlightRecording, trajectory_of
 from ground_station.recording.frames import Frame, FrameRange
-from ground_station.replay.firmware import FirmwareProcess
+from ground_station.replay.rig import FirmwareProcess
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.localizing import maps

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from intake_stand import free_udp_port
 
-from ground_station.service import memory
+from ground_station.service.intake import process
 from ground_station.service.intake.process import Intake
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire.config import from_mapping
@@ -44,7 +44,7 @@ def test_the_intake_gives_back_what_a_payload_left_when_it_goes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[str] = []
-    monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
+    monkeypatch.setattr(process, "give_back", lambda: given.append("back"))
     said: list[str] = []
     document = {
         "video": {"port": free_udp_port()},

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ground_station.service.localizing.overload import WINDOW_S, Overload
+from ground_station.service.localizing.process import WINDOW_S, Overload
 
 
 @pytest.fixture

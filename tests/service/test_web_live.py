@@ -21,9 +21,9 @@ from viewing import connect, next_of, run
 from ground_station.service import bus_messages
 from ground_station.service.web import viewer as viewer_module
 from ground_station.service.web.app import build
-from ground_station.service.web.outbox import SLOTS, TEXTS, Outbox
 from ground_station.service.web.server import listen, server
 from ground_station.service.web.video import Video
+from ground_station.service.web.viewer import SLOTS, TEXTS, Outbox
 
 P = station.PAYLOAD
 

@@ -22,8 +22,8 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.trajectory import read_tum
 from ground_station.simulator import command, scenes
-from ground_station.simulator.floorplan import write_floorplan
 from ground_station.simulator.known_points import project_rolling
+from ground_station.simulator.sample import write_floorplan
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import prepare_flight, simulate, time_ns_of
 from pi_firmware.wire.recording import (

@@ -13,8 +13,7 @@ from ground_station.features.inference import Network
 from ground_station.training import corpus
 from ground_station.training.corpus import Corpus, CorpusSettings
 from ground_station.training.errors import TrainingError
-from ground_station.training.score_graph import scores_only
-from ground_station.training.teacher import Teacher, load
+from ground_station.training.teacher import Teacher, load, scores_only
 
 SIZE = {"rows": 128, "columns": 160}
 SETTINGS = CorpusSettings(

@@ -8,7 +8,7 @@ import pytest
 from ground_station.feature_models import images
 from ground_station.features import detection
 from ground_station.features.methods.rootsift import RootSift
-from ground_station.training import labels, pairs, validation, warps
+from ground_station.training import pairs, validation, warps
 from ground_station.training.corpus import Place
 
 PICTURE, VIEW = (192, 256), (96, 128)
@@ -75,7 +75,7 @@ def test_points_behind_the_horizon_are_nowhere():
 def test_cells_are_distributions_and_keep_a_points_fraction_of_a_pixel():
     points = np.array([[10.25, 20.5], [40.0, 7.9], [3.0, 3.0], [-5.0, 2.0]], np.float32)
     chances = np.array([1, 0.8, 0.4, 1], np.float32)
-    made = labels.soft_cells(points, chances, (48, 64))
+    made = pairs.soft_cells(points, chances, (48, 64))
     assert made.shape == (65, 6, 8) and made.min() >= 0
     assert made.sum(axis=0) == pytest.approx(np.ones((6, 8)))
     mass = made[:64].reshape(8, 8, 6, 8).transpose(2, 0, 3, 1).reshape(48, 64)
@@ -86,7 +86,7 @@ def test_cells_are_distributions_and_keep_a_points_fraction_of_a_pixel():
         assert (mass * near * x).sum() / chance == pytest.approx(point[0], abs=1e-4)
         assert (mass * near * y).sum() / chance == pytest.approx(point[1], abs=1e-4)
     assert mass.sum() == pytest.approx(2.2, abs=1e-4)
-    crowd = labels.soft_cells(
+    crowd = pairs.soft_cells(
         np.array([[2, 2], [5, 5], [2, 5]], np.float32), np.ones(3, np.float32), (16, 16)
     )
     assert crowd[:64, 0, 0].sum() == pytest.approx(1) and crowd[64, 0, 0] == 0
@@ -96,7 +96,7 @@ def test_the_extractor_reads_from_perfect_logits_where_the_points_are():
     rng = np.random.default_rng(4)
     grid = np.stack(np.meshgrid(np.arange(12, 110, 13), np.arange(12, 80, 13)), axis=-1)
     points = (grid.reshape(-1, 2) + rng.uniform(-2, 2, (grid[..., 0].size, 2))).astype(np.float32)
-    made = labels.soft_cells(points, np.ones(len(points), np.float32), VIEW)
+    made = pairs.soft_cells(points, np.ones(len(points), np.float32), VIEW)
     scores = detection.cell_scores(np.log(np.maximum(made, 1e-6)))
     rows, columns = detection.strongest(scores, radius_px=3, threshold=0.02, border_px=4, most=1000)
     found = detection.refined(scores, rows, columns, radius_px=1)

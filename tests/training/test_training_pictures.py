@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from ground_station.feature_models import compression, degrade, images
+from ground_station.feature_models import degrade, images
 from ground_station.features.extractor import FeatureError
 from ground_station.simulator import lighting, scenes
 from ground_station.simulator.textures import power_law_field
@@ -51,16 +51,16 @@ def test_pictures_have_the_spectrum_of_natural_ones_and_are_the_same_each_time()
 def test_h264_gives_the_picture_back_and_a_coarser_quantizer_less_of_it():
     picture = images.procedural(5, 4, SIZE)
     error = [
-        np.abs(compression.round_trip([picture, picture], q).astype(int) - picture).mean()
+        np.abs(degrade.round_trip([picture, picture], q).astype(int) - picture).mean()
         for q in (4, 24, 40)
     ]
     assert error[0] < 1 < error[1] < error[2]
     # It is predicted from the picture before: of one that stands still, nothing is left to send.
     other = images.procedural(5, 0, SIZE)
-    last = compression.round_trip([other, picture], 24)
+    last = degrade.round_trip([other, picture], 24)
     assert np.abs(last.astype(int) - picture).mean() < np.abs(last.astype(int) - other).mean()
     with pytest.raises(FeatureError, match="255x192"):
-        compression.round_trip([picture[:, :255]], 24)
+        degrade.round_trip([picture[:, :255]], 24)
 
 
 def test_degrading_moves_nothing_and_is_a_function_of_its_seed():

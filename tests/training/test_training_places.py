@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training's tests need torch, an optional extra")
 
 from ground_station.features import detection  # noqa: E402
-from ground_station.training.places import peaks, place_loss, refined, scores_of  # noqa: E402
+from ground_station.training.losses import peaks, place_loss, refined, scores_of  # noqa: E402
 
 ROWS, COLUMNS = 64, 80
 SHIFT = torch.tensor([[1.0, 0, 8.0], [0, 1, 0], [0, 0, 1]])[None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import os
 import re
 import sys
 import zipfile
@@ -12,8 +13,20 @@ from pathlib import Path, PurePosixPath
 from deploy.errors import DeployError
 from deploy.image.packages import cache
 from deploy.image.packages.board import Board, Wheel
-from deploy.image.packages.tree import settle_times
 from deploy.run import run
+
+# 1980-01-01, the oldest time that a zip file and FAT can tell.
+_TIME_S = 315_532_800
+_FOLDER_MODE = 0o755
+
+
+def settle_times(folder: Path) -> None:
+    """Gives everything in a folder, itself included, one fixed time, and its folders one mode."""
+    for path in (*folder.rglob("*"), folder):
+        if path.is_dir() and not path.is_symlink():
+            path.chmod(_FOLDER_MODE)
+        os.utime(path, (_TIME_S, _TIME_S), follow_symlinks=False)
+
 
 # Raised when this module makes another folder of the same inputs.
 _RECIPE = 1

@@ -12,16 +12,20 @@ from typing import Any
 
 import numpy as np
 
+from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.localization.settings import LocalizerSettings, load_preset
+from ground_station.geometry.lens import Lens
+from ground_station.localization.projection import project
+from ground_station.localization.settings import LocalizerSettings, ProjectionSettings, load_preset
+from ground_station.localization.visibility import LandmarkIndex
 from ground_station.map import colmap, store
 from ground_station.map.folder import carry_floorplan, check_target, kept_name, replacing
 from ground_station.map.model import model_of
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.refined import FRAME_TIME, Refined
 from ground_station.map.sizes import sizes
-from ground_station.map_update.extension.age import never_seen
+from ground_station.map.store import Map
 from ground_station.map_update.extension.anchoring import Anchoring
 from ground_station.map_update.extension.frames import Frames, Picked, describe, pick, thinned
 from ground_station.map_update.extension.joining import Grown, join
@@ -34,6 +38,25 @@ from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.models import without_images, without_points
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameRange
+
+_CONES = ProjectionSettings(viewing_cone=True, cone_margin_deg=5.0, max_distance_ratio=1.2)
+"""Places from which a keyframe saw a landmark, or nearly: from elsewhere something may hide it."""
+
+
+def never_seen(map_: Map, wTc: F64, seen: I64, often: int) -> dict[str, int]:
+    """How many landmarks were `often` in view of cameras (K, 4, 4), and how many of these not seen.
+
+    `seen` are those that were. They are counted and not removed: another light hides, too.
+    """
+    lens, index = Lens(map_.info.camera), LandmarkIndex(map_.landmarks)
+    times = np.zeros(len(map_.landmarks), np.int64)
+    for T in wTc:
+        times[project(map_.landmarks, T, lens, _CONES, index.near(T, lens, _CONES)).landmark] += 1
+    expected = times >= often
+    missed = expected.copy()
+    missed[seen] = False
+    return {"expected": int(expected.sum()), "never_seen": int(missed.sum())}
+
 
 _FILTERS = 3
 """Rounds in which weak points and frames go: each may make others weak."""

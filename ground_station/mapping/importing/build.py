@@ -5,27 +5,151 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
 
+from ground_station.arrays import F64
 from ground_station.errors import InputError, MapError
+from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.epipolar import essential, sampson_px
 from ground_station.map import colmap, landmarks, store
+from ground_station.map.colmap import pycolmap
 from ground_station.map.folder import replacing
 from ground_station.map.model import Model
 from ground_station.mapping.construction.assembly import assemble
-from ground_station.mapping.construction.images import extract
+from ground_station.mapping.construction.images import Images, extract
+from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.mapping.construction.structure import drop_misfits
-from ground_station.mapping.importing.matching import covisible_pairs, match
+from ground_station.mapping.construction.verification import rules_of
+from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings, SfmSettings
+from ground_station.mapping.sfm import adjustment
 from ground_station.mapping.sfm.database import write_database
 from ground_station.mapping.sfm.foreign import ForeignModel
-from ground_station.mapping.sfm.triangulation import adjust_points, triangulate
+from ground_station.mapping.sfm.two_view import TwoView
+from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
+
+_ITERATIONS = 100
+"""At most, of an adjustment of the points alone."""
+
+
+def triangulate(
+    database: Path, wTc: F64, *, seed: int, min_tri_angle_deg: float, max_error_px: float
+) -> colmap.Reconstruction:
+    """A model of a database of `write_database`; image k has the pose `wTc[k]` (K, 4, 4).
+
+    Schönberger and Frahm, CVPR 2016, section 4.3: tracks are made from verified matches, robustly,
+    completed and merged. The poses are not touched.
+    """
+    colmap.quiet()
+    pycolmap.set_random_seed(seed)
+    loading = pycolmap.DatabaseCacheOptions()
+    loading.load_all_images = True
+    with pycolmap.Database.open(database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, loading)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for k, cTw in enumerate(poses.inverse(wTc)):
+        model.frame(k + 1).rig_from_world = pycolmap.Rigid3d(cTw[:3])
+        model.register_frame(k + 1)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    options.random_seed = seed
+    options.min_angle = min_tri_angle_deg
+    options.complete_max_reproj_error = max_error_px
+    options.merge_max_reproj_error = max_error_px
+    graph = cache.correspondence_graph
+    observations = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    for image_id in range(1, len(wTc) + 1):
+        triangulator.triangulate_image(options, image_id)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    return model
+
+
+def adjust_points(model: colmap.Reconstruction, *, loss_px: float, threads: int = 0) -> None:
+    """Adjusts all points, with a Cauchy loss of scale `loss_px`, and neither poses nor camera."""
+    options = adjustment.adjustment_options(loss_px, threads, _ITERATIONS)
+    options.refine_rig_from_world = False
+    options.refine_sensor_from_rig = False
+    chosen = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        chosen.add_image(image_id)
+    pycolmap.create_default_bundle_adjuster(options, chosen, model).solve()
+
+
+_ROWS = 256
+
+
+def covisible_pairs(
+    points: Sequence[npt.NDArray[np.uint64]], *, least: int, most: int
+) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, sorted: each image with the `most` that share most points with it.
+
+    `points`, K arrays, are the different points that each image sees; pairs that share fewer than
+    `least` are left out.
+    """
+    offset = np.cumsum([0, *map(len, points)])
+    _, column = np.unique(np.concatenate([*points, np.empty(0, np.uint64)]), return_inverse=True)
+    width = int(column.max(initial=0)) + 1
+    ones = np.ones(len(column), np.int32)
+    sees = csr_array((ones, column.ravel(), offset), shape=(len(points), width))
+    pairs = set()
+    for start in range(0, len(points), _ROWS):  # of a large model, all pairs fill the memory
+        shared = (sees[start : start + _ROWS] @ sees.T).toarray()
+        for i, row in enumerate(shared, start=start):
+            row[i] = 0
+            for j in np.argsort(-row, kind="stable")[:most].tolist():
+                if row[j] >= least:
+                    pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
+def match(
+    images: Images,
+    wTc: F64,
+    pairs: Sequence[tuple[int, int]],
+    camera: Camera,
+    settings: MappingSettings,
+    threads: int,
+) -> dict[tuple[int, int], TwoView]:
+    """Matches of the pairs that fit the images' poses (K, 4, 4), where they are enough.
+
+    A match is kept up to `sfm.max_error_px` off its epipolar lines: an observation further off
+    would not stay in the map. Raises `MapError` when no pair has enough."""
+    rules, matrix = rules_of(settings, far=False), camera.matrix
+
+    def one(i: int, j: int) -> TwoView | None:
+        first, second = images.features[i].descriptors, images.features[j].descriptors
+        matches = mutual_matches(first, second, rules.ratio)
+        E = essential(wTc[i], wTc[j])
+        pixels = images.pinhole_px[i][matches[:, 0]], images.pinhole_px[j][matches[:, 1]]
+        fits = sampson_px(*pixels, E, matrix) <= settings.sfm.max_error_px
+        if fits.sum() < rules.min_inliers:
+            return None
+        return TwoView(matches[fits], E / np.linalg.norm(E), None, False)
+
+    found: dict[tuple[int, int], TwoView] = {}
+    with Progress("matching, pairs", len(pairs)) as progress:
+        for pair, view in zip(pairs, Threads(threads).map(one, pairs), strict=True):
+            if view is not None:
+                found[pair] = view
+            progress.step()
+    if not found:
+        raise MapError(
+            f"no two of the {len(images.names)} images have {rules.min_inliers} matches that fit "
+            "the model's poses: are these the pictures that it was made of?"
+        )
+    return found
+
 
 _NAMED = 5
 

@@ -2,24 +2,140 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ground_station.errors import MapError
-from ground_station.geometry.alignment import Alignment
+from ground_station.arrays import F64
+from ground_station.errors import GeometryError, MapError
+from ground_station.geometry.alignment import Alignment, align
+from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map import colmap, store
 from ground_station.map.folder import replacing
+from ground_station.map.store import Map
 from ground_station.map.uncertainty import describe
+from ground_station.mapping.registration.adjustment import KnownPoints, adjust, adjust_agreeing
 from ground_station.mapping.registration.distances import Distances, by_distances, with_distances
-from ground_station.mapping.registration.from_observations import by_observations
 from ground_station.mapping.registration.from_picks import by_picks
 from ground_station.mapping.registration.from_trajectory import by_trajectory
-from ground_station.mapping.registration.observations import PointObservations
+from ground_station.mapping.registration.observations import (
+    PointObservations,
+    Triangulated,
+    reproject,
+    sigma_px,
+    triangulate_observations,
+)
 from ground_station.mapping.registration.picks import Picks
-from ground_station.mapping.registration.registration import Registration
+from ground_station.mapping.registration.registration import (
+    Registration,
+    listed,
+    rms,
+    similarity_report,
+)
+from ground_station.mapping.registration.similarity import (
+    MIN_POINTS,
+    check_spread,
+    robust_similarity,
+)
+
+
+def by_observations(map_: Map, observations: PointObservations, seed: int) -> Registration:
+    """The similarity from observations of known points, triangulated with the map's own poses.
+
+    The points that agree are found first (`robust_similarity`); those are adjusted, weighted by the
+    observations' geometry and by what the places scatter (`adjust`). Each thing that was measured,
+    a point or a tag, is also held out once."""
+    camera, kf = map_.info.camera, map_.keyframes
+    found, notes = triangulate_observations(observations, kf.names, kf.wTc, camera)
+    what = f"of {len(observations.points)} points could be triangulated"
+    if len(found) < MIN_POINTS:
+        raise MapError(
+            f"registration: {len(found)} {what}; at least {MIN_POINTS} are needed"
+            + (f" ({notes[0]})" if notes else "")
+        )
+    points = _known(found, observations, sigma_px(found))
+    plain, agree = robust_similarity(points.model, points.world, _noise(points), seed, "points")
+    adjusted, agree = adjust_agreeing(plain, points, agree)
+    far = _errors(adjusted.fit, points)
+    for point, good, off_m in zip(found, agree, far, strict=True):
+        if not good:
+            notes.append(f"point '{point.name}' left out: {off_m:.3f} m off where the others agree")
+    used, names = points.of(agree), [p for p, good in zip(found, agree, strict=True) if good]
+    fit = adjusted.fit
+    held, scales = _held_out(used)
+    report: dict[str, Any] = {
+        "method": "observations",
+        "points": len(used),
+        "points_given": len(observations.points),
+        "observations": sum(len(point.ray) for point in names),
+        **listed([point.name for point in names], _errors(fit, used), held),
+        "reprojection_rms_px": _reprojection_px(fit, names, camera),
+        "observation_sigma_px": sigma_px(names),
+        "point_sigma_m": adjusted.scatter_m,
+        **similarity_report(fit, scales),
+    }
+    if used.groups < MIN_POINTS:
+        notes.append(
+            f"only {used.groups} of the tags: how exactly they were measured cannot be told, and "
+            "the uncertainty is large; measure three or more"
+        )
+    return Registration(fit, report, adjusted.uncertainty, notes)
+
+
+def _known(
+    found: Sequence[Triangulated], observations: PointObservations, sigma: float
+) -> KnownPoints:
+    group = dict(zip(observations.points, observations.group.tolist(), strict=True))
+    return KnownPoints(
+        model=np.array([point.position for point in found]),
+        covariance=sigma**2 * np.array([point.covariance for point in found]),
+        world=np.array([point.world_m for point in found]),
+        group=np.array([group[point.name] for point in found], np.int64),
+    )
+
+
+def _noise(points: KnownPoints) -> F64:
+    return np.asarray(np.sqrt(np.trace(points.covariance, axis1=1, axis2=2)))
+
+
+def _held_out(points: KnownPoints) -> tuple[F64, list[float]]:
+    """Each point's error (N,), metres, without the thing that it belongs to, and the scales then.
+
+    NaN where the others leave the similarity open.
+    """
+    error = np.full(len(points), np.nan)
+    scales: list[float] = []
+    for group in np.unique(points.group):
+        mine = points.group == group
+        others = points.of(~mine)
+        try:
+            check_spread(others.world, "points")
+            start = align(others.model, others.world, True)
+            fit = adjust(start, others).fit
+        except (MapError, GeometryError):
+            continue
+        error[mine] = _errors(fit, points.of(mine))
+        scales.append(fit.scale)
+    return error, scales
+
+
+def _errors(fit: Alignment, points: KnownPoints) -> F64:
+    return np.asarray(np.linalg.norm(fit.apply(points.model) - points.world, axis=1))
+
+
+def _reprojection_px(fit: Alignment, points: Sequence[Triangulated], camera: Camera) -> float:
+    """How far the world's points lie from their observations, RMS, undistorted pixels."""
+    off = []
+    for point in points:
+        X = fit.rotation.T @ (point.world_m - fit.translation) / fit.scale
+        residual, _ = reproject(X, point.wTc, point.ray, camera)
+        off.append(np.linalg.norm(residual, axis=1))
+    flat = np.concatenate(off)
+    return rms(flat[np.isfinite(flat)]) if np.isfinite(flat).any() else float("inf")
 
 
 def register_map(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import sys
 import threading
 import time
@@ -28,8 +29,7 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.cameras import camera_of
-from ground_station.service.foxglove import documents, drawing, log, world
-from ground_station.service.foxglove.inbox import Inbox
+from ground_station.service.foxglove import documents, drawing, world
 from ground_station.service.foxglove.payload import Payload
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
 from ground_station.service.foxglove.world import World
@@ -37,6 +37,74 @@ from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.settings import FoxgloveSettings, StationSettings
 from pi_firmware.wire.errors import BlimpError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
+
+_LENGTH = 200
+
+
+class RateLimitedHandler(logging.Handler):
+    """Passes on one record of each logger a minute, with how many there were; warnings and up."""
+
+    def __init__(self, say: RateLimitedLog) -> None:
+        super().__init__(logging.WARNING)
+        self._say = say
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Takes a record, under the handler's lock."""
+        try:
+            self._say(record.name, record.getMessage()[:_LENGTH])
+        except Exception:
+            self.handleError(record)
+
+
+def install(say: RateLimitedLog) -> None:
+    """Puts it in place of what Python would print."""
+    logger = logging.getLogger("foxglove")
+    logger.addHandler(RateLimitedHandler(say))
+    logger.propagate = False
+
+
+Task = Callable[[], object]
+_MOST = 2000
+
+
+class Inbox:
+    """Tasks in their order, at most 2000, and the newest frame of each payload.
+
+    Never blocks who puts; `dropped` counts the tasks that a full inbox lost, the oldest first, and
+    `skipped` the frames that a newer one replaced. Safe from any thread.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = self.skipped = 0
+        self._tasks: deque[Task] = deque()
+        self._frames: dict[str, FrameMessage] = {}
+        self._there = threading.Condition()
+
+    def put(self, task: Task) -> None:
+        """Leaves a task."""
+        with self._there:
+            if len(self._tasks) >= _MOST:
+                self._tasks.popleft()
+                self.dropped += 1
+            self._tasks.append(task)
+            self._there.notify()
+
+    def frame(self, payload_id: str, note: FrameMessage) -> None:
+        """Leaves a payload's newest frame."""
+        with self._there:
+            self.skipped += payload_id in self._frames
+            self._frames[payload_id] = note
+            self._there.notify()
+
+    def take(self, timeout_s: float) -> tuple[list[Task], dict[str, FrameMessage]]:
+        """All there is; waits for something to come."""
+        with self._there:
+            self._there.wait_for(lambda: self._tasks or self._frames, timeout_s)
+            tasks, frames = list(self._tasks), self._frames
+            self._tasks.clear()
+            self._frames = {}
+            return tasks, frames
+
 
 PAYLOADS, EVENTS = 32, 100
 _POLL_S = 0.2
@@ -79,7 +147,7 @@ class Publishing:
         self._topics = {topic.id: topic for topic in topics}
         self._of_map = (self._plan.id, self._landmarks.id)
 
-        log.install(RateLimitedLog(_print))
+        install(RateLimitedLog(_print))
         self.server = _listen(settings, context, self)
         bus.subscribe(bus_messages.FRAME, FrameMessage, self._hear_frame)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._later(self._take_estimate))

@@ -5,10 +5,12 @@ Of a payload that waits for poses (`Run.stepped`) each frame is taken in its tur
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +25,96 @@ from ground_station.service import bus_messages, pictures
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
 from ground_station.service.localizing import derive
-from ground_station.service.localizing.accounting import Accounting
+from ground_station.service.localizing.derive import Accounts
 from ground_station.service.localizing.maps import Loader, Loading, folder_of
-from ground_station.service.localizing.overload import Overload
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.settings import Run
+from pi_firmware.wire import files
 from pi_firmware.wire.errors import BlimpError
+
+WINDOW_S = 2.0
+SKIPPED = 0.05
+"""Of the frames told of: what `make limits` calls sustained is TRACKING in 95 % of them."""
+LATE_S = 1.0
+"""Features of a frame take a tenth of this where a core is free for them."""
+
+
+class Overload:
+    """Whether frames are skipped, or features late, for lack of processor; its state in words."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int, int]] = deque()
+
+    def watch(self, localizer: Localizer, now_s: float, taken: int, skipped: int) -> str:
+        """After each frame; the localizer is told, and the answer is "" while all is well.
+
+        `now_s` is monotonic; `taken` and `skipped` count the stream's frames so far.
+        """
+        counts = self._counts
+        if counts and taken + skipped < counts[-1][1] + counts[-1][2]:
+            counts.clear()  # counted again
+        counts.append((now_s, taken, skipped))
+        while len(counts) > 1 and counts[1][0] <= now_s - WINDOW_S:
+            counts.popleft()
+        lost = skipped - counts[0][2]
+        told = lost + taken - counts[0][1]
+        late_s = localizer.keyframe_late_s
+        localizer.overloaded = lost > SKIPPED * told
+        if localizer.overloaded:
+            return (
+                f"this computer is too slow: {lost} of {told} frames skipped in {WINDOW_S:g} s;"
+                " keyframes are rare"
+            )
+        if late_s > LATE_S:
+            return (
+                f"this computer is too slow: features under way for {late_s:.1f} s;"
+                " keyframes are late"
+            )
+        return ""
+
+
+_KEEP_S = 0.25
+
+
+class Accounting:
+    """Counts the frames of a payload's session, which the intake numbers as it shows them.
+
+    What was processed lately when a localizer was killed counts as skipped after it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.accounts = Accounts()
+        self._path = path
+        self._ssrc = self._shown = -1
+        self._kept_s = float("-inf")
+        with contextlib.suppress(OSError, ValueError):
+            self._ssrc, self._shown, processed, localized = map(int, path.read_text().split())
+            self.accounts = Accounts(processed, localized)
+
+    def frame(self, note: FrameMessage) -> None:
+        """A frame comes: those of its session before it that were not taken are skipped."""
+        if note.ssrc != self._ssrc or note.shown <= self._shown:
+            self.accounts = Accounts()
+        self._ssrc, self._shown = note.ssrc, note.shown
+        skipped = max(0, note.shown - 1 - self.accounts.processed)
+        self.accounts = replace(self.accounts, skipped=skipped)
+
+    def skip(self) -> None:
+        """It could not be taken."""
+        self.accounts = replace(self.accounts, skipped=self.accounts.skipped + 1)
+
+    def take(self, *, localized: bool) -> None:
+        """It was processed."""
+        own = self.accounts
+        own = replace(own, processed=own.processed + 1, localized=own.localized + localized)
+        self.accounts, now_s = own, time.monotonic()
+        if now_s - self._kept_s < _KEEP_S:
+            return
+        self._kept_s = now_s
+        kept = f"{self._ssrc} {self._shown} {own.processed} {own.localized}"
+        with contextlib.suppress(OSError):  # the run's folder is full
+            files.write(self._path, kept.encode())
+
 
 RESTART = 3
 """Exit status: only a new process can help."""

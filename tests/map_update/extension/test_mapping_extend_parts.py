@@ -9,7 +9,7 @@ from corridor_light import CAMERA
 from ground_station.geometry import poses
 from ground_station.map import landmarks, store
 from ground_station.map.model import Model
-from ground_station.map_update.extension.age import never_seen
+from ground_station.map_update.extension.extend import never_seen
 from ground_station.map_update.extension.tracks import joined
 from ground_station.map_update.extension.triangulation import triangulate
 from ground_station.mapping.sfm.growing import adjust_among_fixed

@@ -19,8 +19,7 @@ from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
 from ground_station.map import colmap, store
-from ground_station.mapping.importing.build import import_model
-from ground_station.mapping.importing.matching import covisible_pairs
+from ground_station.mapping.importing.build import covisible_pairs, import_model
 from ground_station.mapping.importing.pictures import open_pictures, taken_by
 from ground_station.mapping.sfm import foreign
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.map.store import Map
-from ground_station.mapping.registration.from_observations import by_observations
 from ground_station.mapping.registration.observations import PointObservations
+from ground_station.mapping.registration.register import by_observations
 
 NOISE_M = 0.05
 

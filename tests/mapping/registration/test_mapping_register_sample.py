@@ -14,9 +14,8 @@ from surveyed_points import NOISE_M, far_apart, only, six_points
 
 from ground_station.map import store
 from ground_station.map.uncertainty import describe
-from ground_station.mapping.registration.from_observations import by_observations
 from ground_station.mapping.registration.observations import read_pairs
-from ground_station.mapping.registration.register import transform_map
+from ground_station.mapping.registration.register import by_observations, transform_map
 from ground_station.recording.flight import trajectory_of
 
 SAMPLE = Path(__file__).parents[3] / "maps" / "atrium"

@@ -18,7 +18,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.map import store
 from ground_station.mapping.registration import command, tags
-from ground_station.mapping.registration.from_observations import by_observations
+from ground_station.mapping.registration.register import by_observations
 from ground_station.mapping.registration.tags import FAMILIES, find_tags, read_tags
 from ground_station.recording.frames import Frame
 
