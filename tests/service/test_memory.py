@@ -14,7 +14,7 @@ from pi_firmware.wire.config import from_mapping
 
 HOLES = """
 from pathlib import Path
-from ground_station.service import memory
+from ground_station.service.intake import process
 
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1])
@@ -24,7 +24,7 @@ full = resident()
 kept = blocks[-1]  # the heap cannot shrink past it
 del blocks
 holes = resident()
-memory.give_back()
+process.give_back()
 print(full, holes, resident())
 """
 
