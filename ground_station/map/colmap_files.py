@@ -27,7 +27,7 @@ _LARGEST_PX = 1 << 20
 _NEAR = 1e-5
 """How exactly a number of a text file comes back: others write fewer digits than COLMAP."""
 _SECONDS, _BYTES = 10, 4 << 30
-"""What the child may take, and for each byte of the model `_SECONDS_MB` and `_TIMES` of it more."""
+"""What the child may take, and `_SECONDS_MB` more for each MB of the model, `_TIMES` its bytes."""
 _SECONDS_MB, _TIMES = 1.0, 50
 
 
@@ -38,6 +38,9 @@ def check(folder: Path) -> None:
 
     if not folder.is_dir():
         raise MapError(f"{folder}: there is no such folder")
+    for path in sorted(folder.iterdir()):
+        if not (path.is_file() or path.is_dir()):  # a pipe would be waited for without end
+            raise MapError(f"{path}: neither a file nor a folder: what is a model's is a file")
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # each thread claims memory
     child = [sys.executable, "-I", __file__, str(folder.absolute())]
     run = subprocess.run(child, capture_output=True, text=True, errors="replace", env=environment)

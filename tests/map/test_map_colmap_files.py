@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -81,6 +82,13 @@ def test_a_count_that_takes_for_ever_is_refused_when_its_time_is_over(copy: Path
     struct.pack_into("<Q", data, 51, 1 << 60)  # of the observations of its one point
     (copy / "points3D.bin").write_bytes(bytes(data))
     with pytest.raises(MapError, match=r"^[^\n]*: not a COLMAP model: [^\n]+$"):
+        colmap.read(copy)
+
+
+def test_a_pipe_in_a_models_folder_is_refused_and_not_waited_for(copy: Path) -> None:
+    (copy / "images.bin").unlink()
+    os.mkfifo(copy / "images.bin")
+    with pytest.raises(MapError, match=r"^[^\n]*images.bin: neither a file nor a folder[^\n]*$"):
         colmap.read(copy)
 
 
