@@ -119,7 +119,7 @@ class MappingSettings:
 
     features: str = "rootsift"
     max_features: int = config.key(1500, unit="features", low=50, high=20000)
-    max_images: int = config.key(160, unit="images", low=2, high=20000)
+    max_images: int = config.key(1000, unit="images", low=2, high=20000)
     seed: int = config.key(0, low=0, high=2**31 - 1)
     threads: int = config.key(0, unit="threads", low=0, high=256)
     quantise: bool = True

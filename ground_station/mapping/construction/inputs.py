@@ -1,10 +1,10 @@
 """The inputs of a build: recordings, videos and folders become one sequence of named frames.
 
 Which frames: a range with a step means exactly those. Else an input set of no more frames than
-`keyframes.choose_above` and `max_images` is used whole: it is short, or somebody has chosen already
-(a mapping flight of 4 frames a second, photographs), and every image more ties the map together.
-Of all others the keyframes are taken, for which an input is read twice: once to choose, once for
-the chosen frames.
+`max_images` is used whole where it is short (`keyframes.choose_above`) or most of its frames are
+due as keyframes: somebody has chosen already (photographs, a headset's five frames a second), and
+every image more ties the map together. Of all others the keyframes are taken, for which an input is
+read twice: once to choose, once for the chosen frames.
 """
 
 from __future__ import annotations
@@ -140,6 +140,8 @@ def open_inputs(
     if total <= limit:  # a container that does not say how many frames it holds
         return Inputs(prior, total, built, said, paths, sources)
     chosen = keyframes.choose(figures, settings.max_images, settings.keyframes)
+    if total <= settings.max_images and 2 * chosen.due > total:
+        return Inputs(prior, total, built, said, paths, sources)
     again: list[FrameSource] = [
         open_input(path, rate_hz, ChosenFrames(indices=frozenset(index.tolist())))
         for path, index in zip(paths, chosen.index, strict=True)

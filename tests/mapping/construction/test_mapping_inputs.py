@@ -80,6 +80,17 @@ def test_a_short_input_is_used_whole_and_read_once(folder: Path, camera_file: st
     assert len(names(open_inputs([str(folder)], fewer, camera=camera_file))) <= 8
 
 
+def test_an_input_of_which_most_frames_are_due_is_used_whole(
+    folder: Path, camera_file: str
+) -> None:
+    due = replace(SETTINGS.keyframes, parallax_deg=0.1, turn_deg=0.5)
+    inputs = open_inputs([str(folder)], replace(SETTINGS, keyframes=due), camera=camera_file)
+    assert names(inputs) == [f"{k:03d}.png" for k in range(FRAMES)]
+    assert "keyframes" not in inputs.built
+    fewer = replace(SETTINGS, keyframes=due, max_images=FRAMES // 2)
+    assert len(names(open_inputs([str(folder)], fewer, camera=camera_file))) <= FRAMES // 2
+
+
 def test_of_a_longer_one_keyframes_are_taken_with_their_own_names_and_times(
     folder: Path, camera_file: str
 ) -> None:
