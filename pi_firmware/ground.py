@@ -14,6 +14,8 @@ from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.messages import LinkReport
 
 _SILENT_S = 5.0
+_FOLLOWED_SILENT_S = 3.0
+"""Stations report once a second: this many are missed before another gets the video."""
 IDR_GAP_S = 0.04
 """An IDR is a few frames' size: no ground station has every frame of 30 a second made one."""
 _LOWEST_PORT, _HIGHEST_PORT = 1, 65_535
@@ -33,8 +35,8 @@ class Ground:
     """Takes the ground stations' reports, and sends the video where one of them is.
 
     With `link.host` = "auto" it goes to the first that reports, and to another only when that one
-    has been silent for 5 s. Reports of other streams than ours change nothing else. `on_heard` is
-    called with each report.
+    has been silent for 3 s, or its connection has ended. Reports of other streams than ours change
+    nothing else. `on_heard` is called with each report.
     """
 
     def __init__(
@@ -59,6 +61,11 @@ class Ground:
         self._followed_s = 0.0
         self._idr_s = float("-inf")
         self._seen: Seen | None = None
+
+    @property
+    def followed(self) -> str:
+        """The ground station that was found and gets the video; empty while there is none."""
+        return self._followed
 
     @property
     def seen(self) -> Seen | None:
@@ -88,9 +95,10 @@ class Ground:
         self._capture.link_report(report, self.link.report(report, now_s))
 
     def _follow(self, report: LinkReport, now_s: float) -> None:
-        other = report.ground != self._followed
-        if other and self._followed and now_s - self._followed_s < _SILENT_S:
-            return
+        if report.ground != self._followed and self._followed:
+            recent = now_s - self._followed_s < _FOLLOWED_SILENT_S
+            if recent and self._telemetry.ground_address(self._followed) is not None:
+                return
         address = self._telemetry.ground_address(report.ground)
         if address is not None:
             self._followed, self._followed_s = report.ground, now_s

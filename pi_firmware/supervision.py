@@ -175,6 +175,7 @@ class Supervision:
             release_reason=self.release.reason,
             early_reports=True,
             idr_gap_s=IDR_GAP_S,
+            ground=ground.followed,
             rtx_ssrc=ground.link.rtx_ssrc,
             correction_ssrc=ground.link.correction_ssrc,
             **asdict(self._board.read()),

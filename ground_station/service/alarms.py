@@ -117,7 +117,10 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
     age_s = _table(view, "age_s")
     frame_s, estimate_s = _number(age_s.get("frame")), _number(age_s.get("estimate"))
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
-    if not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
+    if not frames_come and (other := _table(view, "payload").get("station")):
+        text = f"flies with station '{other}', which gets its video"
+        yield Alarm(f"elsewhere/{payload_id}", INFO, payload_id, text)
+    elif not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
         since_s = alive_s if frame_s is None else min(frame_s, alive_s)
         text = f"no frames for {since_s:.0f} s"
         if frame_s is None:  # telemetry comes through, and never any video

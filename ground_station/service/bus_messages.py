@@ -145,6 +145,7 @@ class PayloadMessage(Message):
     recording: str = ""  # the file on the payload's own card
     refused: int = 0
     ended: bool = False
+    station: str = ""  # another one, to which it sends its video
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,7 +170,7 @@ class Health(Message):
     """How payload and board are; None: this board cannot tell, or nothing was heard."""
 
     SCHEMA: ClassVar[str] = "blimp.health"
-    MINOR: ClassVar[int] = 3
+    MINOR: ClassVar[int] = 4
 
     uptime_s: float  # of the program
     captured: int = 0
@@ -207,6 +207,7 @@ class Health(Message):
     idr_gap_s: float = 0.1  # a wish for an IDR sooner than this after another is not heard
     rtx_ssrc: int | None = None  # what is asked for again comes with it; None: nothing does
     correction_ssrc: int | None = None  # forward correction comes with it; None: none ever does
+    ground: str = ""  # the station that it found and sends its video to; empty: it looks for none
 
 
 @dataclass(frozen=True)

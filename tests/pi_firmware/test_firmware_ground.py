@@ -36,8 +36,11 @@ class Capture:
 
 
 class Telemetry:
+    def __init__(self) -> None:
+        self.connected = {"main": "10.0.0.5", "spare": "10.0.0.6"}
+
     def ground_address(self, ground: str) -> str | None:
-        return {"main": "10.0.0.5", "spare": "10.0.0.6"}.get(ground)
+        return self.connected.get(ground)
 
 
 class Following:
@@ -46,13 +49,13 @@ class Following:
     def __init__(self, host: str) -> None:
         self.now_s = 100.0
         self.heard = 0
-        self.link, self.capture = Link(), Capture()
+        self.link, self.capture, self.telemetry = Link(), Capture(), Telemetry()
         self.ground = Ground(
             LinkSettings(host=host),
             SSRC,
             self.link,  # type: ignore[arg-type]
             self.capture,  # type: ignore[arg-type]
-            Telemetry(),  # type: ignore[arg-type]
+            self.telemetry,  # type: ignore[arg-type]
             on_heard=self._hear,
             clock=lambda: self.now_s,
         )
@@ -103,14 +106,23 @@ def test_video_goes_to_the_first_ground_station_and_on_to_another_once_it_is_sil
     following.report("main", ssrc=None)
     following.report("spare", video_port=5700)
     assert following.link.to == [("10.0.0.5", 5600)]
-    following.now_s += 4
+    following.now_s += 2
     following.report("main", video_port=5601)
-    following.now_s += 4
-    following.report("spare", video_port=5700)
-    assert following.link.to == [("10.0.0.5", 5600), ("10.0.0.5", 5601)]
     following.now_s += 2
     following.report("spare", video_port=5700)
-    assert following.link.to[-1] == ("10.0.0.6", 5700)
+    assert following.link.to == [("10.0.0.5", 5600), ("10.0.0.5", 5601)]
+    assert following.ground.followed == "main"
+    following.now_s += 2
+    following.report("spare", video_port=5700)
+    assert following.link.to[-1] == ("10.0.0.6", 5700) and following.ground.followed == "spare"
+
+
+def test_video_goes_on_at_once_when_the_connection_of_its_station_ends() -> None:
+    following = Following("auto")
+    following.report("main")
+    del following.telemetry.connected["main"]
+    following.report("spare", video_port=5700)
+    assert following.link.to == [("10.0.0.5", 5600), ("10.0.0.6", 5700)]
 
 
 def test_a_ground_that_cannot_show_frames_gets_an_idr_but_not_a_flood_of_them() -> None:

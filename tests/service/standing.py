@@ -112,7 +112,8 @@ class Service:
     """`blimp serve` on ports and in folders of its own; a context manager that checks its end.
 
     It flies as it is installed: with an authority of its own, so that telemetry is mutual TLS and
-    video SRTP; only the demo is without. `place` is the private folder in memory in which a run's
+    video SRTP; only the demo is without. A second station is given the first one's `authority`.
+    `place` is the private folder in memory in which a run's
     folder lies. What the service writes is kept over all its starts.
     """
 
@@ -122,6 +123,8 @@ class Service:
         *settings: str,
         payloads: Sequence[str] = PAYLOADS,
         demo: bool = False,
+        name: str = "main",
+        authority: Authority | None = None,
     ) -> None:
         self.folder = folder
         self.recordings = folder / "recordings"
@@ -145,11 +148,12 @@ class Service:
         ):
             self.command += ["--set", setting]
         if not demo:
-            self.authority = Authority.create(folder / "keys")
-            self.certificates = self.authority.add("ground", "main")
-            for payload_id in payloads:
+            self.authority = authority or Authority.create(folder / "keys")
+            self.certificates = self.authority.add("ground", name)
+            for payload_id in payloads if authority is None else ():
                 self.authority.add("payload", payload_id)
             self.command += ["--set", f"telemetry.certificates={self.certificates}"]
+            self.command += ["--set", f"name={name}"]
         self.client = httpx.Client(base_url=self.url, timeout=20.0)
         self.seen: set[Process] = set()
         """All processes that it was ever seen to have."""
@@ -288,11 +292,17 @@ class Service:
     # Who flies to it
 
     def fly(
-        self, payload_id: str, folder: Path, *, rate_hz: float = 30.0, port: int = 0
+        self,
+        payload_id: str,
+        folder: Path,
+        *settings: str,
+        rate_hz: float = 30.0,
+        port: int = 0,
     ) -> PayloadProcess:
         """A payload's own program that flies the sample flight in a loop; a context manager.
 
         A lower rate takes fewer of the flight's frames; `port` is of a link before the service.
+        Settings that are given go before these.
         """
         flight = os.path.relpath(ATRIUM / "flight.mcap")  # a picture shows what is streamed
         return PayloadProcess(
@@ -303,6 +313,7 @@ class Service:
             f"link.port={port or self.video}",
             f"telemetry.connect={json.dumps([self.endpoint])}",
             f"telemetry.certificates={self.authority.of(f'payload.{payload_id}')}",
+            *settings,
         )
 
 

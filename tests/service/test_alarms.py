@@ -143,6 +143,15 @@ def test_no_frames_from_a_living_payload(told, after_s, found):
     assert ids(snapshot) == ({f"no-frames/{P}": "alarm"} if found else {})
 
 
+def test_a_payload_that_flies_with_another_station_is_told_and_no_alarm(told):
+    snapshot, clock = told
+    clock.ns += 5 * S
+    snapshot.payload(P, station.payload(station="spare"))
+    assert ids(snapshot) == {f"elsewhere/{P}": "info"}
+    snapshot.frame(P, station.frame())
+    assert not ids(snapshot)
+
+
 def test_telemetry_without_any_video_names_the_firewall(told):
     snapshot, clock = told
     for _ in range(6):  # P was seen, the other one never

@@ -157,6 +157,7 @@ class Payload:
             _, lost_share = self._account.add(stream.ssrc, counters, sent, now_s)
         offset = listener.clock(self.id)
         health = state.health if state is not None else None
+        followed = health.ground if health is not None else ""
         return PayloadMessage(
             alive=self.alive,
             seen_ns=self.seen_ns,
@@ -175,6 +176,7 @@ class Payload:
             recording=health.recording if health is not None else "",
             refused=state.refused if state is not None else 0,
             ended=state is not None and state.ended,
+            station=followed if followed != listener.name else "",
         )
 
     def close(self) -> None:
