@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ground_station.service.bus_messages import ALARM, INFO, STATION, WARNING, Level
-from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW
+from pi_firmware.wire.messages import ALARM_CRITICAL, ALARM_LOW, UNDERVOLTAGE, WAS
 
 HOLD_S = 3.0
 LOST_S, NO_FRAMES_S, NO_POSES_S, CLOCK_UNKNOWN_S = 2.0, 2.0, 4.0, 10.0
@@ -184,6 +184,11 @@ def _of_board(
     if celsius is not None and celsius > (NO_MORE_HOT_C if name in standing else HOT_C):
         text = f"the payload's processor has {celsius:.0f} °C"
         yield Alarm(name, WARNING, payload_id, text)
+    held = [str(one) for one in health.get("throttled") or () if not str(one).endswith(WAS)]
+    if held:
+        text = f"the payload's board is held back: {', '.join(held)}"
+        text += ": is its cell or its wiring too weak?" if UNDERVOLTAGE in held else ""
+        yield Alarm(f"throttled/{payload_id}", WARNING, payload_id, text)
     name = f"payload-disk/{payload_id}"
     free_MB = _number(health.get("disk_free_MB"))
     if health.get("recording") and _below(free_MB, DISK_WARNING_MB, name in standing):

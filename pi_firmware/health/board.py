@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pi_firmware.health import small_files
+from pi_firmware.wire.messages import UNDERVOLTAGE, WAS
 
 _CPU_ZONES = ("cpu", "soc", "bcm2", "x86_pkg")  # bcm2835_thermal is the Pi's in older kernels
 _COLDEST_C, _HOTTEST_C = -60.0, 150.0  # no silicon that still counts is outside
@@ -20,7 +21,7 @@ _MB = 1e6
 
 # The Pi firmware's bits of now (raspberrypi.com, `vcgencmd get_throttled`); 16 higher stands the
 # same for what has been since power-on, or since the kernel's voltage driver last cleared it.
-_BITS = {0: "undervoltage", 1: "frequency-capped", 2: "throttled", 3: "soft-temperature-limit"}
+_BITS = {0: UNDERVOLTAGE, 1: "frequency-capped", 2: "throttled", 3: "soft-temperature-limit"}
 _WAS_SHIFT = 16
 
 
@@ -116,7 +117,7 @@ class Board:
             return self._undervoltage()
         bits = int(found, 16)
         now = [name for bit, name in _BITS.items() if bits >> bit & 1]
-        return now + [f"{name}-was" for bit, name in _BITS.items() if bits >> bit + _WAS_SHIFT & 1]
+        return now + [name + WAS for bit, name in _BITS.items() if bits >> bit + _WAS_SHIFT & 1]
 
     def _undervoltage(self) -> list[str] | None:
         """What a kernel without the Pi's patches can tell: its alarm of the last two seconds."""
@@ -128,7 +129,7 @@ class Board:
         if alarm not in (0, 1):
             self._voltage = None
             return None
-        return [_BITS[0]] if alarm else []
+        return [UNDERVOLTAGE] if alarm else []
 
 
 def _children(folder: Path, prefix: str) -> list[Path]:

@@ -24,6 +24,8 @@ MOST_LETTERS, MOST_ITEMS = 1024, 64
 """Of a text, of which the rest is cut, and of a list or an object, which is refused beyond it."""
 
 ALARM_NONE, ALARM_LOW, ALARM_CRITICAL = "", "low", "critical"
+UNDERVOLTAGE, WAS = "undervoltage", "-was"
+"""What holds a board back, and how the name of what did so before ends."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ class Health(Message):
     memory_MB: float | None = None  # resident, of the program
     memory_free_MB: float | None = None
     disk_free_MB: float | None = None
-    throttled: list[str] | None = None  # what the board is held back by now, or was
+    throttled: list[str] | None = None  # what the board is held back by now, or was (`WAS`)
     wifi_interface: str = ""
     wifi_signal_dBm: float | None = None
     wifi_quality: float | None = None  # 0 to 1

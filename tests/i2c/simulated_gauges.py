@@ -163,12 +163,16 @@ class Max17048Chip:
 
 @dataclass
 class Faults:
-    """What goes wrong: every n-th read fails with errno 121 or gives `nonsense`; 0: never."""
+    """What goes wrong: every n-th read fails with errno 121 or gives `nonsense`; 0: never.
+
+    A bus with a line that is held low gives each transfer up after `stuck_s`, as the kernel does.
+    """
 
     absent: bool = False
     fail_every: int = 0
     nonsense_every: int = 0
     nonsense: int = 0xFFFF
+    stuck_s: float = 0.0
 
 
 class FakeBus:
@@ -199,6 +203,9 @@ class FakeBus:
         """Nothing to release."""
 
     def _acknowledge(self, address: int) -> None:
+        if self.faults.stuck_s:
+            time.sleep(self.faults.stuck_s)
+            raise TimeoutError(errno.ETIMEDOUT, "Connection timed out")
         if self.faults.absent or address != self._address:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")
 

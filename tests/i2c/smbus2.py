@@ -19,6 +19,7 @@ BUSES = {
     96: ("ina226", 0x40, Faults(nonsense_every=11)),
     97: ("max17048", 0x36, Faults(nonsense_every=5)),
     98: ("max17048", 0x36, Faults(nonsense_every=2)),
+    99: ("ina219", 0x40, Faults(stuck_s=1.0)),
 }
 _FLYING: dict[int, FlyingBus] = {}
 """Opened again, a bus has the same chip and cell."""

@@ -304,6 +304,21 @@ def test_a_level_rises_at_once_and_falls_late(told):
     assert (standing[name].alarm.level, standing[name].alarm.since_ns) == ("warning", 10 * S)
 
 
+@pytest.mark.parametrize(
+    ("held", "text"),
+    [
+        (["undervoltage", "throttled", "throttled-was"], "undervoltage, throttled: is its cell"),
+        (["soft-temperature-limit"], "held back: soft-temperature-limit"),
+        (["undervoltage-was"], ""),
+        (None, ""),
+    ],
+)
+def test_a_board_that_is_held_back_says_by_what(told, held, text):
+    told[0].payload(P, station.payload(health={"time_ns": 1, "throttled": held}))
+    texts = [alarm.text for alarm in alarms._found(told[0].document(), 0, frozenset())]
+    assert len(texts) == bool(text) and all(text in one for one in texts)
+
+
 def test_a_limit_for_the_end_lies_apart_from_the_one_for_the_beginning(told):
     snapshot, _ = told
 

@@ -14,6 +14,6 @@ import sys
 from pathlib import Path
 
 _TESTS = Path(__file__).parents[2]
-for _room in ("faults", "service", "stream"):
+for _room in ("faults", "pi_firmware", "service", "stream"):
     if str(_TESTS / _room) not in sys.path:
         sys.path.insert(0, str(_TESTS / _room))

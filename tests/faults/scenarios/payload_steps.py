@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from standing import is_stopped
+from vehicle import Vehicle
 
 from scenarios import disk
+from scenarios.background import Background
 from scenarios.step import Step
 
 if TYPE_CHECKING:
@@ -22,8 +25,12 @@ GAUGES = {
     "failing": "i2c:ina219@92:0x40",
     "nonsense": "i2c:ina219@93:0x40",
     "none": "i2c:max17048@98:0x36",
+    "stuck": "i2c:ina219@99:0x40",
 }
 _ENCODER_GIVES_NONE = 1
+_UNDERVOLTAGE, _THROTTLED = 0x1, 0x4
+_HELD_BACK_S = 0.02
+_NOISE_BYTES = 200
 
 
 @dataclass(frozen=True)
@@ -128,6 +135,64 @@ class GaugeFault(Step):
 
     def fix(self, world: World) -> None:
         world.configure(self, None)
+
+
+@dataclass(frozen=True)
+class Undervoltage(Step):
+    """The supply is too low, and the board halves its clock: it stands still half of the time."""
+
+    def inject(self, world: World) -> None:
+        world.disturb(self, "payload", "board_state", _UNDERVOLTAGE | _THROTTLED)
+
+        def hold_back() -> None:
+            run = world.run
+            run.send(signal.SIGSTOP)
+            time.sleep(_HELD_BACK_S)
+            run.send(signal.SIGCONT)
+
+        world.kept[id(self)] = Background(hold_back, _HELD_BACK_S).start()
+
+    def lacking(self, world: World) -> str:
+        told = [alarm["text"] for alarm in world.service.state()["alarms"]]
+        return "" if any("undervoltage" in text for text in told) else f"the page says {told}"
+
+    def fix(self, world: World) -> None:
+        world.kept.pop(id(self)).end()
+        world.disturb(self, "payload", "board_state", 0)
+
+
+@dataclass(frozen=True)
+class LineNoise(Step):
+    """An armed vehicle on a serial line that garbles: noise between all that it says."""
+
+    STARTS: ClassVar[bool] = True
+
+    def inject(self, world: World) -> None:
+        vehicle = Vehicle(world.folder / f"line-{id(self)}")
+        draw = world.draw()
+
+        def speak() -> None:
+            os.write(vehicle.master, draw.randbytes(_NOISE_BYTES))
+            vehicle.live(armed=True)
+            os.write(vehicle.master, draw.randbytes(_NOISE_BYTES))
+            vehicle.listen()
+
+        speaking = Background(speak, 0.2).at_end(vehicle.unplug).start()
+        world.kept[id(self)] = speaking
+        world.configure(self, {"autopilot.uri": f"serial:{vehicle.link}"})
+
+    def lacking(self, world: World) -> str:
+        speaking: Background = world.kept[id(self)]
+        note = world.heard.payload(NAME)
+        autopilot = note.autopilot if note is not None else None
+        if speaking.failure is not None:
+            return f"the line fell silent: {speaking.failure}"
+        armed = autopilot is not None and autopilot.armed
+        return "" if armed and speaking.acts else f"it is not heard to be armed: {autopilot}"
+
+    def fix(self, world: World) -> None:
+        world.configure(self, None)
+        world.kept.pop(id(self)).end()
 
 
 @dataclass(frozen=True)

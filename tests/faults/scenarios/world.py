@@ -40,7 +40,7 @@ _TICK_S, _LOOK_S, _TIMEOUT_S = 0.05, 0.5, 2.0
 HOPELESS = 3
 """The payload's exit status by which systemd starts it again."""
 _SHIMS = {
-    "payload": ("stepped_clock", "encoder_fault", "file_fault"),
+    "payload": ("stepped_clock", "encoder_fault", "file_fault", "board_state"),
     "ground": ("stepped_clock", "file_fault"),
 }
 
