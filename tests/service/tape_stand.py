@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +10,6 @@ import web_station as station
 
 from ground_station.service import bus_messages
 from ground_station.service.web.app import build
-from ground_station.service.web.server import listen, server
 from pi_firmware.wire.recording import RecordingReader, RecordingWriter
 
 T0_NS, RATE_HZ, SECONDS = 1_700_000_000_000_000_000, 30.0, 14.0
@@ -64,12 +61,5 @@ def serving(folder: Path, flight: Path) -> Iterator[int]:
     bus = station.SilentBus()
     web = build(station.run_of(folder, video_rate_hz=20.0), folder, bus, None)
     (folder / "recordings" / "flight.mcap").write_bytes(flight.read_bytes())
-    with listen("127.0.0.1", 0) as sock:
-        serving = server(web.guarded)
-        thread = threading.Thread(target=lambda: asyncio.run(serving.serve([sock])), daemon=True)
-        thread.start()
-        station.until(lambda: serving.started)
-        yield sock.getsockname()[1]
-        serving.should_exit = True
-        thread.join(10.0)
-        assert not thread.is_alive()
+    with station.serving(web) as port:
+        yield port

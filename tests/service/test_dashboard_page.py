@@ -1,9 +1,11 @@
-"""The dashboard in a real browser, against a station that says what a test wants it to say."""
+"""The dashboard in a real browser, on a station whose bus says what a test wants it to say."""
 
 from __future__ import annotations
 
 import base64
+import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,11 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fake_station import FRAMES, FakeStation, Payload, Served, sample_flight, sample_station
+import web_station
+from flown_station import FRAMES, FlownStation, Payload, flown, sample_flight
 
-from ground_station import presentation
+from ground_station import __version__, presentation
 from ground_station.geometry.camera import Camera
 from ground_station.service.web.app import STATIC, static_files
+from ground_station.service.web.jobs import Jobs
 
 SHARED = Path(presentation.__file__).parent / "web"
 
@@ -25,9 +29,9 @@ SIZES = {
     "desk": (1440, 900), "landscape": (1024, 768), "tablet": (820, 1180), "phone": (390, 844),
     "phone on its side": (844, 390),
 }  # fmt: skip
-# It reports a refused connection itself, whoever waits for it; it advises on reading canvases back,
-# which the tests do and the page does not; and on its own way of drawing without a GPU.
-OF_THE_BROWSER = ("ERR_CONNECTION", "willReadFrequently", "GL Driver Message")
+# It reports a refused connection or request itself, whoever waits for it; it advises on reading
+# canvases back, which the tests do and the page does not; and on its way of drawing without a GPU.
+OF_THE_BROWSER = ("ERR_CONNECTION", "409 (Conflict)", "willReadFrequently", "GL Driver Message")
 # The page's own clock is eleven days off, in all tests: it must not matter.
 WRONG_CLOCK = "const now = Date.now; Date.now = () => now() + 1e9;"
 WATCH_POLICY = (
@@ -39,7 +43,7 @@ WATCH_POLICY = (
 class Watched:
     """A page with all that it complained of."""
 
-    def __init__(self, browser: Any, served: Served) -> None:
+    def __init__(self, browser: Any, station: FlownStation) -> None:
         width, height = SIZES["desk"]
         size = {"width": width, "height": height}
         self.page = browser.new_context(viewport=size).new_page()
@@ -51,7 +55,7 @@ class Watched:
         self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
         self.page.add_init_script(WRONG_CLOCK)
         self.page.add_init_script(WATCH_POLICY)
-        self.page.goto(served.url)
+        self.page.goto(station.url)
         self.page.wait_for_selector('#link[data-phase="open"]')
         self.page.evaluate("window.marker = 'not loaded again'")
 
@@ -73,46 +77,44 @@ class Watched:
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
-    one = Served(sample_station())
-    sample_flight()
-    yield one
-    one.stop()
+def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FlownStation]:
+    payloads = Payload("blimp-1"), Payload("blimp-2", sequence=100)
+    with flown(tmp_path_factory.mktemp("station"), *payloads) as station:
+        yield station
 
 
 @pytest.fixture(scope="module")
-def opened(browser: Any, served: Served) -> Iterator[Watched]:
-    watched = Watched(browser, served)
+def opened(browser: Any, flying: FlownStation) -> Iterator[Watched]:
+    watched = Watched(browser, flying)
     yield watched
     watched.page.close()
 
 
 @pytest.fixture
-def shown(opened: Watched, served: Served) -> Iterator[Watched]:
-    """The page and a station that is as at its start; what the page complains of fails the test."""
-    fresh, station = sample_station(), served.station
-    for name in ("refuse", "answer_s", "recording", "demo", "floorplan", "map", "name"):
-        setattr(station, name, getattr(fresh, name))
-    for name, payload in fresh.payloads.items():
-        station.payloads[name].__dict__.update(
-            payload.__dict__ | {"sequence": station.payloads[name].sequence}
-        )
-    station.alarms.clear()
-    station.asked.clear()
+def station(flying: FlownStation, monkeypatch: pytest.MonkeyPatch) -> FlownStation:
+    """As at its start, in a folder of its own without recordings."""
+    monkeypatch.chdir(flying.folder)
+    flying.refuse, flying.answer_s, flying.recording, flying.job = "", 0.0, False, None
+    for one in flying.payloads.values():
+        one.__dict__.update(Payload(one.id, one.sequence).__dict__)
+    for path in (flying.folder / "recordings").iterdir():
+        path.unlink()
+    return flying
+
+
+@pytest.fixture
+def shown(opened: Watched, station: FlownStation) -> Iterator[Watched]:
+    """The page of the station; what it complains of fails the test."""
     opened.page.keyboard.press("1")
     opened.until("document.querySelector('#alarms').childElementCount === 0")
     opened.until("document.querySelector('.state').dataset.state === 'tracking'")
     opened.until("!document.querySelector('[data-phase=working]')")
+    station.asked.clear()
     yield opened
     assert opened.problems == []
     assert opened.page.evaluate("violations") == []
-    assert opened.hosts == {f"127.0.0.1:{served.port}"}
+    assert opened.hosts == {f"127.0.0.1:{station.port}"}
     assert opened.page.evaluate("window.marker") == "not loaded again"
-
-
-@pytest.fixture
-def station(served: Served) -> FakeStation:
-    return served.station
 
 
 def eventually(holds: Callable[[], bool]) -> None:
@@ -122,7 +124,7 @@ def eventually(holds: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def stand_still(watched: Watched, station: FakeStation, frame: int) -> None:
+def stand_still(watched: Watched, station: FlownStation, frame: int) -> None:
     """The first payload stays at a frame of the sample, and the page shows it."""
     one = station.payloads["blimp-1"]
     one.flies = False
@@ -145,7 +147,7 @@ def rgb(colour: str) -> list[int]:
 
 
 @pytest.mark.parametrize("frame", [40, 150])
-def test_the_blimp_is_drawn_where_it_is(shown: Watched, station: FakeStation, frame: int) -> None:
+def test_the_blimp_is_drawn_where_it_is(shown: Watched, station: FlownStation, frame: int) -> None:
     stand_still(shown, station, frame)
     x_m, y_m, _ = sample_flight().positions_m[frame]
     box = shown.page.locator("#plan-above").bounding_box()
@@ -164,7 +166,7 @@ def test_the_blimp_is_drawn_where_it_is(shown: Watched, station: FakeStation, fr
 
 
 def test_the_picture_is_the_newest_and_its_landmarks_lie_on_it(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
     for frame in (60, 120):
         stand_still(shown, station, frame)
@@ -173,9 +175,9 @@ def test_the_picture_is_the_newest_and_its_landmarks_lie_on_it(
         url = shown.page.evaluate("document.getElementById('video-picture').toDataURL()")
         png = np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8)
         picture = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE).astype(float)
-        jpeg = np.frombuffer(sample_flight().jpegs[frame // 2], np.uint8)
-        sent = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
-        assert np.abs(picture - sent).mean() < 2.0
+        quality = [cv2.IMWRITE_JPEG_QUALITY, station.run.station.http.jpeg_quality]
+        jpeg = cv2.imencode(".jpg", sample_flight().pictures[frame // 2], quality)[1]
+        assert np.abs(picture - cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)).mean() < 2.0
         u, v = sample_flight().points_px[frame][:2]
         box = shown.page.locator("#video-points").bounding_box()
         scale = min(box["width"] / 640, box["height"] / 480)
@@ -234,39 +236,39 @@ def test_the_scene_shows_the_map_and_can_be_turned(shown: Watched) -> None:
     shown.page.keyboard.press("0")
 
 
-def test_latencies_are_by_the_stations_clock(shown: Watched, station: FakeStation) -> None:
+def test_latencies_are_by_the_stations_clock(shown: Watched, station: FlownStation) -> None:
     shown.until("Number(document.querySelector('[data-f=pose]').textContent) > 0")
-    assert 20 <= float(shown.text("[data-f=pose]")) <= 60  # the fake's are 32 to 48 ms
+    assert 20 <= float(shown.text("[data-f=pose]")) <= 60  # the station's are 40 ms
     shown.until("Number(document.querySelector('[data-f=screen]').textContent) > 0")
     assert 0 < float(shown.text("[data-f=screen]")) < 10_000
-    eventually(lambda: any(heard["type"] == "shown" for heard in station.heard))
-    told = [heard["shown_ms"] for heard in station.heard if heard["type"] == "shown"]
-    assert all(0 < ms < 10_000 for ms in told)
+    told = re.compile(rb'to_screen_seconds_(?:sum|count){payload="blimp-1"} (\S+)')
+    eventually(lambda: bool(told.search(station.web.metrics.text())))
+    count, sum_s = (float(value) for value in told.findall(station.web.metrics.text()))
+    assert 0 < sum_s < 10 * count
 
 
 def test_an_alarm_is_loud_then_acknowledged_and_quiet_then_gone(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
-    station.alarm("lost", "alarm", "blimp-1", "LOST for 2 s: no landmarks")
-    row = '[data-id="lost/blimp-1"]'
+    one, row = station.payloads["blimp-1"], '[data-id="lost/blimp-1"]'
+    one.state, one.reason = "LOST", "no landmarks"
     shown.page.wait_for_selector(row)
-    assert "blimp-1: LOST for 2 s: no landmarks" in shown.text(row)
+    assert re.search("blimp-1: LOST for [23] s: no landmarks", shown.text(row))
     shown.until("document.title.startsWith('⚠ blimp-1: LOST')")
     assert "LOST" in shown.text("#say")
     loud = shown.page.locator(row).bounding_box()["height"]
     shown.page.click(f"{row} button")
     shown.page.wait_for_selector(f"{row}[data-seen]")
     assert shown.page.locator(row).bounding_box()["height"] < loud
-    station.end_alarms()
+    one.state = "TRACKING"
     shown.page.wait_for_selector(row, state="detached")
     shown.until("!document.title.startsWith('⚠')")
-    # When it comes again, it is new.
-    station.alarm("lost", "alarm", "blimp-1", "LOST for 2 s: no landmarks")
+    one.state = "LOST"  # when it comes again, it is new
     shown.page.wait_for_selector(f"{row}:not([data-seen])")
 
 
 def test_states_are_said_in_words_and_old_values_are_not_shown_as_current(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
     one = station.payloads["blimp-1"]
     one.state, one.reason = "DEGRADED", "few landmarks: 14 of 120"
@@ -289,7 +291,7 @@ def test_states_are_said_in_words_and_old_values_are_not_shown_as_current(
 
 
 def test_the_payloads_firmware_is_told_and_marked_when_an_update_did_not_stay(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
     one, place = station.payloads["blimp-1"], "#board [data-f=version]"
 
@@ -298,52 +300,61 @@ def test_the_payloads_firmware_is_told_and_marked_when_an_update_did_not_stay(
         assert shown.text(place) == text
         assert shown.page.locator(f"{place}[data-bad]").count() == bad
 
-    says(one.version, one.version, bad=False)
-    one.release, one.release_reason = "fell back", "0.0.1+gitnew: no frames <b>within</b> 120 s"
-    says(f"fell back to {one.version}", f"{one.version}: {one.release_reason}", bad=True)
-    one.version, one.release, one.release_reason = "0.9.0", "factory", ""
-    says("0.9.0", "0.9.0: the ground station is 0.0.0", bad=True)
-    one.version = ""  # an older payload
+    ours = f"{__version__}+git0123456789ab"
+    one.health = {"version": ours, "release": "update"}
+    says(ours, ours, bad=False)
+    reason = "0.0.1+gitnew: no frames <b>within</b> 120 s"
+    one.health |= {"release": "fell back", "release_reason": reason}
+    says(f"fell back to {ours}", f"{ours}: {reason}", bad=True)
+    one.health = {"version": "0.0.9", "release": "factory"}
+    says("0.0.9", f"0.0.9: the ground station is {__version__}", bad=True)
+    one.health = {}  # an older payload
     shown.until(f"document.querySelector('{place}').textContent === '–'")
     assert shown.page.locator(f"{place}[data-bad]").count() == 0
-    one.version, one.release = Payload(one.id).version, "update"
 
 
-def test_a_recording_starts_and_stops(shown: Watched, station: FakeStation) -> None:
+def test_a_recording_starts_and_stops(shown: Watched, station: FlownStation) -> None:
     shown.page.click("#act-record")
     shown.page.wait_for_selector("#act-record[data-on]")
-    assert station.asked == [("recording", {"active": True})]
+    assert station.asked == [("intake", {"do": "record-start"})]
     shown.until("document.querySelector('#act-record').textContent.includes('Stop')")
     shown.page.click("#act-record")
     shown.page.wait_for_selector("#act-record:not([data-on])")
-    assert station.asked[1:] == [("recording", {"active": False})]
+    assert station.asked[1:] == [("intake", {"do": "record-stop"})]
 
 
-def test_the_steps_lead_on_and_start_a_job(shown: Watched, station: FakeStation) -> None:
+def test_the_steps_lead_on_and_start_a_job(
+    shown: Watched, station: FlownStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(Jobs, "start", lambda _, step, words: started.append((step, words)))
+    for name in ("a", "b"):
+        web_station.write_recording(station.folder / "recordings" / f"{name}.mcap")
+    (station.folder / "<b>a walk<.mp4").touch()
     shown.page.keyboard.press("n")
     shown.page.wait_for_selector("#steps-dialog .step")
     rows = shown.page.locator("#steps-dialog .step").all_text_contents()
-    assert len(rows) == 3 and "done" in rows[0] and "to do" in rows[1] and "later" in rows[2]
-    assert "no map of <b>your own</b> yet" in rows[1]
-    assert "/srv/blimp" in shown.text("#steps-dialog [data-f=note]")
-    commands = shown.page.locator("#steps-dialog code").all_text_contents()
-    assert commands == ["blimp map build 'a b.mp4' --out maps/NAME"]
-    build = shown.page.locator("#steps-dialog .step[data-state=ready]")
+    assert len(rows) == 6 and "done" in rows[0] and "to do" in rows[3] and "later" in rows[4]
+    assert "videos: <b>a walk<.mp4" in rows[2]
+    assert str(station.folder) in shown.text("#steps-dialog [data-f=note]")
+    build = shown.page.locator("#steps-dialog .step").nth(3)
+    assert "blimp map build '<b>a walk<.mp4' --out" in build.text_content()
     build.locator("select").select_option("b.mcap")
-    build.locator("input").fill(" hall ")
-    station.refuse = "another job runs"
-    build.get_by_role("button", name="Start").click()
-    shown.until("document.querySelector('.step-outcome').textContent === 'another job runs'")
-    station.refuse = ""
-    build.get_by_role("button", name="Start").click()
-    shown.until("document.querySelector('.step-outcome').textContent.startsWith('It runs')")
-    asked = ("job", {"step": "build", "choice": "b.mcap", "map": "hall"})
-    assert station.asked == [asked, asked]
+    for name, outcome in (("atrium", "atrium: give it a name"), (" hall ", "It runs")):
+        build.locator("input").fill(name)
+        build.get_by_role("button", name="Start").click()
+        shown.until(f"document.querySelector('.step-outcome').textContent.startsWith('{outcome}')")
+    recording, out = (str(station.folder / name) for name in ("recordings/b.mcap", "maps/hall"))
+    assert started == [("build", ["blimp", "map", "build", recording, "--out", out])]
     shown.page.keyboard.press("Escape")
 
 
-def test_a_job_is_shown_with_its_progress_and_its_end(shown: Watched, station: FakeStation) -> None:
+def test_a_job_is_shown_with_its_progress_and_its_end(
+    shown: Watched, station: FlownStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also one that another page started."""
+    stopped: list[bool] = []
+    monkeypatch.setattr(Jobs, "stop", lambda _: stopped.append(True))
     assert shown.page.locator("#job").is_hidden()
     job = {"step": "build", "command": "blimp map build a.mcap", "started_ns": 1, "running": True}
     job |= {"status": None, "line": "pairs: 3 of 4", "share": 0.75, "page": ""}
@@ -352,7 +363,7 @@ def test_a_job_is_shown_with_its_progress_and_its_end(shown: Watched, station: F
     assert "75 % · pairs: 3 of 4" in shown.text("#job")
     assert shown.page.locator("#job a").is_hidden()
     shown.page.click("#job button")
-    eventually(lambda: ("job", None) in station.asked)
+    eventually(lambda: stopped == [True])
     station.job = job | {"share": None, "page": "http://127.0.0.1:4321/x/"}
     shown.until("document.querySelector('#job a').href === 'http://127.0.0.1:4321/x/'")
     for status, word in ((0, "is done"), (2, "failed"), (None, "was stopped")):
@@ -365,33 +376,34 @@ def test_a_job_is_shown_with_its_progress_and_its_end(shown: Watched, station: F
 
 
 def test_recordings_are_listed_and_deleted_by_a_second_press(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
-    file = "flight-000007-20260131T142530Z.mcap"
-    kept = {"file": file, "size_MB": 61.2, "modified_ns": 1, "started_ns": 1, "duration_s": 754.2}
-    station.recordings = [
-        kept | {"file": "now.mcap", "active": True, "maps": [], "duration_s": None},
-        kept | {"active": False, "maps": ["atrium", "<b>hall</b>"]},
-    ]
+    recordings, file = station.folder / "recordings", "flight-000007-20260131T142530Z.mcap"
+    web_station.write_recording(recordings / file, 754.2, ("atrium", "<b>hall<b>"))
+    os.utime(recordings / file, (1, 1))
+    (recordings / "now.mcap").touch()
+    os.truncate(recordings / "now.mcap", 61_200_000)
+    station.recording = True
+    shown.page.wait_for_selector("#act-record[data-on]")
     shown.page.keyboard.press("g")
     shown.until("document.querySelectorAll('.recordings li').length === 2")
-    assert "being written" in shown.text(".recordings li:nth-child(1)")
+    assert "being written · 61 MB" in shown.text(".recordings li:nth-child(1)")
     assert shown.page.locator(".recordings li:nth-child(1) button").count() == 0
     row = ".recordings li:nth-child(2)"
-    assert "atrium, <b>hall</b> · 12:34 · 61 MB" in shown.text(row)
+    assert "<b>hall<b>, atrium · 12:34 · 0.0 MB" in shown.text(row)
     links = shown.page.locator(f"{row} a").evaluate_all("links => links.map((a) => a.pathname)")
     assert links == [f"/api/recordings/{file}", f"/api/recordings/{file}/trajectory.txt"]
     deleter = shown.page.locator(f"{row} button:last-child")
     deleter.click()
-    assert station.asked == []
+    assert (recordings / file).exists()
     deleter.click()
     shown.until("document.querySelectorAll('.recordings li').length === 1")
-    assert station.asked == [("delete", file)]
+    assert [path.name for path in recordings.iterdir()] == ["now.mcap"]
     shown.page.keyboard.press("Escape")
 
 
 def test_a_refusal_says_why_and_work_shows_that_it_works(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
     station.refuse, station.answer_s = "the localizer is loading a map", 0.7
     working = shown.page.evaluate(
@@ -406,10 +418,10 @@ def test_a_refusal_says_why_and_work_shows_that_it_works(
     assert working
     shown.page.wait_for_selector('#act-relocalize[data-phase="refused"]')
     assert "refused: the localizer is loading a map" in shown.text("#outcome")
-    assert [what for what, _ in station.asked] == ["blimp-1/relocalize"]
+    assert station.asked == [("localizer/blimp-1", {"do": "relocalize"})]
 
 
-def test_what_is_dangerous_wants_the_payloads_name(shown: Watched, station: FakeStation) -> None:
+def test_what_is_dangerous_wants_the_payloads_name(shown: Watched, station: FlownStation) -> None:
     shown.page.click("#act-power")
     assert shown.page.locator("#power-shutdown").is_disabled()
     shown.page.fill("#power-word", "blimp-2")
@@ -419,27 +431,36 @@ def test_what_is_dangerous_wants_the_payloads_name(shown: Watched, station: Fake
     assert station.asked == []
     shown.page.click("#power-shutdown")
     eventually(lambda: len(station.asked) == 1)
-    assert station.asked == [("blimp-1/command", {"name": "shutdown", "arguments": {}})]
+    asked = {"do": "payload-command", "payload": "blimp-1", "name": "shutdown", "arguments": {}}
+    assert station.asked == [("intake", asked)]
 
 
 def test_a_map_is_chosen_and_one_without_a_plan_has_a_grid(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
+    name = "great-hall-of-the-east-wing"
+    ignored = shutil.ignore_patterns("*.mcap", "*.jpg", "floorplan.*")
+    shutil.copytree(web_station.ATRIUM, station.folder / "maps" / name, ignore=ignored)
     shown.page.click("#act-map")
-    shown.page.click("text=great-hall-of-the-east-wing")
+    shown.page.click(f"text={name}")
     shown.page.wait_for_selector("#plan-empty:not([hidden])")
-    assert station.asked == [("blimp-1/map", {"name": "great-hall-of-the-east-wing"})]
+    assert station.asked == [("localizer/blimp-1", {"do": "map", "name": name})]
     assert "no floor plan" in shown.text("#plan-empty")
     station.payloads["blimp-1"].map = "atrium"
     shown.page.wait_for_selector("#plan-empty", state="hidden")
+    shutil.rmtree(station.folder / "maps" / name)
 
 
 def test_events_are_newest_first_bounded_filtered_and_never_markup(
-    shown: Watched, station: FakeStation
+    shown: Watched, station: FlownStation
 ) -> None:
     for k in range(450):
-        station.event(("info", "warning", "alarm")[k % 3], f"event {k}", "blimp-1")
-    station.event("alarm", "<img src=x onerror=alert(1)><b>bold</b>", "blimp-1")
+        station.event(("info", "warning", "alarm")[k % 3], f"event {k}")
+        if k % 30 == 29:  # a viewer's queue is short
+            shown.until(
+                f"document.querySelector('.event .text')?.textContent.includes('event {k}')"
+            )
+    station.event("alarm", "<img src=x onerror=alert(1)><b>bold</b>")
     shown.until("document.querySelector('.event .text')?.textContent.includes('<b>bold</b>')")
     assert shown.page.locator(".event").count() == 200
     assert "event 449" in shown.text(".event:nth-child(2) .text")
@@ -449,7 +470,7 @@ def test_events_are_newest_first_bounded_filtered_and_never_markup(
     shown.page.click('.events [data-level="info"]')
 
 
-def test_keys_do_what_the_help_says(shown: Watched, station: FakeStation) -> None:
+def test_keys_do_what_the_help_says(shown: Watched, station: FlownStation) -> None:
     keys = shown.page.keyboard
     keys.press("?")
     shown.page.wait_for_selector("#help-dialog[open]")
@@ -457,7 +478,7 @@ def test_keys_do_what_the_help_says(shown: Watched, station: FakeStation) -> Non
     keys.press("Escape")
     shown.page.wait_for_selector("#help-dialog", state="hidden")
     keys.press("l")
-    eventually(lambda: ("blimp-1/relocalize", {}) in station.asked)
+    eventually(lambda: ("localizer/blimp-1", {"do": "relocalize"}) in station.asked)
     keys.press("2")
     shown.page.wait_for_selector('.payload[aria-label^="blimp-2"][aria-checked="true"]')
     shown.until("document.querySelector('#video-caption').textContent.includes('frame')")
@@ -491,52 +512,57 @@ def test_thirty_estimates_a_second_do_not_lay_the_page_out_thirty_times(shown: W
     session.detach()
 
 
+LONG_NAME = "a-very-long-name-of-a-payload-17"
+
+
+@pytest.fixture(scope="module")
+def crowded(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+    """A page of three payloads, of which one is hot and has the longest name that there may be."""
+    names = "blimp-1", "blimp-2", LONG_NAME
+    payloads = [Payload(name, sequence=40 * k) for k, name in enumerate(names)]
+    payloads[-1].health = {"temperature_C": 82.0}
+    with flown(tmp_path_factory.mktemp("crowded"), *payloads) as station:
+        watched = Watched(browser, station)
+        watched.page.wait_for_selector(f'[data-id="hot/{LONG_NAME}"]')
+        yield watched
+        watched.page.close()
+
+
 @pytest.mark.parametrize("size", list(SIZES))
-def test_nothing_runs_over_its_edge(shown: Watched, station: FakeStation, size: str) -> None:
-    name = "the-very-long-name-of-a-payload-number-17"
-    chip = f'.payload[aria-label^="{name}"]'
-    station.payloads[name] = Payload(name, first=80)
+def test_nothing_runs_over_its_edge(crowded: Watched, size: str) -> None:
     width, height = SIZES[size]
-    shown.page.set_viewport_size({"width": width, "height": height})
-    try:
-        shown.page.wait_for_selector(chip)  # or its alarm is of nobody
-        station.alarm("hot", "warning", name, "the payload's processor has 82 °C")
-        shown.page.wait_for_selector(f'[data-id="hot/{name}"]')
-        shown.page.wait_for_timeout(300)
-        over = shown.page.evaluate(
-            """selectors => {
-              // Of a machine that cannot follow; the page's own are back at its next look.
-              for (const name of ["pose", "screen", "pose99", "screen99"])
-                document.querySelector(`[data-f=${name}]`).textContent = "13929";
-              return [...document.querySelectorAll(selectors)]
-                .filter((node) => node.scrollWidth > node.clientWidth + 1)
-                .map((node) => `${node.className}: ${node.textContent.trim().slice(0, 40)}`);
-            }""",
-            "html, .bar, .page, .metric, .lines div, .lines i, .big, .pairs, "
-            ".fates td:first-child, .act span, .state-word, .alarm, .banner",
-        )
-        assert over == []
-        # State, charge and commands are in sight wherever one has scrolled to.
-        out_of_sight = shown.page.evaluate(
-            """() => {
-              document.querySelector(".events").scrollIntoView();
-              const seen = (node) => {
-                const box = node.getBoundingClientRect();
-                return box.height && box.top >= 0 && box.bottom <= innerHeight;
-              };
-              return [".payload[aria-checked=true] use", ".act", "#bar-battery b, #battery b"]
-                .filter((name) => ![...document.querySelectorAll(name)].some(seen));
-            }"""
-        )
-        assert out_of_sight == []
-    finally:
-        del station.payloads[name]
-        shown.page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
-        shown.page.wait_for_selector(chip, state="detached")
+    crowded.page.set_viewport_size({"width": width, "height": height})
+    crowded.page.wait_for_timeout(300)
+    over = crowded.page.evaluate(
+        """selectors => {
+          // Of a machine that cannot follow; the page's own are back at its next look.
+          for (const name of ["pose", "screen", "pose99", "screen99"])
+            document.querySelector(`[data-f=${name}]`).textContent = "13929";
+          return [...document.querySelectorAll(selectors)]
+            .filter((node) => node.scrollWidth > node.clientWidth + 1)
+            .map((node) => `${node.className}: ${node.textContent.trim().slice(0, 40)}`);
+        }""",
+        "html, .bar, .page, .metric, .lines div, .lines i, .big, .pairs, "
+        ".fates td:first-child, .act span, .state-word, .alarm, .banner",
+    )
+    assert over == []
+    # State, charge and commands are in sight wherever one has scrolled to.
+    out_of_sight = crowded.page.evaluate(
+        """() => {
+          document.querySelector(".events").scrollIntoView();
+          const seen = (node) => {
+            const box = node.getBoundingClientRect();
+            return box.height && box.top >= 0 && box.bottom <= innerHeight;
+          };
+          return [".payload[aria-checked=true] use", ".act", "#bar-battery b, #battery b"]
+            .filter((name) => ![...document.querySelectorAll(name)].some(seen));
+        }"""
+    )
+    assert out_of_sight == []
 
 
 def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
-    shown: Watched, served: Served
+    shown: Watched, station: FlownStation
 ) -> None:
     ground, light = "getComputedStyle(document.body).backgroundColor", "rgb(233, 237, 240)"
     assert shown.page.evaluate(ground) == light
@@ -545,7 +571,7 @@ def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
     shown.page.click("#help-open")
     shown.page.click('[data-scheme="dark"]')
     another = shown.page.context.new_page()
-    another.goto(served.url)
+    another.goto(station.url)
     another.wait_for_selector('.video[data-place="main"]')
     assert another.evaluate(ground) == shown.page.evaluate(ground) != light
     another.close()
@@ -555,30 +581,25 @@ def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
     shown.page.click('.plan [data-do="swap"]')
 
 
-def test_who_is_signed_out_is_asked_for_the_token(browser: Any) -> None:
-    other = Served(sample_station())
-    watched = Watched(browser, other)
-    try:
-        other.stop()
-        other.station.signed_out = True
-        other.start()
+def test_who_is_signed_out_is_asked_for_the_token(browser: Any, tmp_path: Path) -> None:
+    with flown(tmp_path, Payload("blimp-1")) as station:
+        watched = Watched(browser, station)
+        station.stop()
+        station.start(token=web_station.TOKEN)
         watched.page.wait_for_url("**/login")
-    finally:
         watched.page.close()
-        other.stop()
 
 
 def test_a_station_that_was_gone_is_taken_up_again_without_a_reload(
-    shown: Watched, served: Served
+    shown: Watched, station: FlownStation
 ) -> None:
-    served.stop()
+    station.stop()
     shown.page.wait_for_selector("#offline:not([hidden])")
     assert re.search(r"No connection to the station since \d\d:\d\d:\d\d", shown.text("#offline"))
     shown.until("document.title.startsWith('⚠ No connection')")
     shown.until("document.querySelector('[data-f=word]').textContent === 'Offline'")
     shown.page.wait_for_selector(".metrics[data-stale]")
-    served.station.refuse = "never asked"
-    served.start()
+    station.start()
     shown.page.wait_for_selector("#offline", state="hidden")
     shown.until("document.querySelector('[data-f=word]').textContent === 'Tracking'")
     caption = shown.text("#video-caption")

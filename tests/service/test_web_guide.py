@@ -67,16 +67,8 @@ def heard(estimate: Any = None, demo: bool = False, **payload: Any) -> dict[str,
 
 
 def record(name: str = "flight.mcap") -> None:
-    from mcap.writer import Writer
-
     Path("recordings").mkdir(exist_ok=True)
-    with Path("recordings", name).open("wb") as file:
-        mcap = Writer(file)
-        mcap.start()
-        channel = mcap.register_channel("x", "json", 0)
-        for at_ns in (0, int(2e9)):
-            mcap.add_message(channel, at_ns, b"{}", at_ns)
-        mcap.finish()
+    station.write_recording(Path("recordings", name))
 
 
 def own_map(name: str = "hall", registered: bool = True, inputs: str = "flight.mcap") -> None:

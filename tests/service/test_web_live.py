@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import socket
-import threading
 import time
 from collections import Counter
 
@@ -21,7 +20,6 @@ from viewing import connect, next_of, run
 from ground_station.service import bus_messages
 from ground_station.service.web import viewer as viewer_module
 from ground_station.service.web.app import build
-from ground_station.service.web.server import listen, server
 from ground_station.service.web.video import Video
 from ground_station.service.web.viewer import SLOTS, TEXTS, Outbox
 
@@ -33,16 +31,9 @@ def served(tmp_path):
     """The application behind the real server, on a thread; its bus is the test's."""
     bus = station.SilentBus()
     web = build(station.run_of(tmp_path, viewers=3, video_rate_hz=20.0), tmp_path, bus, None)
-    with listen("127.0.0.1", 0) as sock:
-        serving = server(web.guarded)
-        thread = threading.Thread(target=lambda: asyncio.run(serving.serve([sock])), daemon=True)
-        thread.start()
-        station.until(lambda: serving.started)
+    with station.serving(web) as port:
         station.say_all(bus.put)
-        yield web, bus, sock.getsockname()[1]
-        serving.should_exit = True
-        thread.join(10.0)
-        assert not thread.is_alive()
+        yield web, bus, port
 
 
 def test_a_viewer_is_greeted_with_everything_and_then_told_what_changes(served):

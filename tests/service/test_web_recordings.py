@@ -22,20 +22,6 @@ def shelf(tmp_path, served):
     return tmp_path / "recordings"
 
 
-def write_recording(path, seconds=2.0, maps=()):
-    from mcap.writer import Writer
-
-    with path.open("wb") as file:
-        mcap = Writer(file)
-        mcap.start()
-        for name in maps:
-            mcap.add_metadata(f"map {name}", {"name": name})
-        channel = mcap.register_channel("x", "json", 0)
-        for at_ns in (0, int(seconds * 1e9)):
-            mcap.add_message(channel, at_ns, b"{}", at_ns)
-        mcap.finish()
-
-
 def open_files(path):
     links = (os.path.realpath(link) for link in Path("/proc/self/fd").iterdir())
     return [link for link in links if link == str(path)]
@@ -43,8 +29,8 @@ def open_files(path):
 
 def test_recordings_are_listed_with_size_and_duration(served, shelf):
     client, bus, _ = served
-    write_recording(shelf / "a.mcap", maps=("hall", "hall", "atrium"))
-    write_recording(shelf / "b.mcap", 3.5)
+    station.write_recording(shelf / "a.mcap", maps=("hall", "hall", "atrium"))
+    station.write_recording(shelf / "b.mcap", 3.5)
     (shelf / "cut.mcap").write_bytes((shelf / "a.mcap").read_bytes()[:-30])
     (shelf / "not-one.txt").write_text("x")
     (shelf / "folder.mcap").mkdir()
@@ -95,13 +81,13 @@ def test_a_recording_is_downloaded_whole_or_in_part(served, shelf):
 @pytest.mark.parametrize("rest", ["", "/trajectory.txt"])
 def test_no_path_leaves_the_folder(served, shelf, name, rest):
     secret = shelf.parent / "secret.mcap"
-    write_recording(secret)
-    write_recording(shelf / "a.mcap")
-    write_recording(shelf / ".hidden.mcap")
+    station.write_recording(secret)
+    station.write_recording(shelf / "a.mcap")
+    station.write_recording(shelf / ".hidden.mcap")
     (shelf / "a.txt").write_text("x")
     (shelf / "folder.mcap").mkdir()
     (shelf / "inner").mkdir()
-    write_recording(shelf / "inner" / "a.mcap")
+    station.write_recording(shelf / "inner" / "a.mcap")
     (shelf / "link.mcap").symlink_to(secret)
     os.mkfifo(shelf / "pipe.mcap")
     assert served[0].get(f"/api/recordings/{name}{rest}").status_code in (404, 422)
@@ -113,7 +99,7 @@ def test_no_path_leaves_the_folder(served, shelf, name, rest):
 def test_a_recording_is_deleted_but_not_the_one_being_written(served, shelf):
     client, bus, _ = served
     for name in ("a.mcap", "b.mcap"):
-        write_recording(shelf / name)
+        station.write_recording(shelf / name)
     bus.put(
         bus_messages.RECORDING, bus_messages.STATION, station.recording(active=True, file="b.mcap")
     )
@@ -130,7 +116,7 @@ def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypa
     client, _, _ = served
     from ground_station.recording import export
 
-    write_recording(shelf / "a.mcap")
+    station.write_recording(shelf / "a.mcap")
     monkeypatch.setattr(export, "tum_lines", lambda path: iter(["# tum\n", "1 2 3 4 5 6 7 8\n"]))
     for _ in range(3):  # each ends and lets the next one in
         answer = client.get("/api/recordings/a.mcap/trajectory.txt")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import subprocess
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,8 @@ from ground_station.service.settings import (
     Run,
     StationSettings,
 )
+from ground_station.service.web.app import Web
+from ground_station.service.web.server import listen, server
 from pi_firmware.wire import messages
 
 with warnings.catch_warnings():  # of a client that starlette would rather have
@@ -75,11 +79,11 @@ class SilentBus:
         return self.answer
 
 
-def run_of(folder: Path, **http: Any) -> Run:
+def run_of(folder: Path, *, shelf: Path = ATRIUM.parent, **http: Any) -> Run:
     """Settings with the sample map, whose recordings lie in folder/recordings."""
     (folder / "recordings").mkdir(exist_ok=True)
     station = StationSettings(
-        map=MapSettings(folder=str(ATRIUM), shelf=str(ATRIUM.parent)),
+        map=MapSettings(folder=str(shelf / "atrium"), shelf=str(shelf)),
         recording=RecordingSettings(folder=str(folder / "recordings")),
         http=HttpSettings(**{"port": 0, **http}),
     )
@@ -180,6 +184,36 @@ def until(condition: Callable[[], Any], limit_s: float = 20.0) -> Any:
         assert time.monotonic() < deadline_s, "it did not happen in time"
         time.sleep(0.02)
     return found
+
+
+@contextlib.contextmanager
+def serving(web: Web, port: int = 0) -> Iterator[int]:
+    """The application behind the real server, in a thread; its port of loopback."""
+    with listen("127.0.0.1", port) as sock:
+        serving = server(web.guarded)
+        thread = threading.Thread(target=lambda: asyncio.run(serving.serve([sock])), daemon=True)
+        thread.start()
+        until(lambda: serving.started)
+        yield sock.getsockname()[1]
+        web.loop().call_soon_threadsafe(web.live.close)
+        serving.should_exit = True
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def write_recording(path: Path, seconds: float = 2.0, maps: Iterable[str] = ()) -> None:
+    """The smallest that is one: it has a length, and says in which maps it was flown."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        mcap = Writer(file)
+        mcap.start()
+        for name in maps:
+            mcap.add_metadata(f"map {name}", {"name": name})
+        channel = mcap.register_channel("x", "json", 0)
+        for at_ns in (0, int(seconds * 1e9)):
+            mcap.add_message(channel, at_ns, b"{}", at_ns)
+        mcap.finish()
 
 
 @contextlib.contextmanager
