@@ -1,14 +1,12 @@
-"""The checks of a recording find what is wrong with it, and nothing in what is whole."""
+"""The check of recordings finds what is wrong with one, and nothing in what is whole."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mcap.opcode import Opcode
-from mcap_doctor import MAGIC, complaints
+from mcap_doctor import complaints
 
 from pi_firmware.wire.recording import RecordingWriter
 
@@ -30,60 +28,16 @@ def test_what_is_whole_has_no_complaint(recording: Path) -> None:
     assert complaints(recording) == [] and complaints(SAMPLE) == []
 
 
-def at(data: bytes, opcode: int, which: int = 0) -> int:
-    """Where the content of a record begins."""
-    place, found = len(MAGIC), []
-    while place < len(data) - len(MAGIC):
-        code, length = struct.unpack_from("<BQ", data, place)
-        if code == opcode:
-            found.append(place + 9)
-        place += 9 + length
-    return found[which]
+def test_another_byte_in_a_message_or_in_the_summary_is_found(recording: Path) -> None:
+    data = recording.read_bytes()
+    (begins,) = struct.unpack("<Q", data[-28:-20])
+    for place in [data.index(b'"k": 2'), *range(begins, len(data) - 8, 5)]:
+        recording.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        assert complaints(recording), place
 
 
-def plus_one(data: bytearray, place: int) -> None:
-    data[place] = (data[place] + 1) % 256
-
-
-@pytest.mark.parametrize(
-    ("opcode", "offset", "expected"),
-    [
-        (Opcode.CHUNK, 0, "other times"),  # its start time
-        (Opcode.CHUNK, 16, "another size"),
-        (Opcode.CHUNK, 24, "another CRC"),
-        (Opcode.MESSAGE_INDEX, 6, "points elsewhere"),  # the first log time
-        (Opcode.CHUNK_INDEX, 0, "tells of another"),
-        (Opcode.CHUNK_INDEX, 16, "no chunk at"),
-        (Opcode.CHUNK_INDEX, 38, "lie elsewhere"),  # a message index's offset
-        (Opcode.METADATA_INDEX, 8, "no metadata payload"),
-        (Opcode.STATISTICS, 0, "message_count is 41, not 40"),
-        (Opcode.STATISTICS, 8, "schema_count"),
-        (Opcode.STATISTICS, 22, "chunk_count"),
-        (Opcode.STATISTICS, 34, "message_end_time"),
-        (Opcode.FOOTER, 0, "the summary begins elsewhere"),
-        (Opcode.FOOTER, 16, "the checksum of the summary"),
-    ],
-)
-def test_a_number_that_is_another_is_found(
-    recording: Path, opcode: int, offset: int, expected: str
-) -> None:
-    data = bytearray(recording.read_bytes())
-    plus_one(data, at(bytes(data), opcode) + offset)
-    recording.write_bytes(data)
-    assert any(expected in complaint for complaint in complaints(recording))
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda data: data[:-1],
-        lambda data: data[1:],
-        lambda data: data[: len(data) // 2],
-        lambda data: MAGIC,
-        lambda data: MAGIC + MAGIC,
-        lambda data: b"",
-    ],
-)
-def test_a_file_without_its_ends_is_found(recording: Path, spoil: Callable[[bytes], bytes]) -> None:
-    recording.write_bytes(spoil(recording.read_bytes()))
-    assert complaints(recording)
+def test_a_file_that_is_cut_is_found(recording: Path) -> None:
+    data = recording.read_bytes()
+    for cut in (data[:-1], data[1:], data[: len(data) // 2], data[:8], b""):
+        recording.write_bytes(cut)
+        assert complaints(recording), len(cut)
