@@ -11,7 +11,6 @@ import hashlib
 import os
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ground_station.arrays import F64, U8
@@ -80,11 +79,8 @@ def _right_distances(extractor: Extractor, pairs: Pairs) -> F64:
     found = [np.empty(0)]
     for first, second, matrix in pairs:
         one, other = extractor.extract(first), extractor.extract(second)
-        if not len(one) or not len(other):
-            continue
-        feature, match = homographic.mutual_nearest(one.descriptors, other.descriptors)
-        there = cv2.perspectiveTransform(one.keypoints_px[feature][None].astype(float), matrix)[0]
-        off_px = np.linalg.norm(there - other.keypoints_px[match], axis=1)
-        apart = one.descriptors[feature] - other.descriptors[match]
-        found.append(np.linalg.norm(apart, axis=1)[off_px <= homographic.LIMIT_PX])
+        again = homographic.found_again(one, other, matrix, (first.shape, second.shape))
+        right = again.matches[again.apart_px <= homographic.NEAR_PX]
+        apart = one.descriptors[right[:, 0]] - other.descriptors[right[:, 1]]
+        found.append(np.linalg.norm(apart, axis=1))
     return np.concatenate(found)

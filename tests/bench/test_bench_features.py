@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from ground_station.bench.features import homographies, table, timing
-from ground_station.bench.features.homographies import Pair, Score, project, score
+from ground_station.bench.features.homographies import Pair, Score, score
 from ground_station.errors import InputError
+from ground_station.feature_models.homographic import Found, project
 from ground_station.features import extractors
 from ground_station.features.extractor import Features
 
@@ -45,13 +46,14 @@ def test_counts_are_those_made_by_hand():
     second = features(
         [[20, 10], [60, 52.9], [40, 40], [3, 90]], [eye[0], eye[1], eye[3], eye[5] + 0.1 * eye[2]]
     )
-    found = score(first, second, flat())
-    assert found.keypoints == (5, 4)
+    made = score(first, second, flat())
+    told, found = made.document(), made.found
+    assert told["keypoints"] == (5, 4)
     # Of the first 4 are in view (one is not), of the second 3 (x = 3 would be at -7).
-    assert found.seen == 4 + 3
-    assert found.repeated == 2 + 2
+    assert told["seen"] == 4 + 3
+    assert told["repeated"] == 2 + 2
     assert found.repeatability == pytest.approx(4 / 7)
-    assert (found.matches, found.correct) == (4, 2)
+    assert (told["matches"], told["correct"]) == (4, 2)
     assert found.accuracy == 0.5
 
 
@@ -59,16 +61,16 @@ def test_a_match_is_correct_up_to_three_pixels():
     eye = np.eye(4)
     for off, expected in ((3.0, 1), (3.01, 0)):
         first, second = features([[10, 10]] * 2, eye[:2]), features([[20 + off, 10]] * 2, eye[:2])
-        assert score(first, second, flat()).correct == 2 * expected
+        assert score(first, second, flat()).found.correct == 2 * expected
 
 
 def test_nothing_found_scores_nothing():
     none = Features(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 4)))
     some = features([[10, 10]], [[1, 0, 0, 0]])
     for first, second in ((none, none), (none, some), (some, none)):
-        found = score(first, second, flat())
-        assert (found.repeatability, found.accuracy) == (0, 0)
-        assert found.corners_px == math.inf
+        made = score(first, second, flat())
+        assert (made.found.repeatability, made.found.accuracy) == (0, 0)
+        assert made.corners_px == math.inf
 
 
 @pytest.mark.parametrize("name", ["rootsift", "orb"])
@@ -78,7 +80,7 @@ def test_a_picture_and_its_warp_are_matched_and_give_the_homography(name):
     (found,) = homographies.measure(
         extractors.create(name, 800), [Pair("wall 1-2", first, second, WARP)]
     )
-    assert found.repeatability > 0.7 and found.accuracy > 0.8
+    assert found.found.repeatability > 0.7 and found.found.accuracy > 0.8
     assert found.corners_px < 1
 
 
@@ -90,7 +92,7 @@ def test_a_wrong_truth_is_told_by_all_measures():
     (found,) = homographies.measure(
         extractors.create("rootsift", 800), [Pair("wall 1-2", first, second, wrong)]
     )
-    assert found.accuracy < 0.05
+    assert found.found.accuracy < 0.05
     assert found.corners_px == pytest.approx(12, rel=0.2)
 
 
@@ -101,18 +103,24 @@ def test_projection_is_opencvs():
 
 
 def test_means_are_over_pairs_and_by_scene():
+    def found(repeated: int, correct: int) -> Found:
+        """Of ten each."""
+        order = np.arange(10)
+        nearest_px, apart_px = (np.where(order < n, 0.0, 9.0) for n in (repeated, correct))
+        return Found(nearest_px, np.zeros((10, 2), np.int32), apart_px)
+
     scores = [
-        Score("a 1-2", (10, 20), 10, 5, 10, 9, 0.5),
-        Score("a 1-3", (10, 20), 10, 10, 10, 7, 4.0),
-        Score("b 1-2", (30, 30), 10, 0, 10, 2, math.inf),
+        Score("a 1-2", (10, 20), found(5, 9), 0.5),
+        Score("a 1-3", (10, 20), found(10, 7), 4.0),
+        Score("b 1-2", (30, 30), found(0, 2), math.inf),
     ]
-    found = homographies.summary(scores)
-    assert found["repeatability"] == pytest.approx(0.5)
-    assert found["accuracy"] == pytest.approx(0.6)
-    assert found["scenes"] == {"a": pytest.approx(0.8), "b": pytest.approx(0.2)}
-    assert found["homography"] == {"1": pytest.approx(1 / 3), "3": pytest.approx(1 / 3),
+    told = homographies.summary(scores)
+    assert told["repeatability"] == pytest.approx(0.5)
+    assert told["accuracy"] == pytest.approx(0.6)
+    assert told["scenes"] == {"a": pytest.approx(0.8), "b": pytest.approx(0.2)}
+    assert told["homography"] == {"1": pytest.approx(1 / 3), "3": pytest.approx(1 / 3),
                                    "5": pytest.approx(2 / 3)}  # fmt: skip
-    assert found["keypoints"] == pytest.approx((15 + 15 + 30) / 3)
+    assert told["keypoints"] == pytest.approx((15 + 15 + 30) / 3)
 
 
 def write_pair(folder: Path) -> None:

@@ -14,7 +14,7 @@ from onnx import numpy_helper
 
 from ground_station.feature_models import comparison, homographic, quantize
 from ground_station.features import model
-from ground_station.features.extractor import FeatureError, Features
+from ground_station.features.extractor import FeatureError
 
 
 def picture(seed: int, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
@@ -103,24 +103,6 @@ def test_a_warp_shows_an_inner_part_and_says_where(tmp_path: Path) -> None:
         assert abs(patch.mean() - warped[y, x]) < 12
     again, same = homographic.warp(image, np.random.default_rng(3))
     assert np.array_equal(warped, again) and np.array_equal(matrix, same)
-
-
-def features(points: list[tuple[float, float]], descriptors: np.ndarray) -> Features:
-    return Features(np.array(points, np.float32), np.ones(len(points), np.float32), descriptors)
-
-
-def test_matches_are_counted_by_the_definition() -> None:
-    """Five points shifted by 10 px: one 2.9 px off, one 3.1, one out of sight, one not mutual."""
-    shift = np.array([[1, 0, 10], [0, 1, 0], [0, 0, 1]], float)
-    eye = np.eye(6, dtype=np.float32)
-    first = features(
-        [(10, 10), (30, 10), (50, 10), (95, 10), (70, 50)], np.stack([*eye[:4], eye[0] * 0.9])
-    )
-    second = features([(20, 10), (42.9, 10), (63.1, 10), (5, 10)], eye[:4])
-    assert homographic.correct_matches(first, second, shift, (60, 100)) == (2, 3)
-    assert homographic.correct_matches(first, features([], eye[:0]), shift, (60, 100)) == (0, 0)
-    none = features([], eye[:0])
-    assert homographic.correct_matches(none, second, shift, (60, 100)) == (0, 0)
 
 
 def test_frames_are_taken_evenly_in_one_pass() -> None:
