@@ -6,8 +6,7 @@ import errno
 import functools
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from pi_firmware.recording import Recorder
@@ -120,14 +119,6 @@ def is_cut(path: Path) -> bool:
     reader = RecordingReader(path)
     reader.topics()
     return reader.cut
-
-
-def eventually(condition: Callable[[], object]) -> None:
-    """Waits until it is true; fails when that takes absurdly long."""
-    until = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < until, "waited in vain"
-        time.sleep(0.005)
 
 
 class FullDisk(DurableFile):

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from vehicle import Vehicle
+from waiting import eventually
 
 from pi_firmware import autopilot
 from pi_firmware.settings import AutopilotSettings
@@ -63,13 +64,6 @@ def pilot(vehicle: Vehicle) -> Iterator[Pilot]:
     made.autopilot.stop()
 
 
-def until(done: Callable[[], Any], also: Callable[[], Any] = lambda: None) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not done():
-        assert time.monotonic() < end_s, "it did not come"
-        also()
-
-
 def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
     vehicle: Vehicle, pilot: Pilot
 ) -> None:
@@ -77,7 +71,7 @@ def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
         pilot.pose(1.0)
         vehicle.listen()
 
-    until(lambda: vehicle.estimates(), give)
+    eventually(lambda: vehicle.estimates(), step=give)
     first = vehicle.estimates()[0]
     assert (first.x, first.y, first.z) == pytest.approx((1, -2, -3))
     assert (first.roll, first.pitch, first.yaw) == pytest.approx((0, 0, 0), abs=1e-6)
@@ -93,7 +87,7 @@ def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
         pilot.pose(1.0, relocalized=True)
         vehicle.listen()
 
-    until(lambda: vehicle.estimates()[-1].reset_counter >= 1, give_relocalized)
+    eventually(lambda: vehicle.estimates()[-1].reset_counter >= 1, step=give_relocalized)
 
 
 def x25(data: bytes) -> int:
@@ -119,7 +113,7 @@ def test_a_pose_with_velocity_is_an_odometry_byte_by_byte(vehicle: Vehicle, pilo
                 data += os.read(vehicle.master, 4096)
 
     head = b"\x4b\x01\x00"  # message 331
-    until(lambda: head in data and len(data) - data.index(head) > 300, give)
+    eventually(lambda: head in data and len(data) - data.index(head) > 300, step=give)
     frame = data[data.index(head) - 7 :]
     magic, length, _, _, _, system, component = frame[:7]
     assert (magic, system, component) == (0xFD, 1, 197)
@@ -149,13 +143,15 @@ def test_stale_and_lost_poses_never_arrive(vehicle: Vehicle, pilot: Pilot) -> No
         pilot.pose(50.0, age_ns=2 * 10**9) if count % 2 else pilot.pose(60.0, state="LOST")
         vehicle.listen()
 
-    until(lambda: pilot.told and pilot.told[-1].stale > 3 and pilot.told[-1].lost > 3, give)
+    eventually(
+        lambda: pilot.told and pilot.told[-1].stale > 3 and pilot.told[-1].lost > 3, step=give
+    )
 
     def give_good() -> None:
         pilot.pose(1.0)
         vehicle.listen()
 
-    until(lambda: vehicle.estimates(), give_good)
+    eventually(lambda: vehicle.estimates(), step=give_good)
     assert {m.x for m in vehicle.estimates()} == {1.0}
 
 
@@ -172,7 +168,7 @@ def test_its_heartbeat_attitude_and_battery_come_back(vehicle: Vehicle, pilot: P
             os.write(vehicle.master, b"\xfd\xff\x00")
         vehicle.listen()
 
-    until(lambda: pilot.told and pilot.told[-1].battery_V, live)
+    eventually(lambda: pilot.told and pilot.told[-1].battery_V, step=live)
     state = pilot.told[-1]
     assert state.connected and state.heartbeats > 0
     assert state.armed is True and state.mode == 5
@@ -192,7 +188,7 @@ def test_unknown_figures_and_other_senders_are_not_taken(vehicle: Vehicle, pilot
     vehicle.say(unknown)
     vehicle.say(nan)
     before = len(pilot.told)
-    until(lambda: len(pilot.told) > before + 5, vehicle.listen)
+    eventually(lambda: len(pilot.told) > before + 5, step=vehicle.listen)
     state = pilot.told[-1]
     assert not state.connected and state.heartbeats == 0
     assert (state.battery_V, state.battery_A, state.battery_percentage) == (None, None, None)
@@ -206,14 +202,14 @@ def test_a_line_that_is_unplugged_is_opened_again_and_nothing_waits_for_it(
         pilot.pose(1.0)
         vehicle.listen()
 
-    until(lambda: vehicle.estimates(), give)
+    eventually(lambda: vehicle.estimates(), step=give)
     vehicle.unplug()
     for _ in range(1000):
         pilot.pose(1.0)
     vehicle.plug()
     vehicle.heard.clear()
-    until(lambda: vehicle.estimates(), give)
-    until(lambda: pilot.told[-1].lines_opened >= 2, give)
+    eventually(lambda: vehicle.estimates(), step=give)
+    eventually(lambda: pilot.told[-1].lines_opened >= 2, step=give)
 
 
 def test_a_line_that_nobody_reads_neither_blocks_poses_nor_the_end(
@@ -233,7 +229,7 @@ def test_a_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
     settings = AutopilotSettings(uri=f"serial:{tmp_path}/none", period_s=0.1)
     waiting = autopilot.open_autopilot(settings, told.append)
     waiting.start()
-    until(lambda: len(told) > 1, lambda: time.sleep(0.01))
+    eventually(lambda: len(told) > 1, step=lambda: time.sleep(0.01))
     waiting.stop()
     assert not told[-1].connected and told[-1].lines_opened == 0
     assert "No such file" in told[-1].reason
@@ -242,9 +238,9 @@ def test_a_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
 def test_a_vehicle_that_falls_silent_is_not_quoted_any_more(
     vehicle: Vehicle, pilot: Pilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    until(lambda: pilot.told and pilot.told[-1].connected, vehicle.live)
+    eventually(lambda: pilot.told and pilot.told[-1].connected, step=vehicle.live)
     monkeypatch.setattr("pi_firmware.autopilot.line._SILENT_S", 0.05)
-    until(lambda: not pilot.told[-1].connected, vehicle.listen)
+    eventually(lambda: not pilot.told[-1].connected, step=vehicle.listen)
     assert pilot.autopilot.armed  # as far as anybody knows: what would stop its video is refused
     assert pilot.told[-1].battery_V is None and pilot.told[-1].armed is None
 
@@ -266,7 +262,7 @@ def test_a_telemetry_that_fails_does_not_stop_the_poses(vehicle: Vehicle) -> Non
         )  # fmt: skip
         vehicle.listen()
 
-    until(lambda: len(vehicle.estimates()) > 3, give)
+    eventually(lambda: len(vehicle.estimates()) > 3, step=give)
     pilot.stop()
 
 
@@ -304,7 +300,7 @@ def test_a_pose_from_the_ground_reaches_the_autopilot_through_the_program(
             vehicle.live()
             vehicle.listen()
 
-        until(lambda: vehicle.estimates() and states and states[-1].connected, give)
+        eventually(lambda: vehicle.estimates() and states and states[-1].connected, step=give)
         assert vehicle.estimates()[-1].z == pytest.approx(-3)
         ground.close()
         program.terminate()

@@ -1,11 +1,11 @@
 """A test camera goes and hangs when asked, across its being closed and opened again."""
 
 import time
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from waiting import eventually
 
 from pi_firmware import gstreamer, sources
 from pi_firmware.settings import CameraSettings
@@ -59,20 +59,13 @@ class Running:
 
     def await_frames(self, more: int) -> None:
         wanted = self.count + more
-        until(lambda: self.count >= wanted)
+        eventually(lambda: self.count >= wanted)
 
     def error(self, limit_s: float = LIMIT_S) -> str:
         """The pipeline's error, empty when none comes."""
         kind = self._gst.MessageType.ERROR
         message = self.pipeline.get_bus().timed_pop_filtered(int(limit_s * 1e9), kind)
         return message.parse_error()[0].message if message else ""
-
-
-def until(true: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 def test_a_camera_is_gone_and_back(clock: Clock) -> None:

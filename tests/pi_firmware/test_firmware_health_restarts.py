@@ -8,14 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from waiting import eventually
 
 from pi_firmware.health import Restarts
-
-LIMIT_S = 20.0
 
 
 class Card:
@@ -48,16 +46,9 @@ def card(tmp_path: Path) -> Card:
     return Card(tmp_path)
 
 
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end, "it did not come"
-        time.sleep(0.005)
-
-
 def sends_a_frame(card: Card, process: Restarts) -> None:
     process.fresh()
-    until(lambda: card.document["without_frame"] == 0)
+    eventually(lambda: card.document["without_frame"] == 0)
 
 
 def test_processes_of_one_boot_are_counted(card: Card) -> None:
@@ -140,7 +131,7 @@ def test_the_first_frame_only_is_written(card: Card) -> None:
     written = card.path.stat()
     for _ in range(1000):
         process.fresh()
-    until(lambda: "restarts" not in {thread.name for thread in threading.enumerate()})
+    eventually(lambda: "restarts" not in {thread.name for thread in threading.enumerate()})
     after = card.path.stat()
     assert (after.st_ino, after.st_mtime_ns) == (written.st_ino, written.st_mtime_ns)
     assert not card.path.with_name("restarts.json.part").exists()
@@ -283,7 +274,7 @@ def test_killed_at_any_moment_the_file_is_whole(card: Card) -> None:
         ) as process:
             assert process.stdout is not None
             process.stdout.readline()
-            until(lambda aim=aim: counted() >= aim)
+            eventually(lambda aim=aim: counted() >= aim)
             time.sleep(chance.random() * 0.05)  # somewhere within a write
             os.kill(process.pid, signal.SIGKILL)
         assert counted() >= aim

@@ -2,9 +2,9 @@
 
 import threading
 import time
-from collections.abc import Callable
 
 import pytest
+from waiting import eventually
 
 from pi_firmware.health import PeriodicThread, Table, Task
 
@@ -19,13 +19,6 @@ class Hand:
 
     def __call__(self) -> float:
         return self.now_s
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end, "it did not come"
-        time.sleep(0.005)
 
 
 def test_late_is_who_began_and_was_not_heard_within_its_watchdog() -> None:
@@ -93,7 +86,7 @@ def test_a_thread_runs_its_task_again_and_again_and_beats() -> None:
     assert table.ages() == {}
     runner.start()
     runner.start()
-    until(lambda: len(calls) >= 5)
+    eventually(lambda: len(calls) >= 5)
     assert set(calls) == {"quick"} and list(table.ages()) == ["quick"]
     assert runner.stop()
     after = len(calls)
@@ -118,10 +111,10 @@ def test_a_call_that_raises_is_told_once_goes_on_and_does_not_beat() -> None:
 
     runner = PeriodicThread(table, "poor", poor, report)
     runner.start()
-    until(lambda: len(calls) >= 10)
+    eventually(lambda: len(calls) >= 10)
     if len(calls) < 20:
         assert told == ["poor: OSError: no such gauge"]
-    until(lambda: len(calls) >= 21)
+    eventually(lambda: len(calls) >= 21)
     assert told == ["poor: OSError: no such gauge"]
     assert runner.stop()
 
@@ -139,7 +132,7 @@ def test_a_task_that_always_fails_becomes_late() -> None:
     runner = PeriodicThread(table, "poor", poor, told.append)
     runner.start()
     clock.now_s += 6.0
-    until(lambda: len(calls) >= 3)
+    eventually(lambda: len(calls) >= 3)
     assert table.late() == ["poor"]
     assert {"poor: ValueError: 0", "poor: ValueError: 1"} == set(told), "each new reason is told"
     assert runner.stop()
@@ -171,7 +164,7 @@ def test_missed_periods_are_not_made_up_for() -> None:
 
     runner = PeriodicThread(table, "slow", slow, print)
     runner.start()
-    until(lambda: len(began) >= 4)
+    eventually(lambda: len(began) >= 4)
     assert runner.stop()
     # After the second call, at once, the third comes a whole period later.
     assert began[2] - began[1] > 0.15 and began[3] - began[2] > 0.15
@@ -183,6 +176,6 @@ def test_a_task_may_stop_its_own_thread() -> None:
     calls: list[bool] = []
     runners.append(PeriodicThread(table, "last", lambda: calls.append(runners[0].stop()), print))
     runners[0].start()
-    until(lambda: len(calls) == 1)
+    eventually(lambda: len(calls) == 1)
     assert runners[0].stop(LIMIT_S)
     assert calls == [False], "it had not ended yet as it asked"

@@ -6,10 +6,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from waiting import eventually
 
 from pi_firmware.health import Wifi, WifiState, programs, radio
 from pi_firmware.health.programs import ProgramError
@@ -25,13 +25,6 @@ WIRELESS = (
     " face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22\n"
     " wlan0: 0000   {quality}.  {level}.  -256        0      0      0      0     11        0\n"
 )
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end, "it did not come"
-        time.sleep(0.005)
 
 
 def interface(root: Path, name: str, *, is_radio: bool = True, index: int = 3) -> None:
@@ -446,7 +439,7 @@ def test_a_program_that_hangs_is_ended_with_its_children(scripts: Programs, tmp_
             return True
         return state.rsplit(")", 1)[1].split()[0] == "Z"
 
-    until(gone)
+    eventually(gone)
 
 
 def test_an_empty_entry_of_path_is_not_the_folder_we_stand_in(
@@ -480,7 +473,7 @@ def test_step_and_heard_never_wait_for_a_program_that_hangs(root: Path) -> None:
         assert wifi.state.restarts == 0
     assert len(calls) == 1, "the steps neither waited nor piled up"
     release.set()
-    until(lambda: wifi.state.signal_dBm == -50.0)
+    eventually(lambda: wifi.state.signal_dBm == -50.0)
     wifi.stop()
     assert "wifi" not in {thread.name for thread in threading.enumerate()}
 
@@ -510,7 +503,7 @@ def test_stopped_in_the_middle_of_a_restart_the_radio_is_switched_on(root: Path)
     assert down.wait(LIMIT_S)
     wifi.stop()
     assert calls[calls.index("down") + 1] == "up"
-    until(lambda: "wifi" not in {thread.name for thread in threading.enumerate()})
+    eventually(lambda: "wifi" not in {thread.name for thread in threading.enumerate()})
 
 
 def test_an_announcement_that_fails_does_not_end_the_watch(root: Path) -> None:
@@ -527,9 +520,9 @@ def test_an_announcement_that_fails_does_not_end_the_watch(root: Path) -> None:
 
     wifi = Wifi(WifiSettings("auto"), announce, root=root, run=run)
     wifi.step()
-    until(lambda: len(told) == 1)
+    eventually(lambda: len(told) == 1)
     wifi.step()
-    until(lambda: not wifi._wake.is_set())
+    eventually(lambda: not wifi._wake.is_set())
     assert told == [messages.EVENT_RADIO_FAILED]
     assert wifi._thread is not None and wifi._thread.is_alive()
     wifi.stop()

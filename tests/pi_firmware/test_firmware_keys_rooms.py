@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from recorded import Events, eventually, feed, files
+from recorded import Events, feed, files
 from scipy.spatial.transform import Rotation
+from waiting import eventually
 
 from pi_firmware import encoder
 from pi_firmware.autopilot.poses import PoseGate

@@ -18,7 +18,6 @@ from recorded import (
     PERIOD_NS,
     START_NS,
     Events,
-    eventually,
     feed,
     files,
     info,
@@ -28,6 +27,7 @@ from recorded import (
     unit,
     video,
 )
+from waiting import eventually
 
 from ground_station.recording.open import open_input
 from pi_firmware import gstreamer

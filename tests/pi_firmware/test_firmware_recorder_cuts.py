@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from recorded import (
     PowerCut,
-    eventually,
     feed,
     files,
     is_cut,
@@ -21,6 +20,7 @@ from recorded import (
     recorder,
     sequences,
 )
+from waiting import eventually
 
 from ground_station.recording.open import open_input
 from pi_firmware.wire.recording import RecordingReader

@@ -21,7 +21,6 @@ from recorded import (
     FullDisk,
     HeldDisk,
     PowerCut,
-    eventually,
     feed,
     files,
     info,
@@ -32,6 +31,7 @@ from recorded import (
     unit,
     video,
 )
+from waiting import eventually
 
 from ground_station.recording.h264 import grey
 from pi_firmware.wire import annexb

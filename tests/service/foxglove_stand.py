@@ -35,13 +35,6 @@ LIMIT_S = 60.0
 CAPTURE_NS = 1_790_000_000_123_456_789
 
 
-def until(condition: Callable[[], bool], what: str) -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"{what} did not come"
-        time.sleep(0.02)
-
-
 def estimate(sequence: int = 7, **fields: Any) -> EstimateMessage:
     """A solved frame's."""
     values: dict[str, Any] = {

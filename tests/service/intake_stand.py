@@ -10,12 +10,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS / "stream"), str(TESTS / "faults")]
+sys.path[:0] = [str(TESTS), str(TESTS / "stream"), str(TESTS / "faults")]
 
 from impaired_link import ImpairedLink, Impairment  # noqa: E402
 from numbered_flight import (  # noqa: E402
@@ -28,6 +27,7 @@ from numbered_flight import (  # noqa: E402
     write_flight,
 )
 from payload_process import PayloadProcess, free_port  # noqa: E402
+from waiting import eventually  # noqa: E402
 
 from ground_station.service import bus_messages  # noqa: E402
 from ground_station.service.bus import Bus, Router  # noqa: E402
@@ -48,7 +48,6 @@ __all__ = [
 
 ROUND = 60
 """Frames of the flight that is flown in a loop, each with its number in its picture."""
-LIMIT_S = 60.0
 CAMERA = """width_px = 640
 height_px = 480
 fx_px = 501.58
@@ -57,15 +56,6 @@ cx_px = 312.51
 cy_px = 241.21
 k1 = 0.1673
 """
-
-
-def eventually(condition: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
-    """Waits until it is true and returns that; fails when it takes absurdly long."""
-    until_s = time.monotonic() + limit_s
-    while not (result := condition()):
-        assert time.monotonic() < until_s, "waited in vain"
-        time.sleep(0.02)
-    return result
 
 
 def free_udp_port() -> int:

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,13 +36,6 @@ SAMPLE = ROOT / "maps" / "atrium"
 PAYLOAD = "blimp-1"
 NAME = f"localizer/{PAYLOAD}"
 LIMIT_S = 120.0
-
-
-def until(condition: Callable[[], bool], what: str = "it") -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"{what} did not come"
-        time.sleep(0.02)
 
 
 class Station:

@@ -24,12 +24,13 @@ from typing import Any
 
 import intake_stand  # noqa: F401 - it says where the other rooms' helpers are
 import numpy as np
-from localizing_stand import LIMIT_S, PAYLOAD, SAMPLE, localizer, station, until
+from localizing_stand import LIMIT_S, PAYLOAD, SAMPLE, localizer, station
 from soaking import report
 from soaking.arguments import MOST_HOURS, Parser, number, on_interrupt
 from soaking.judging import rows as slope_rows
 from soaking.processes import Watch
 from soaking.table import Row
+from waiting import eventually
 
 from ground_station.errors import GroundStationError
 from ground_station.localization.estimate import State
@@ -83,7 +84,7 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
         told.bus.subscribe(
             bus_messages.ESTIMATE, EstimateMessage, lambda _, note: said.put(note), PAYLOAD
         )
-        until(lambda: told.event("map-loaded") is not None, "the map")
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
         start_s, lost = time.monotonic(), False
         for k, image in zip(
             range(round(3600 * options.hours * RATE_HZ)), to_and_fro(images), strict=False

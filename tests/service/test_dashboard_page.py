@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import web_station
 from flown_station import FRAMES, FlownStation, Payload, flown, sample_flight
+from waiting import eventually
 
 from ground_station import __version__, presentation
 from ground_station.geometry.camera import Camera
@@ -115,13 +116,6 @@ def shown(opened: Watched, station: FlownStation) -> Iterator[Watched]:
     assert opened.page.evaluate("violations") == []
     assert opened.hosts == {f"127.0.0.1:{station.port}"}
     assert opened.page.evaluate("window.marker") == "not loaded again"
-
-
-def eventually(holds: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + LIMIT_MS / 1e3
-    while not holds():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
 
 
 def stand_still(watched: Watched, station: FlownStation, frame: int) -> None:

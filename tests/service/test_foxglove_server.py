@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 import pytest
 from foxglove import Context
-from foxglove_stand import CAPTURE_NS, PAYLOAD, ROOT, Client, Station, estimate, server, until
+from foxglove_stand import CAPTURE_NS, PAYLOAD, ROOT, Client, Station, estimate, server
+from waiting import eventually
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -328,7 +329,7 @@ def test_a_client_that_does_not_read_delays_nobody(stand: SimpleNamespace) -> No
             lambda: stand.station.say(estimate(2000)),
         )
         beats = len(stand.station.beats)
-        until(lambda: len(stand.station.beats) > beats, "beat")
+        eventually(lambda: len(stand.station.beats) > beats, what="beat")
         # It did lose some, and not the newest.
         slow.drain()
         numbers = [said["sequence"] for _, said in slow.received[f"/{PAYLOAD}/estimate"]]
@@ -336,7 +337,7 @@ def test_a_client_that_does_not_read_delays_nobody(stand: SimpleNamespace) -> No
 
 
 def test_it_says_that_it_lives(stand: SimpleNamespace) -> None:
-    until(lambda: bool(stand.station.beats), "beat")
+    eventually(lambda: bool(stand.station.beats), what="beat")
     beat = stand.station.beats[-1]
     assert (beat.name, beat.pid) == ("foxglove", stand.process.pid)
 
@@ -361,7 +362,7 @@ def test_a_bus_that_comes_back_is_heard_again(tmp_path: Path) -> None:
                 "the next",
                 lambda: station.say(estimate(8)),
             )
-            until(lambda: bool(station.beats), "beat")
+            eventually(lambda: bool(station.beats), what="beat")
             # With a client and a map being asked for, it still ends when it is told to.
             client.subscribe("/map/landmarks")
             process.send_signal(signal.SIGTERM)

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from localizing_stand import SAMPLE, copy_map, until
+from localizing_stand import SAMPLE, copy_map
+from waiting import eventually
 
 from ground_station.errors import MapError
 from ground_station.localization.settings import load_preset
@@ -124,7 +125,7 @@ def test_one_map_is_loaded_at_a_time(shelf: Path, monkeypatch: pytest.MonkeyPatc
         loader.begin(SAMPLE)
     assert loader.landed() is None
     release.set()
-    until(loading.ready.is_set)
+    eventually(loading.ready.is_set)
     assert loader.landed() is loading and loader.landed() is None
     assert loading.localizer is None
     assert loading.refused == f"{shelf / 'hall'}: MemoryError: no room"

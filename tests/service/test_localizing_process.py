@@ -27,8 +27,8 @@ from localizing_stand import (
     localizer,
     payload,
     station,
-    until,
 )
+from waiting import eventually
 
 from ground_station.localization.localizer import Localizer
 from ground_station.recording.flight import FlightRecording, trajectory_of
@@ -71,7 +71,7 @@ def run_folder(tmp_path: Path) -> Path:
 def running(run_folder: Path, shelf: Path) -> Iterator[tuple[Station, subprocess.Popen[str]]]:
     """A localizer that has loaded its map."""
     with station(run_folder, shelf=str(shelf)) as told, localizer(run_folder) as process:
-        until(lambda: told.event("map-loaded") is not None, "the map")
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
         yield told, process
 
 
@@ -85,7 +85,7 @@ def localized(told: Station, frame: Frame, **fields: Any) -> EstimateMessage:
     """One frame shown, and what is said of it."""
     before = len(told.estimates)
     note = told.show(frame.image, frame.index, frame.time_ns, **fields)
-    until(lambda: len(told.estimates) > before, f"frame {frame.index}'s estimate")
+    eventually(lambda: len(told.estimates) > before, what=f"frame {frame.index}'s estimate")
     estimate = told.estimates[-1]
     assert estimate.sequence == note.sequence and told.accounted()
     return estimate
@@ -100,11 +100,11 @@ def test_the_sample_flight_is_localized_and_every_frame_accounted_for(
         localizer(run_folder) as process,
         Intake(told) as intake,
     ):
-        until(lambda: told.event("map-loaded") is not None, "the map")
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
         with FirmwareProcess(payload(intake.receiver.port), tmp_path) as firmware:
-            until(lambda: not firmware.running(), "the stream's end")
+            eventually(lambda: not firmware.running(), what="the stream's end")
             firmware.check()
-        until(told.accounted, "the last frame")
+        eventually(told.accounted, what="the last frame")
         assert process.poll() is None
         assert told.said == intake.receiver.counters.decoded > 60
         last = told.estimates[-1]
@@ -175,7 +175,9 @@ def test_a_map_is_changed_while_frames_come(
     assert localized(told, flight[0]).map == "atrium"
     answer = told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
     assert answer["done"] and answer["map"] == "hall"
-    until(lambda: any("'hall' is in use" in event.text for event in told.events), "the map")
+    eventually(
+        lambda: any("'hall' is in use" in event.text for event in told.events), what="the map"
+    )
     changed = localized(told, flight[1])
     assert changed.map == "hall" and changed.relocalized and error_m(changed) < 0.1
     assert (changed.processed, changed.localized) == (2, 2)
@@ -219,7 +221,7 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
         station(run_folder, folder=str(shelf / "cut"), shelf=str(shelf)) as told,
         localizer(run_folder) as process,
     ):
-        until(lambda: told.event("map-refused") is not None, "the refusal")
+        eventually(lambda: told.event("map-refused") is not None, what="the refusal")
         refused = told.event("map-refused")
         assert refused is not None and refused.level == "alarm"
         assert "landmarks.safetensors" in refused.text and "\n" not in refused.text
@@ -229,7 +231,7 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
         assert said.state == "INITIALIZING" and said.reason.startswith("no map: ")
         assert (said.processed, said.skipped, said.position_m) == (0, 1, None)
         assert told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)["done"]
-        until(lambda: told.event("map-loaded") is not None, "the map")
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
         found = localized(told, flight[1])
         assert found.map == "hall" and error_m(found) < 0.1
         assert (found.processed, found.skipped) == (1, 1)
@@ -270,7 +272,7 @@ def test_frames_of_another_cameras_size_are_refused_and_it_lives(
     for k in range(12):  # more than may fail
         before = len(told.estimates)
         told.show(small, k, flight[0].time_ns + k)
-        until(lambda count=before: len(told.estimates) > count)
+        eventually(lambda count=before: len(told.estimates) > count)
         said = told.estimates[-1]
         assert said.state == "INITIALIZING" and said.position_m is None
         assert said.reason.startswith(f"frame {k} has 320x240 pixels, the camera 640x480: ")
@@ -284,7 +286,7 @@ def test_a_picture_that_was_overwritten_is_skipped(
     told, _ = running
     localized(told, flight[0])
     old = told.show(flight[1].image, 1, flight[1].time_ns)
-    until(lambda: len(told.estimates) == 2)
+    eventually(lambda: len(told.estimates) == 2)
     for _ in range(SLOTS):
         told.pictures.write(flight[2].image)
     told.say(replace(old, shown=old.shown + 1))
@@ -358,11 +360,12 @@ def test_while_its_map_is_loaded_it_says_so(
         try:
             ask = functools.partial(told.bus.query, NAME, {"do": "map", "name": "atrium"})
             # Answered, it also hears of frames: it subscribes first.
-            until(lambda: ask()["reason"] == "the map 'atrium' is being loaded; try again then")
+            loading = "the map 'atrium' is being loaded; try again then"
+            eventually(lambda: ask()["reason"] == loading)
             said = localized(told, flight[0])
             assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
             release.set()
-            until(lambda: told.event("map-loaded") is not None, "the map")
+            eventually(lambda: told.event("map-loaded") is not None, what="the map")
             assert error_m(localized(told, flight[1])) < 0.1
         finally:
             release.set()
@@ -403,7 +406,7 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
         thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
         thread.start()
         try:
-            until(lambda: told.event("map-loaded") is not None, "the map")
+            eventually(lambda: told.event("map-loaded") is not None, what="the map")
             failing.resets = 0
             for frame in flight[:times]:
                 said = localized(told, frame)
@@ -416,9 +419,9 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
                 assert error_m(localized(told, flight[20])) < 0.1
                 assert told.estimates[-1].processed == 10
             else:
-                until(lambda: bool(ended), "the end")
+                eventually(lambda: bool(ended), what="the end")
                 assert ended == [RESTART]
-                until(lambda: told.event("localizer-failed") is not None, "the event")
+                eventually(lambda: told.event("localizer-failed") is not None, what="the event")
         finally:
             stop.set()
             thread.join()
@@ -433,7 +436,7 @@ def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(
 
     with station(run_folder) as told:
         with localizer(run_folder) as process:
-            until(with_a_map, "the map")
+            eventually(with_a_map, what="the map")
             for frame in flight[:3]:
                 localized(told, frame)
             process.kill()
@@ -441,7 +444,7 @@ def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(
             told.show(frame.image, frame.index, frame.time_ns)
         before = len(told.events)
         with localizer(run_folder):
-            until(lambda: with_a_map(before), "the map")
+            eventually(lambda: with_a_map(before), what="the map")
             found = localized(told, flight[5])
             # What was processed within the last quarter of a second may count as skipped.
             assert 2 <= found.processed <= 4 and found.processed + found.skipped == 6

@@ -36,7 +36,7 @@ def page(browser: Any, port: int) -> Iterator[Any]:
 
 
 def until(page: Any, expression: str) -> None:
-    station.until(lambda: page.evaluate(expression))
+    station.eventually(lambda: page.evaluate(expression))
 
 
 def play(page: Any, file: str = "flight.mcap") -> None:

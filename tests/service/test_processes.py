@@ -7,11 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import eventually
 
 from ground_station.service import bus_messages, processes, settings
 from ground_station.service.bus import Bus, Router
@@ -45,14 +46,6 @@ def bus_folder(tmp_path: Path) -> Iterator[Path]:
     router.close()
 
 
-def until(condition: Callable[[], bool], step: Callable[[], object] = lambda: None) -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "it did not come"
-        step()
-        time.sleep(0.02)
-
-
 class Time:
     """A clock that is set by hand."""
 
@@ -75,7 +68,7 @@ def test_a_process_that_ends_is_started_anew_after_ever_longer_pauses(modules: P
             child.step()
         pauses.append(clock.now_s - before_s)
         said: list[str] = []
-        until(lambda s=said: any(s), lambda s=said: s.append(child.step()))  # type: ignore[misc]
+        eventually(lambda s=said: any(s), step=lambda s=said: s.append(child.step()))  # type: ignore[misc]
         assert said[-1] == "ends ended with status 1; it is restarted"
     assert child.restarts == 7
     assert pauses == sorted(pauses) and 9 < pauses[-1] <= 10.5
@@ -114,13 +107,13 @@ def test_who_ends_slowly_is_not_waited_for(modules: Path, monkeypatch: pytest.Mo
     children.step()
     pid = children.pids()["stays"]
     os.kill(pid, signal.SIGSTOP)  # it hears no request to end
-    until(lambda: _state(pid) == "T")
+    eventually(lambda: _state(pid) == "T")
     children.remove("stays")
     assert _runs(pid) and "stays" not in children
     children.add(spec)
     assert "stays" not in children  # not beside the one that ends
-    until(lambda: not _runs(pid), children.step)
-    until(lambda: "stays" in children, lambda: (children.step(), children.add(spec)))
+    eventually(lambda: not _runs(pid), step=children.step)
+    eventually(lambda: "stays" in children, step=lambda: (children.step(), children.add(spec)))
     children.close()
 
 
@@ -161,10 +154,10 @@ def test_bad_input_of_a_needed_process_ends_the_service(modules: Path) -> None:
             return True
         return False
 
-    until(step)
+    eventually(step)
     one_may = Child(Spec("refuses", "stand_in_refuses", needed=False))
     said: list[str] = []
-    until(lambda: bool(said and said[-1]), lambda: said.append(one_may.step()))
+    eventually(lambda: bool(said and said[-1]), step=lambda: said.append(one_may.step()))
     assert "status 2" in said[-1]
 
 
@@ -181,7 +174,7 @@ def test_a_later_process_waits_for_the_needed_ones_at_the_first_start_only(modul
         children.step()
         assert waiting.started
         os.kill(awaited.pid, signal.SIGKILL)  # from here on none waits for the other
-        until(lambda: waiting.restarts >= 2 and awaited.restarts == 1, children.step)
+        eventually(lambda: waiting.restarts >= 2 and awaited.restarts == 1, step=children.step)
     finally:
         children.close()
 
@@ -200,7 +193,7 @@ def test_children_end_with_a_parent_that_is_killed(modules: Path, tmp_path: Path
         pid = int(process.stdout.readline())
         time.sleep(0.3)  # setpriv gives way to the program
         process.send_signal(signal.SIGKILL)
-    until(lambda: not _runs(pid))
+    eventually(lambda: not _runs(pid))
 
 
 def _runs(pid: int) -> bool:
@@ -222,15 +215,17 @@ def test_notes_cross_the_bus_and_what_is_none_is_dropped(bus_folder: Path) -> No
         )
         newest = two.newest(bus_messages.PAYLOAD, PayloadMessage, "blimp-1")
         event = EventMessage(1, "station", bus_messages.INFO, "hello", "zwölf °")
-        until(lambda: bool(heard), lambda: one.publish(bus_messages.EVENT, "blimp-1", event))
+        eventually(
+            lambda: bool(heard), step=lambda: one.publish(bus_messages.EVENT, "blimp-1", event)
+        )
         assert heard[0] == ("blimp-1", event)
         one._session.put("station/event/x", b'{"time_ns": 1}')
         one._session.put("station/event/x", b"\xff")
-        until(lambda: two.dropped == 2)
+        eventually(lambda: two.dropped == 2)
         one.publish(bus_messages.PAYLOAD, "blimp-2", PayloadMessage(True, 1))
         for seen_ns in range(1, 6):
             one.publish(bus_messages.PAYLOAD, "blimp-1", PayloadMessage(True, seen_ns))
-        until(lambda: newest.skipped == 4)
+        eventually(lambda: newest.skipped == 4)
         note = newest.take(LIMIT_S)
         assert note is not None and note.seen_ns == 5
         assert newest.take(0.01) is None
@@ -249,7 +244,7 @@ def test_questions_are_answered_refused_or_not_answered(bus_folder: Path) -> Non
 
     with Bus(bus_folder, "one") as one, Bus(bus_folder, "two") as two:
         one.serve("intake", do)
-        until(lambda: two.query("intake", {"do": "x"})["done"] is True)
+        eventually(lambda: two.query("intake", {"do": "x"})["done"] is True)
         assert two.query("intake", {"do": "x"}) == {
             "done": True,
             "reason": "",

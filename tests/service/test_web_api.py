@@ -34,7 +34,7 @@ def test_alarms_stand_in_the_state_and_are_told_to_the_others(served):
     bus.put(
         bus_messages.RECORDING, bus_messages.STATION, station.recording(problem="the disk is full")
     )
-    station.until(lambda: client.get("/api/state").json()["alarms"])
+    station.eventually(lambda: client.get("/api/state").json()["alarms"])
     (alarm,) = client.get("/api/state").json()["alarms"]
     assert (alarm["id"], alarm["level"], alarm["payload"]) == ("recording", "alarm", "-")
     (said,) = [note for kind, _, note in bus.said if kind == bus_messages.EVENT]

@@ -49,7 +49,7 @@ def write(folder: Path, text: str) -> str:
 
 
 def ended(jobs: Jobs) -> dict[str, Any]:
-    station.until(lambda: not (jobs.state() or {})["running"])
+    station.eventually(lambda: not (jobs.state() or {})["running"])
     return jobs.state() or {}
 
 
@@ -58,7 +58,7 @@ def test_a_job_is_told_with_how_far_it_is_and_ends_with_its_status(
 ) -> None:
     assert jobs.state() is None
     jobs.start("build", ["blimp", write(tmp_path, TALKS)])
-    state = station.until(lambda: (now := jobs.state()) and "8" in now["line"] and now)
+    state = station.eventually(lambda: (now := jobs.state()) and "8" in now["line"] and now)
     assert state["running"] and state["share"] == 0.75 and state["status"] is None
     assert state["line"] == "pairs: 6 of 8 [2J" and state["step"] == "build"
     assert state["page"] == "http://127.0.0.1:4321/secret/"
@@ -77,7 +77,7 @@ def test_a_job_is_told_with_how_far_it_is_and_ends_with_its_status(
 
 def test_the_next_web_process_finds_it_and_can_stop_it(jobs: Jobs, tmp_path: Path) -> None:
     jobs.start("build", ["blimp", write(tmp_path, TALKS)])
-    station.until(lambda: (jobs.state() or {})["share"])
+    station.eventually(lambda: (jobs.state() or {})["share"])
     after = Jobs(tmp_path)
     assert after.state() == jobs.state()
     with pytest.raises(Busy):
@@ -92,7 +92,7 @@ def test_one_that_does_not_obey_ends_all_the_same(
     monkeypatch.setattr(jobs_module, "_STOP_S", 0.5)
     deaf = "import signal, time\nsignal.signal(2, signal.SIG_IGN)\nprint('1 of 2', flush=True)\n"
     jobs.start("build", ["blimp", write(tmp_path, deaf + "time.sleep(60)\n")])
-    station.until(lambda: (jobs.state() or {})["share"])
+    station.eventually(lambda: (jobs.state() or {})["share"])
     jobs.stop()
     assert not (jobs.state() or {})["running"]
 
@@ -191,10 +191,10 @@ def test_a_real_command_goes_on_without_its_page(
     (tmp_path / "board.toml").write_text("no = 'board'\n")
     answer = client.post("/api/job", json={"step": "calibrate", "choice": "a.mcap"})
     assert answer.json()["done"], answer.text
-    station.until(lambda: not client.get("/api/state").json()["job"]["running"])
+    station.eventually(lambda: not client.get("/api/state").json()["job"]["running"])
     job = client.get("/api/state").json()["job"]
     assert job["status"] == 2 and job["line"].startswith("blimp calibrate: ")
-    said = station.until(
+    said = station.eventually(
         lambda: [note for _, _, note in bus.said if getattr(note, "name", "") == "job-ended"]
     )
     assert said[0].level == "warning" and "blimp calibrate: " in said[0].text

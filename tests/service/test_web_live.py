@@ -146,7 +146,7 @@ def test_pictures_are_the_frames_and_come_only_to_who_looks(served, tmp_path):
                 await next_of(blind, "video", limit_s=0.5)
 
     run(main())
-    station.until(lambda: not web.video._wanted)  # nobody looks: nothing is encoded
+    station.eventually(lambda: not web.video._wanted)  # nobody looks: nothing is encoded
     bus.put(bus_messages.FRAME, P, station.frame())
     assert web.video.encoded == 5
 
@@ -264,7 +264,7 @@ def test_a_viewer_that_takes_nothing_harms_nobody_and_is_closed(served, monkeypa
     web, _, port = served
     monkeypatch.setattr(viewer_module, "TAKES_NOTHING_S", 6.0)
     stopped = stopped_viewer(port)
-    station.until(lambda: web.live.viewers == 1)
+    station.eventually(lambda: web.live.viewers == 1)
     loop = web.loop()
     picture = b"\0\0\0\2{}" + b"x" * 1_000_000
     received: list[float] = []
@@ -285,10 +285,10 @@ def test_a_viewer_that_takes_nothing_harms_nobody_and_is_closed(served, monkeypa
     run(main())
     assert len(received) > 20
     assert max(np.diff(received)) < 5.0  # the other one saw its pictures all the while
-    station.until(lambda: web.live.viewers == 0)
+    station.eventually(lambda: web.live.viewers == 0)
     assert "blimp_viewer_pictures_lost_total 0.0" not in web.metrics.text().decode()
     # The connection is gone, not only its place, though what was sent still lies unread.
-    station.until(lambda: _was_reset(stopped))
+    station.eventually(lambda: _was_reset(stopped))
     stopped.close()
 
 
@@ -333,7 +333,7 @@ def test_encoding_keeps_the_rate_and_skips_the_rest(tmp_path):
             count += 1
             time.sleep(0.004)
         span_s = time.monotonic() - begin_s
-        station.until(lambda: video.encoded + video.skipped + video.gone == count)
+        station.eventually(lambda: video.encoded + video.skipped + video.gone == count)
         assert 0 < len(taken) <= 10 * span_s + 2
         assert {name for name, _ in taken} == {P}
     finally:
@@ -346,15 +346,15 @@ def test_a_picture_that_is_gone_or_cannot_be_read_ends_nothing(tmp_path):
     try:
         video.want(frozenset({P}))
         video.frame(P, station.frame())  # there is no ring yet
-        station.until(lambda: video.gone == 1)
+        station.eventually(lambda: video.gone == 1)
         ring = station.ring(tmp_path)
         slot, stamp = ring.write(station.texture())
         time.sleep(0.05)
         video.frame(P, station.frame("slot", stamp))
-        station.until(lambda: video.failed == 1)
+        station.eventually(lambda: video.failed == 1)
         time.sleep(0.05)
         video.frame(P, station.frame(slot, stamp))
-        station.until(lambda: taken)
+        station.eventually(lambda: taken)
     finally:
         video.close()
 
@@ -414,7 +414,7 @@ def test_connections_are_bounded(served, monkeypatch):
         with contextlib.suppress(ConnectionResetError):
             assert late.recv(1) == b""
         assert len(held) == 8
-    station.until(lambda: _answers(port))
+    station.eventually(lambda: _answers(port))
 
 
 def _answers(port) -> bool:

@@ -271,7 +271,7 @@ def test_few_are_played_at_once_and_who_leaves_leaves_nothing(port: int) -> None
             await viewer.close()
 
     run(main())
-    station.until(lambda: players() == 0)
+    station.eventually(lambda: players() == 0)
 
 
 def test_a_recording_that_damages_later_ends_in_words(tmp_path: Path, flight: Path) -> None:

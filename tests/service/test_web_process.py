@@ -56,8 +56,8 @@ def test_it_serves_what_the_bus_says_beats_and_ends(folder):
             state = httpx.get(f"http://127.0.0.1:{port}/api/state").json()
             return state["payloads"].get(P, {}).get("estimate")
 
-        assert station.until(flies)["state"] == "TRACKING"
-        station.until(lambda: any(note.name == "web" for note in beats))
+        assert station.eventually(flies)["state"] == "TRACKING"
+        station.eventually(lambda: any(note.name == "web" for note in beats))
         assert next(note.pid for note in beats if note.name == "web") == process.pid
         answer = httpx.post(f"http://127.0.0.1:{port}/api/recording", json={"active": True})
         assert answer.json() == {"done": True, "reason": "", "values": {"asked": 1}}
@@ -66,7 +66,7 @@ def test_it_serves_what_the_bus_says_beats_and_ends(folder):
             bus_messages.STATION,
             station.recording(problem="the disk is full"),
         )
-        station.until(lambda: any(note.name == "alarm-begins" for note in events))
+        station.eventually(lambda: any(note.name == "alarm-begins" for note in events))
         begin_s = time.monotonic()
         process.send_signal(signal.SIGTERM)
         assert process.wait(20.0) == 0

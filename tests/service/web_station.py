@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from waiting import eventually
 
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import (
@@ -177,15 +178,6 @@ def ring(folder: Path) -> PictureWriter:
     return PictureWriter(folder, PAYLOAD)
 
 
-def until(condition: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """What the condition gives as soon as it is true."""
-    deadline_s = time.monotonic() + limit_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline_s, "it did not happen in time"
-        time.sleep(0.02)
-    return found
-
-
 @contextlib.contextmanager
 def serving(web: Web, port: int = 0) -> Iterator[int]:
     """The application behind the real server, in a thread; its port of loopback."""
@@ -193,7 +185,7 @@ def serving(web: Web, port: int = 0) -> Iterator[int]:
         serving = server(web.guarded)
         thread = threading.Thread(target=lambda: asyncio.run(serving.serve([sock])), daemon=True)
         thread.start()
-        until(lambda: serving.started)
+        eventually(lambda: serving.started)
         yield sock.getsockname()[1]
         web.loop().call_soon_threadsafe(web.live.close)
         serving.should_exit = True

@@ -16,7 +16,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,6 +23,7 @@ import pytest
 from card_parts import EPOCH, ImageReader, make_checkout, missing_tools
 from native_root import add_programs
 from raspios_base import make_tree, write_base
+from waiting import eventually
 
 from deploy.errors import DeployError
 from deploy.image import card, raspios
@@ -330,14 +330,14 @@ def test_stopped_or_killed_in_the_middle_nothing_half_is_left(
     )
     try:
         here = ".base-*.part-*/root/tmp/here"
-        _until(lambda: list(cache.glob(here)) or process.poll() is not None)
+        eventually(lambda: list(cache.glob(here)) or process.poll() is not None)
         (work,) = cache.glob(".base-*.part-*")
         process.send_signal(how)
         assert process.wait(60) != 0
     finally:
         process.kill()
         process.wait()
-    _until(lambda: not _inside(work))
+    eventually(lambda: not _inside(work))
     assert {path: path.read_bytes() for path in cache.glob("*.tar")} == kept
     assert not place.exists() and work.exists() == (how == signal.SIGKILL)
     stand.archive.add(name, "2")
@@ -356,11 +356,3 @@ def _inside(root: Path) -> list[int]:
             if str(path.readlink()).startswith(str(root)):
                 found.append(int(path.parent.name))
     return found
-
-
-def _until(condition: object, limit_s: float = 60.0) -> None:
-    assert callable(condition)
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
-        time.sleep(0.05)

@@ -12,11 +12,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from waiting import eventually
 
 from deploy.errors import DeployError
 from deploy.image.packages import build_rootfs, load_board
@@ -175,7 +175,7 @@ def test_stopped_or_killed_it_leaves_nothing_half_made(
     )
     environment = {**os.environ, "PYTHONPATH": str(_ROOT), "TAKES_S": "60"}
     first = subprocess.Popen([sys.executable, "-c", program], env=environment, cwd=_ROOT)
-    _until(calls.exists)
+    eventually(calls.exists)
     second = subprocess.Popen(
         [sys.executable, "-c", program],
         env={**environment, "TAKES_S": "0"},
@@ -186,7 +186,7 @@ def test_stopped_or_killed_it_leaves_nothing_half_made(
     first.send_signal(how)
     assert first.wait(60) == (130 if how == signal.SIGINT else -how)
     # The tool doesn't outlive it.
-    _until(lambda: not Path(f"/proc/{environment_of_first['pid']}").exists())
+    eventually(lambda: not Path(f"/proc/{environment_of_first['pid']}").exists())
     out, _ = second.communicate(timeout=60)
     assert second.returncode == 0
     assert _left(tmp_path / "cache") == [Path(out.decode().strip()).name]
@@ -218,11 +218,3 @@ def test_nothing_of_one_machine_s_own_goes_onto_all_cards(tmp_path: Path) -> Non
     assert all((root / name).is_file() for name in kept)
     assert (root / "etc/machine-id").read_bytes() == b""
     assert (root / "var/log/apt").is_dir()
-
-
-def _until(condition: object, limit_s: float = 60.0) -> None:
-    assert callable(condition)
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
-        time.sleep(0.05)

@@ -7,7 +7,6 @@ import json
 import shutil
 import socket
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import uvicorn
+from waiting import eventually
 
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import align
@@ -86,13 +86,6 @@ class Stand:
         self.server.should_exit = True
         self.thread.join(LIMIT_S)
         self.socket.close()
-
-
-def eventually(holds: Any) -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not holds():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 @pytest.fixture
