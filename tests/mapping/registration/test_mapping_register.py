@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +36,6 @@ def world_points():
     rng = np.random.default_rng(8)
     points = rng.uniform([6.0, 3.0, 0.6], [7.9, 5.9, 2.0], (12, 3))
     return points
-
-
-@pytest.fixture
-def target(built, tmp_path):
-    folder = tmp_path / "map"
-    shutil.copytree(built.folder, folder)
-    return folder
 
 
 def _pairs(tmp_path: Path, lines: list[str]) -> observations.PointObservations:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,13 +28,6 @@ def run(*words: object) -> int:
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     return command.run(parser.parse_args([str(word) for word in words]))
-
-
-@pytest.fixture
-def target(built, tmp_path):
-    folder = tmp_path / "map"
-    shutil.copytree(built.folder, folder)
-    return folder
 
 
 def test_the_uncertainty_is_printed_and_kept(built, target, tmp_path, capsys):

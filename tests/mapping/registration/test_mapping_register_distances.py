@@ -35,13 +35,6 @@ def lines_of(scene, wrong=None, told=None, noise_px=0.2):
     return lines
 
 
-@pytest.fixture
-def target(built, tmp_path):
-    folder = tmp_path / "map"
-    shutil.copytree(built.folder, folder)
-    return folder
-
-
 def read(tmp_path, lines):
     path = tmp_path / "DISTANCES.csv"
     path.write_text("\n".join(lines) + "\n")
