@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ground_station.simulator.building import OPEN, SceneBuilder
 from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder, Surface
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 24.0, 16.0, 9.0
 BAY_M = 3.0
@@ -36,15 +36,6 @@ class _Atrium:
         self.b = SceneBuilder(texels_per_m)
         self.moved, self.posted = moved, posted
         self._places = np.random.default_rng(_MOVED_SEED)
-        self.footprints: list[Footprint] = []
-        self.known: list[KnownPoint] = []
-        self.lamps: list[Lamp] = []
-
-    def survey(self, name: str, surface: Surface, corner: int) -> None:
-        """Makes a corner of a surface (0: origin, 1: +u, 2: +u+v, 3: +v) a known point."""
-        x, y, z = surface.corners()[corner].tolist()
-        a, b, c = surface.normal.tolist()
-        self.known.append(KnownPoint(name, (x, y, z), (a, b, c)))
 
     def placed(self, x: float, y: float) -> tuple[float, float]:
         """Where a piece of furniture stands that was at (x, y) when the hall was mapped."""
@@ -59,9 +50,7 @@ class _Atrium:
         """A poster with two of its corners surveyed (they stand out from the wall by the sign)."""
         if self.posted:
             o["edition"] = 1
-        surface = self.b.rectangle(origin, u, v, "poster", detail=1.6, text=name, **o)
-        self.survey(f"sign-{name.lower()}-a", surface, 0)
-        self.survey(f"sign-{name.lower()}-b", surface, 2)
+        self.b.sign(f"sign-{name.lower()}", origin, u, v, name, **o)
 
     def floor_and_ceiling(self) -> None:
         for i in range(8):
@@ -130,11 +119,8 @@ class _Atrium:
                     self.b.box([a, -0.17, z], [c, -0.11, z + 0.06], "metal", rgb=(0.13, 0.14, 0.15))
             for m in ((a + c) / 2 - 0.25, (a + c) / 2 + 0.2):  # handles
                 self.b.box([m, -0.09, 0.9], [m + 0.04, -0.05, 1.4], "metal", rgb=(0.6, 0.6, 0.6))
-            self.footprints += [
-                Footprint((x, -0.3, a, 0), "wall"),
-                Footprint((c, -0.3, x + BAY_M, 0), "wall"),
-                Footprint((a, -0.17, c, -0.11), "glass"),
-            ]
+            self.b.walls((x, -0.3, a, 0), (c, -0.3, x + BAY_M, 0))
+            self.b.footprints.append(Footprint((a, -0.17, c, -0.11), "glass"))
         for k, text in ((1, "EXIT"), (4, "INFO"), (6, "CAFE")):
             x = BAY_M * k + 0.95
             self.sign(text, [x + 1.1, 0.02, 2.72], [-1.1, 0, 0], [0, 0, 1.15])
@@ -149,13 +135,13 @@ class _Atrium:
                     [0, y, z], [0, 1.6, 0], [0, 0, 1.5], "plaster", rgb=rgb, dirt=0.22
                 )
                 if (j, k) in ((2, 2), (7, 2), (2, 4), (7, 4), (4, 1)):
-                    self.survey(f"panel-{j}-{k}", panel, 0)
+                    self.b.survey(f"panel-{j}-{k}", panel, 0)
         for y in range(1, 10):
             self.b.box([0, 1.6 * y - 0.02, 0], [0.02, 1.6 * y + 0.02, HEIGHT_M], "metal",
                        faces=("+x",), rgb=(0.2, 0.2, 0.2))  # fmt: skip
         for y, z, text in ((3.4, 1.3, "PHYSICS"), (7.0, 1.5, "LIBRARY"), (10.8, 4.4, "ROBOTICS")):
             self.sign(text, [0.03, y, z], [0, 1.5, 0], [0, 0, 2.0])
-        self.footprints.append(Footprint((-0.3, -0.3, 0, WIDTH_M + 0.3), "wall"))
+        self.b.walls((-0.3, -0.3, 0, WIDTH_M + 0.3))
 
     def east(self) -> None:
         """Brick, with stairs along it up to the balcony."""
@@ -185,10 +171,8 @@ class _Atrium:
             for s in range(steps):
                 y, z = y0 + run * s, rise * (s + 1) + offset
                 self.b.box([22.2, y, z - 0.03], [22.25, y + run, z + 0.03], "metal", rgb=_TEAL)
-        self.footprints += [
-            Footprint((24, -0.3, 24.3, WIDTH_M + 0.3), "wall"),
-            Footprint((22.2, y0, 24, BALCONY_Y_M), "stairs"),
-        ]
+        self.b.walls((24, -0.3, 24.3, WIDTH_M + 0.3))
+        self.b.footprints.append(Footprint((22.2, y0, 24, BALCONY_Y_M), "stairs"))
 
     def north(self) -> None:
         """The balcony, its handrail and pillars, and equal doors on both floors."""
@@ -239,7 +223,7 @@ class _Atrium:
                 [x, 13, BALCONY_Z_M - SLAB_M], [3, 0, 0], [0, 0, SLAB_M], "concrete", rgb=_WHITE
             )
             if k in (2, 5):
-                self.survey(f"slab-{k}", fascia, 0)
+                self.b.survey(f"slab-{k}", fascia, 0)
             # The handrail.
             gap = x >= 21  # where the stairs arrive
             for q in range(0 if not gap else 4, 4):
@@ -257,10 +241,8 @@ class _Atrium:
         # Banners hang from the balcony, in front of its slab.
         for x, text in ((7.6, "WELCOME"), (16.6, "AIRSHIPS")):
             self.sign(text, [x, 12.96, 2.2], [1.8, 0, 0], [0, 0, 1.3])
-        self.footprints += [
-            Footprint((-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3), "wall"),
-            Footprint((0, BALCONY_Y_M, LENGTH_M, WIDTH_M), "balcony"),
-        ]
+        self.b.walls((-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3))
+        self.b.footprints.append(Footprint((0, BALCONY_Y_M, LENGTH_M, WIDTH_M), "balcony"))
 
     def pillars(self) -> None:
         """Two rows of equal pillars: the southern up to the roof, the northern to the balcony."""
@@ -273,19 +255,19 @@ class _Atrium:
                 r = PILLAR_RADIUS_M + 0.08
                 self.b.box([x - r, y - r, 0], [x + r, y + r, 0.3], "concrete", rgb=_GREY)
                 self.b.box([x - r, y - r, top - 0.25], [x + r, y + r, top], "concrete", rgb=_GREY)
-                self.footprints.append(Footprint((x - r, y - r, x + r, y + r), "pillar", disc=True))
+                self.b.footprints.append(
+                    Footprint((x - r, y - r, x + r, y + r), "pillar", disc=True)
+                )
                 if k in (1, 3, 6):
                     side = r if y < 8 else -r
                     row = "s" if y < 8 else "n"
                     normal = (0.0, float(np.sign(side)), 0.0)
-                    self.known.append(KnownPoint(f"base-{row}-{k}", (x - r, y + side, 0.3), normal))
+                    self.b.known.append(
+                        KnownPoint(f"base-{row}-{k}", (x - r, y + side, 0.3), normal)
+                    )
 
     def furniture(self) -> None:
-        def solid(lo: list[float], hi: list[float], material: str, **o: Any) -> None:
-            self.b.box(lo, hi, material, **o)
-            self.footprints.append(Footprint((lo[0], lo[1], hi[0], hi[1]), "furniture"))
-
-        top = ("-x", "+x", "-y", "+y", "+z")
+        solid = self.b.stand
         for x, y in ((6.5, 4.0), (11.0, 4.0), (15.5, 4.0), (6.5, 11.6), (11.0, 11.6), (15.5, 11.6)):
             x, y = self.placed(x, y)
             solid([x, y, 0.35], [x + 2.0, y + 0.5, 0.45], "wood")  # benches
@@ -293,31 +275,35 @@ class _Atrium:
                 self.b.box([x + q, y + 0.05, 0], [x + q + 0.12, y + 0.45, 0.35], "metal")
         for x, y, rgb in ((8.2, 7.2, _TEAL), (13.6, 7.4, _RED)):  # sofas back to back
             x, y = self.placed(x, y)
-            solid([x, y, 0], [x + 1.9, y + 0.9, 0.42], "fabric", faces=top, rgb=rgb)
-            self.b.box([x, y + 0.35, 0.42], [x + 1.9, y + 0.55, 0.85], "fabric", faces=top, rgb=rgb)
-            solid([x + 2.2, y + 0.1, 0.42], [x + 3.0, y + 0.8, 0.48], "wood", faces=(*top, "-z"))
+            solid([x, y, 0], [x + 1.9, y + 0.9, 0.42], "fabric", faces=OPEN, rgb=rgb)
+            self.b.box(
+                [x, y + 0.35, 0.42], [x + 1.9, y + 0.55, 0.85], "fabric", faces=OPEN, rgb=rgb
+            )
+            solid([x + 2.2, y + 0.1, 0.42], [x + 3.0, y + 0.8, 0.48], "wood", faces=(*OPEN, "-z"))
             self.b.box([x + 2.55, y + 0.4, 0], [x + 2.65, y + 0.5, 0.42], "metal")
-        solid([19.6, 8.2, 0], [20.4, 10.8, 1.1], "wood", faces=top, upright=True)  # reception
+        solid([19.6, 8.2, 0], [20.4, 10.8, 1.1], "wood", faces=OPEN, upright=True)  # reception
         self.b.box([19.5, 8.1, 1.1], [20.5, 10.9, 1.16], "terrazzo", slab_m=0.6, rgb=_GREY)
         for x, y in ((3.2, 4.6), (3.2, 11.2), (20.6, 4.2), (10.6, 9.6), (12.9, 5.6), (5.2, 8.0)):
             x, y = self.placed(x, y)
-            solid([x, y, 0], [x + 0.6, y + 0.6, 0.55], "concrete", faces=top, rgb=_GREY)  # planters
+            solid(
+                [x, y, 0], [x + 0.6, y + 0.6, 0.55], "concrete", faces=OPEN, rgb=_GREY
+            )  # planters
             for dx, dy, z0, z1 in (
                 (0.0, 0.0, 0.55, 1.0),
                 (0.1, 0.1, 1.0, 1.35),
                 (0.2, 0.15, 1.35, 1.6),
             ):
                 self.b.box(
-                    [x + dx, y + dy, z0], [x + 0.6 - dx, y + 0.6 - dy, z1], "foliage", faces=top
+                    [x + dx, y + dy, z0], [x + 0.6 - dx, y + 0.6 - dy, z1], "foliage", faces=OPEN
                 )
         for x, text in ((9.7, "MAP"), (14.4, "TODAY")):  # notice boards on the floor, two sided
             lo, hi = [x, 8.9, 0.0], [x + 0.9, 9.0, 1.9]
-            solid(lo, hi, "metal", faces=top, rgb=(0.2, 0.2, 0.22))
+            solid(lo, hi, "metal", faces=OPEN, rgb=(0.2, 0.2, 0.22))
             self.sign(text, [x + 0.05, 8.89, 0.5], [0.8, 0, 0], [0, 0, 1.3])
             self.b.rectangle([x + 0.85, 9.01, 0.5], [-0.8, 0, 0], [0, 0, 1.3], "poster",
                              text=text, detail=1.6)  # fmt: skip
         for k, x in enumerate((1.2, 4.4, 17.6, 20.8)):  # cupboards under the balcony
-            solid([x, 15.4, 0], [x + 0.9, 15.98, 1.9], "metal", faces=top,
+            solid([x, 15.4, 0], [x + 0.9, 15.98, 1.9], "metal", faces=OPEN,
                   rgb=((0.35, 0.33, 0.28), _GREY)[k % 2])  # fmt: skip
         for x in (3.0, 9.0, 15.0, 21.0):  # pendant lamps on rods
             for y in (5.0, 11.0):
@@ -329,9 +315,9 @@ class _Atrium:
                 self.b.rectangle(
                     [x - 0.2, y - 0.2, 6.5], [0.4, 0, 0], [0, 0.4, 0], "metal", rgb=_WHITE
                 )
-                self.lamps.append(Lamp((x, y, 6.1)))
+                self.b.lamps.append(Lamp((x, y, 6.1)))
         for x in (3.0, 9.0, 15.0, 21.0):
-            self.lamps.append(Lamp((x, 14.6, 3.2)))
+            self.b.lamps.append(Lamp((x, 14.6, 3.2)))
 
     def outside(self) -> None:
         """What the windows show: pavement, trees, the sky."""
@@ -365,7 +351,7 @@ class _Atrium:
 
 
 def build_atrium(texels_per_m: float, *, moved: bool = False, posted: bool = False) -> Scene:
-    """The scene `atrium`; its textures are the same for every flight.
+    """The scene `atrium`.
 
     `moved`: benches, sofas and plants stand up to `MOVED_M` elsewhere; `posted`: other posters hang
     in the old ones' places. That is the hall some time after it was mapped.
@@ -375,12 +361,5 @@ def build_atrium(texels_per_m: float, *, moved: bool = False, posted: bool = Fal
         a.floor_and_ceiling, a.south, a.west, a.east, a.north, a.pillars, a.furniture, a.outside,
     ):  # fmt: skip
         part()
-    return Scene(
-        name="atrium" + "-moved" * moved + "-posted" * posted,
-        size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
-        surfaces=tuple(a.b.surfaces),
-        footprints=tuple(a.footprints),
-        known_points=tuple(a.known),
-        lamps=tuple(a.lamps),
-        texture_seed=TEXTURE_SEED,
-    )
+    name = "atrium" + "-moved" * moved + "-posted" * posted
+    return a.b.scene(name, (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

@@ -7,8 +7,8 @@ along the corridor, z up; the origin is the south-west corner on the floor. Plan
 
 from __future__ import annotations
 
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder
+from ground_station.simulator.building import SceneBuilder
+from ground_station.simulator.scene import Lamp, Scene
 
 BAYS, BAY_M = 7, 4.0
 LENGTH_M, WIDTH_M, HEIGHT_M = BAYS * BAY_M, 4.0, 3.0
@@ -18,7 +18,7 @@ _WHITE, _GREY, _GREEN = (0.72, 0.72, 0.70), (0.45, 0.45, 0.46), (0.20, 0.33, 0.1
 _DOOR, _LEFT, _RIGHT, _FRAME = 1_000_001, 1_000_002, 1_000_003, 1_000_004
 
 
-def _bay(b: SceneBuilder, x: float, known: list[KnownPoint], number: int) -> None:
+def _bay(b: SceneBuilder, x: float, number: int) -> None:
     """Walls, floor and ceiling of one bay, and what hangs there."""
     north, south = WIDTH_M, 0.0
     b.rectangle([x, north, 0], [BAY_M, 0, 0], [0, 0, HEIGHT_M], "plaster", rgb=_WHITE)
@@ -35,44 +35,29 @@ def _bay(b: SceneBuilder, x: float, known: list[KnownPoint], number: int) -> Non
     b.box([x - 0.15, north - 0.22, 0], [x + 0.15, north, HEIGHT_M], "concrete", rgb=_GREY,
           faces=("-y", "-x", "+x"), print=_FRAME + 10)  # fmt: skip
     b.box([x + 2.0, north - 0.5, 0.4], [x + 3.8, north - 0.08, 0.5], "wood", print=_FRAME + 20)
-    sign = b.rectangle([x + 1.8, north - 0.02, 0.9], [0.85, 0, 0], [0, 0, 1.2], "poster",
-                       text="SAFETY", detail=1.6, print=_LEFT)  # fmt: skip
+    b.sign(f"sign-{number}", [x + 1.8, north - 0.02, 0.9], [0.85, 0, 0], [0, 0, 1.2], "SAFETY",
+           print=_LEFT)  # fmt: skip
     b.rectangle([x + 2.85, north - 0.02, 0.7], [1.0, 0, 0], [0, 0, 1.6], "poster", text="NEWS",
                 detail=1.6, print=_RIGHT)  # fmt: skip
     b.rectangle([x + 3.0, south + 0.03, 0], [-1.0, 0, 0], [0, 0, 2.1], "door", text="STORE",
                 detail=1.3, print=_DOOR + 10)  # fmt: skip
-    normal = sign.normal.tolist()
-    for corner, end in ((0, "a"), (2, "b")):
-        px, py, pz = sign.corners()[corner].tolist()
-        name = f"sign-{number}-{end}"
-        known.append(KnownPoint(name, (px, py, pz), (normal[0], normal[1], normal[2])))
 
 
 def build_corridor(texels_per_m: float) -> Scene:
-    """The scene `corridor`; its textures are the same for every flight."""
+    """The scene `corridor`."""
     b = SceneBuilder(texels_per_m)
-    known: list[KnownPoint] = []
-    lamps: list[Lamp] = []
     for number in range(BAYS):
         x = BAY_M * number
-        _bay(b, x, known, number)
+        _bay(b, x, number)
         for dx in (1.0, 3.0):
-            lamps.append(Lamp((x + dx, WIDTH_M / 2, HEIGHT_M - 0.12)))
+            b.lamps.append(Lamp((x + dx, WIDTH_M / 2, HEIGHT_M - 0.12)))
             b.box([x + dx - 0.6, WIDTH_M / 2 - 0.1, HEIGHT_M - 0.1],
                   [x + dx + 0.6, WIDTH_M / 2 + 0.1, HEIGHT_M - 0.02], "metal", rgb=_WHITE,
                   print=_DOOR + 20)  # fmt: skip
     b.rectangle([0, 0, 0], [0, WIDTH_M, 0], [0, 0, HEIGHT_M], "brick")
     b.rectangle([LENGTH_M, WIDTH_M, 0], [0, -WIDTH_M, 0], [0, 0, HEIGHT_M], "plaster", rgb=_GREEN)
-    walls = (
+    b.walls(
         (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
         (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
     )  # fmt: skip
-    return Scene(
-        name="corridor",
-        size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
-        surfaces=tuple(b.surfaces),
-        footprints=tuple(Footprint(bounds, "wall") for bounds in walls),
-        known_points=tuple(known),
-        lamps=tuple(lamps),
-        texture_seed=TEXTURE_SEED,
-    )
+    return b.scene("corridor", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

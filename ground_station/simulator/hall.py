@@ -9,10 +9,8 @@ origin is the south-west corner on the floor. Light falls in through the roof.
 
 from __future__ import annotations
 
-from typing import Any
-
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder
+from ground_station.simulator.building import OPEN, SceneBuilder
+from ground_station.simulator.scene import Footprint, Lamp, Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 18.0, 12.0, 5.4
 PANEL_M, ROW_M = 1.5, 1.35
@@ -132,52 +130,34 @@ def _roof(b: SceneBuilder) -> list[Lamp]:
 
 
 def build_hall(texels_per_m: float) -> Scene:
-    """The scene `hall`; its textures are the same for every flight."""
+    """The scene `hall`."""
     b = SceneBuilder(texels_per_m)
-    known: list[KnownPoint] = []
-    footprints = [
-        Footprint(bounds, "wall")
-        for bounds in (
-            (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
-            (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
-        )
-    ]  # fmt: skip
+    b.walls(
+        (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
+        (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
+    )  # fmt: skip
     for i in range(6):
         for j in range(3):
             b.rectangle([3 * i, 4 * j, 0], [3, 0, 0], [0, 4, 0], "terrazzo", slab_m=0.75,
                         detail=0.8)  # fmt: skip
     for wall in (_SOUTH, _EAST, _NORTH, _WEST):
         _panels(b, wall)
-    lamps = _roof(b)
+    b.lamps = _roof(b)
     for wall, at, text in _DOORS:
         b.rectangle(wall.at(at + 1.1, 0.03, 0), wall.rightwards(1.1), [0, 0, 2.15], "door",
                     text=text, detail=1.3)  # fmt: skip
         for post in (at - 0.1, at + 1.1):
             b.box(*wall.solid((post, post + 0.1), 0.07, (0.0, 2.25)), "wood", upright=True)
     for wall, at, z, width, height, text in _POSTERS:
-        sign = b.rectangle(wall.at(at + width, 0.03, z), wall.rightwards(width), [0, 0, height],
-                           "poster", text=text, detail=1.6)  # fmt: skip
-        nx, ny, nz = sign.normal.tolist()
-        for corner, end in ((0, "a"), (2, "b")):
-            px, py, pz = sign.corners()[corner].tolist()
-            known.append(KnownPoint(f"sign-{text.lower()}-{end}", (px, py, pz), (nx, ny, nz)))
+        b.sign(f"sign-{text.lower()}", wall.at(at + width, 0.03, z), wall.rightwards(width),
+               [0, 0, height], text)  # fmt: skip
     for wall, at in ((_SOUTH, 4.0), (_EAST, 10.9), (_NORTH, 6.1), (_WEST, 6.6)):  # fuse boxes
         b.box(*wall.solid((at, at + 0.5), 0.14, (1.3, 2.0)), "metal", rgb=_RED)
     for x, y, length, width, height, material, rgb in _FURNITURE:
-        colour: dict[str, Any] = {} if rgb is None else {"rgb": rgb}
-        b.box([x, y, 0], [x + length, y + width, height], material,
-              faces=("-x", "+x", "-y", "+y", "+z"), **colour)  # fmt: skip
-        footprints.append(Footprint((x, y, x + length, y + width), "furniture"))
+        colour = {} if rgb is None else {"rgb": rgb}
+        b.stand([x, y, 0], [x + length, y + width, height], material, faces=OPEN, **colour)
     for x, y in _PLANTS:
         b.box([x - 0.2, y - 0.2, 0], [x + 0.2, y + 0.2, 0.45], "concrete", rgb=_DARK)
         b.box([x - 0.3, y - 0.3, 0.45], [x + 0.3, y + 0.3, 1.25], "foliage")
-        footprints.append(Footprint((x - 0.2, y - 0.2, x + 0.2, y + 0.2), "furniture"))
-    return Scene(
-        name="hall",
-        size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
-        surfaces=tuple(b.surfaces),
-        footprints=tuple(footprints),
-        known_points=tuple(known),
-        lamps=tuple(lamps),
-        texture_seed=TEXTURE_SEED,
-    )
+        b.footprints.append(Footprint((x - 0.2, y - 0.2, x + 0.2, y + 0.2), "furniture"))
+    return b.scene("hall", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

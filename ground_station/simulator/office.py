@@ -8,10 +8,8 @@ notices. The plans' paths keep clear of everything above 1.5 m, as in the atrium
 
 from __future__ import annotations
 
-from typing import Any
-
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder
+from ground_station.simulator.building import OPEN, SceneBuilder
+from ground_station.simulator.scene import Lamp, Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 22.0, 14.0, 4.6
 BAY_M = 2.75
@@ -21,30 +19,11 @@ TEXTURE_SEED = 77003
 
 _WHITE, _SAND, _SLATE = (0.72, 0.72, 0.70), (0.58, 0.52, 0.42), (0.24, 0.27, 0.31)
 _BLUE, _GREEN, _DARK = (0.11, 0.19, 0.36), (0.20, 0.33, 0.18), (0.12, 0.12, 0.13)
-_OPEN = ("-x", "+x", "-y", "+y", "+z")
 
 
 class _Office:
     def __init__(self, texels_per_m: float) -> None:
         self.b = SceneBuilder(texels_per_m)
-        self.footprints: list[Footprint] = []
-        self.known: list[KnownPoint] = []
-        self.lamps: list[Lamp] = []
-
-    def sign(
-        self, name: str, text: str, origin: list[float], u: list[float], v: list[float]
-    ) -> None:
-        """A poster with two of its corners surveyed."""
-        surface = self.b.rectangle(origin, u, v, "poster", detail=1.6, text=text)
-        a, b, c = surface.normal.tolist()
-        for corner, end in ((0, "a"), (2, "b")):
-            x, y, z = surface.corners()[corner].tolist()
-            self.known.append(KnownPoint(f"{name}-{end}", (x, y, z), (a, b, c)))
-
-    def solid(self, lo: list[float], hi: list[float], material: str, **options: Any) -> None:
-        """A box that stands on the plan."""
-        self.b.box(lo, hi, material, faces=_OPEN, **options)
-        self.footprints.append(Footprint((lo[0], lo[1], hi[0], hi[1]), "furniture"))
 
     def floor_and_ceiling(self) -> None:
         for k in range(8):
@@ -62,7 +41,7 @@ class _Office:
                        faces=("-x", "+x", "-z"), rgb=_WHITE, detail=0.7)  # fmt: skip
             for y in (2.0, 6.9, 10.6):  # strip lights between the trays
                 self.b.box([x + 0.7, y - 0.1, 4.4], [x + 2.0, y + 0.1, 4.5], "metal", rgb=_WHITE)
-                self.lamps.append(Lamp((x + 1.35, y, 4.38)))
+                self.b.lamps.append(Lamp((x + 1.35, y, 4.38)))
 
     def south(self) -> None:
         """Parapet, windows and lintel, bay after bay."""
@@ -77,8 +56,8 @@ class _Office:
                 self.b.box([m, -0.2, 0.9], [m + 0.06, -0.12, 3.5], "metal", rgb=_DARK)
             for z in (0.9, 2.7, 3.44):
                 self.b.box([x + 0.35, -0.2, z], [x + BAY_M, -0.12, z + 0.06], "metal", rgb=_DARK)
-            self.b.box([x + 0.5, 0, 0.15], [x + 2.5, 0.12, 0.7], "metal", faces=_OPEN, rgb=_WHITE)
-        self.footprints.append(Footprint((-0.3, -0.3, LENGTH_M + 0.3, 0), "wall"))
+            self.b.box([x + 0.5, 0, 0.15], [x + 2.5, 0.12, 0.7], "metal", faces=OPEN, rgb=_WHITE)
+        self.b.walls((-0.3, -0.3, LENGTH_M + 0.3, 0))
 
     def corridor(self) -> None:
         """Equal doors with equal notices between them, behind a low wall and posts."""
@@ -92,19 +71,18 @@ class _Office:
             for a in (x + 0.42, x + 1.45):
                 self.b.box([a, y - 0.06, 0], [a + 0.08, y, 2.18], "wood", upright=True,
                            faces=("-y", "-x", "+x"))  # fmt: skip
-            self.sign(f"notice-{k}", "NOTICE", [x + 1.75, y - 0.02, 1.2], [0.7, 0, 0], [0, 0, 0.95])
+            self.b.sign(f"notice-{k}", [x + 1.75, y - 0.02, 1.2], [0.7, 0, 0], [0, 0, 0.95],
+                        "NOTICE")  # fmt: skip
             text = ("SAFETY", "PLAN", "NEWS", "TEAM")[k % 4]
             self.b.rectangle([x + 0.7, y - 0.02, 2.5], [1.3, 0, 0], [0, 0, 1.7], "poster",
                              text=text, detail=1.4)  # fmt: skip
             self.b.box([x, CORRIDOR_Y_M - 0.05, 0], [x + 1.9, CORRIDOR_Y_M + 0.05, 1.1], "wood",
-                       faces=_OPEN, rgb=(0.30, 0.22, 0.14), plank_m=0.12)  # fmt: skip
+                       faces=OPEN, rgb=(0.30, 0.22, 0.14), plank_m=0.12)  # fmt: skip
             low, high = CORRIDOR_Y_M - 0.12, CORRIDOR_Y_M + 0.12
             self.b.box([x - 0.12, low, 0], [x + 0.12, high, HEIGHT_M], "concrete",
                        faces=("-x", "+x", "-y", "+y"), rgb=_GREEN)  # fmt: skip
-            self.footprints.append(
-                Footprint((x, CORRIDOR_Y_M - 0.05, x + 1.9, CORRIDOR_Y_M + 0.05), "wall")
-            )
-        self.footprints.append(Footprint((-0.3, y, LENGTH_M + 0.3, y + 0.3), "wall"))
+            self.b.walls((x, CORRIDOR_Y_M - 0.05, x + 1.9, CORRIDOR_Y_M + 0.05))
+        self.b.walls((-0.3, y, LENGTH_M + 0.3, y + 0.3))
 
     def rooms(self) -> None:
         """At each end a wall with a long opening and a doorway, and a room behind."""
@@ -117,14 +95,14 @@ class _Office:
             for y0, y1, z0, z1 in pieces:
                 self.b.box([a, y0, z0], [c, y1, z1], "plaster", rgb=rgb, dirt=0.2)
                 if z0 == 0.0:
-                    self.footprints.append(Footprint((a, y0, c, y1), "wall"))
+                    self.b.walls((a, y0, c, y1))
             for y in (2.6, 4.2, 5.8, 7.54):
                 self.b.box([a, y, 0.95], [c, y + 0.06, 2.8], "metal", rgb=_DARK)
             face = c + 0.01 if out > 0 else a - 0.01
             for y, text in ((0.7, "KITCHEN"), (8.0, "PRINT"), (10.6, "MEETING")):
                 start = y if out > 0 else y + 1.1  # upright text reads along +u
-                self.sign(f"sign-{text.lower()}-{'w' if out > 0 else 'e'}", text,
-                          [face, start, 1.5], [0, 1.1 * out, 0], [0, 0, 1.5])  # fmt: skip
+                name = f"sign-{text.lower()}-{'w' if out > 0 else 'e'}"
+                self.b.sign(name, [face, start, 1.5], [0, 1.1 * out, 0], [0, 0, 1.5], text)
             end = 0.0 if out > 0 else LENGTH_M
             u = 3.5 * out
             for k in range(4):
@@ -132,29 +110,28 @@ class _Office:
                 self.b.rectangle([end, y, 0], [0, u, 0], [0, 0, HEIGHT_M], "brick", detail=1.1)
             for y in (0.6, 3.0, 5.4, 10.4):
                 lo, hi = sorted((end + 0.02 * out, end + 0.45 * out))
-                self.solid([lo, y, 0], [hi, y + 1.6, 2.0], "wood", upright=True)
-            self.footprints.append(
-                Footprint((-0.3, 0, 0, WIDTH_M) if out > 0 else (22.0, 0, 22.3, WIDTH_M), "wall")
-            )
+                self.b.stand([lo, y, 0], [hi, y + 1.6, 2.0], "wood", faces=OPEN, upright=True)
+            self.b.walls((-0.3, 0, 0, WIDTH_M) if out > 0 else (22.0, 0, 22.3, WIDTH_M))
 
     def desks(self) -> None:
         """Equal desks in rows, screens and cupboards on them; nothing reaches 1.5 m."""
         for x in (3.2, 6.4, 9.6, 12.8, 16.0):
             for y in (1.6, 5.0, 8.4):
-                self.solid([x, y, 0.68], [x + 1.8, y + 1.6, 0.74], "wood", rgb=(0.50, 0.40, 0.27))
-                self.b.box([x, y + 0.78, 0.74], [x + 1.8, y + 0.82, 1.2], "fabric", faces=_OPEN,
+                self.b.stand([x, y, 0.68], [x + 1.8, y + 1.6, 0.74], "wood", faces=OPEN,
+                             rgb=(0.50, 0.40, 0.27))  # fmt: skip
+                self.b.box([x, y + 0.78, 0.74], [x + 1.8, y + 0.82, 1.2], "fabric", faces=OPEN,
                            rgb=_BLUE if int(x + y) % 2 else _GREEN)  # fmt: skip
                 for dy in (0.5, 1.02):
                     self.b.box([x + 0.5, y + dy, 0.85], [x + 1.1, y + dy + 0.06, 1.22], "metal",
-                               faces=_OPEN, rgb=_DARK)  # fmt: skip
+                               faces=OPEN, rgb=_DARK)  # fmt: skip
                 self.b.rectangle([x + 0.15, y + 0.1, 0.745], [0.3, 0, 0], [0, 0.42, 0], "poster",
                                  text="MEMO", detail=1.6)  # fmt: skip
-                self.b.box([x + 1.3, y + 0.1, 0], [x + 1.7, y + 0.7, 0.68], "metal", faces=_OPEN,
+                self.b.box([x + 1.3, y + 0.1, 0], [x + 1.7, y + 0.7, 0.68], "metal", faces=OPEN,
                            rgb=_WHITE)  # fmt: skip
                 self.b.box([x + 0.5, y - 0.65, 0.4], [x + 1.0, y - 0.15, 0.5], "fabric", rgb=_DARK)
         for x, y in ((2.3, 10.8), (8.6, 4.2), (15.1, 7.6), (18.9, 10.9), (18.9, 0.7)):
-            self.solid([x, y, 0], [x + 0.5, y + 0.5, 0.5], "concrete", rgb=_SLATE)
-            self.b.box([x + 0.05, y + 0.05, 0.5], [x + 0.45, y + 0.45, 1.1], "foliage", faces=_OPEN)
+            self.b.stand([x, y, 0], [x + 0.5, y + 0.5, 0.5], "concrete", faces=OPEN, rgb=_SLATE)
+            self.b.box([x + 0.05, y + 0.05, 0.5], [x + 0.45, y + 0.45, 1.1], "foliage", faces=OPEN)
 
     def outside(self) -> None:
         """What the windows show: a car park, a hedge, the sky."""
@@ -175,16 +152,8 @@ class _Office:
 
 
 def build_office(texels_per_m: float) -> Scene:
-    """The scene `office`; its textures are the same for every flight."""
+    """The scene `office`."""
     o = _Office(texels_per_m)
     for part in (o.floor_and_ceiling, o.south, o.corridor, o.rooms, o.desks, o.outside):
         part()
-    return Scene(
-        name="office",
-        size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
-        surfaces=tuple(o.b.surfaces),
-        footprints=tuple(o.footprints),
-        known_points=tuple(o.known),
-        lamps=tuple(o.lamps),
-        texture_seed=TEXTURE_SEED,
-    )
+    return o.b.scene("office", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

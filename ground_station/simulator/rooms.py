@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder
+from ground_station.simulator.building import OPEN, SceneBuilder
+from ground_station.simulator.scene import Lamp, Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.6, 9.6, 2.7
 PASSAGE_Y_M = (4.0, 5.4)
@@ -78,7 +78,7 @@ _LONG = (
 )  # fmt: skip
 
 
-def _inner_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
+def _inner_walls(b: SceneBuilder) -> None:
     """Plain walls with doorways, their frames, and the skirting."""
 
     def block(
@@ -90,7 +90,7 @@ def _inner_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
             lo, hi = [lo[1], lo[0], lo[2]], [hi[1], hi[0], hi[2]]
         b.box(lo, hi, material, **options)
         if z[0] == 0.0 and material == "plaster":
-            footprints.append(Footprint((lo[0], lo[1], hi[0], hi[1]), "wall"))
+            b.walls((lo[0], lo[1], hi[0], hi[1]))
 
     for axis, at, start, end, doors in _INNER:
         a = start
@@ -107,7 +107,7 @@ def _inner_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
             block(axis, at, c - 0.05, a + 0.05, (_DOOR_HEIGHT_M - 0.02, 2.16), 0.08, "wood")
 
 
-def _outer_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
+def _outer_walls(b: SceneBuilder) -> None:
     """Four walls with windows, their bars and sills, radiators beneath."""
     for side, across, reach in (("north", WIDTH_M, LENGTH_M), ("south", 0.0, LENGTH_M),
                                 ("west", 0.0, WIDTH_M), ("east", LENGTH_M, WIDTH_M)):  # fmt: skip
@@ -127,10 +127,8 @@ def _outer_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
         inwards = -1 if out > 0 else 1
         a = 0.0
         for left, right in [(w[1], w[2]) for w in _WINDOWS if w[0] == side]:
-            footprints.append(Footprint(block(a, left, (0.0, _ROOF_M), "plaster", **paint),
-                                        "wall"))  # fmt: skip
-            footprints.append(Footprint(block(left, right, (0.0, _SILL_M), "plaster", **paint),
-                                        "wall"))  # fmt: skip
+            b.walls(block(a, left, (0.0, _ROOF_M), "plaster", **paint))
+            b.walls(block(left, right, (0.0, _SILL_M), "plaster", **paint))
             block(left, right, (_LINTEL_M, _ROOF_M), "plaster", **paint)
             bars = (0.4 * out, 0.6 * out)
             for x in (left, (left + right) / 2 - 0.03, right - 0.06):
@@ -143,7 +141,7 @@ def _outer_walls(b: SceneBuilder, footprints: list[Footprint]) -> None:
                 block(left + 0.2, right - 0.2, (0.12, 0.62), "metal",
                       off_m=(0.03 * inwards, 0.1 * inwards), rgb=_WHITE)  # fmt: skip
             a = right
-        footprints.append(Footprint(block(a, reach, (0.0, _ROOF_M), "plaster", **paint), "wall"))
+        b.walls(block(a, reach, (0.0, _ROOF_M), "plaster", **paint))
 
 
 def _outside(b: SceneBuilder) -> None:
@@ -165,10 +163,8 @@ def _outside(b: SceneBuilder) -> None:
 
 
 def build_rooms(texels_per_m: float) -> Scene:
-    """The scene `rooms`; its textures are the same for every flight."""
+    """The scene `rooms`."""
     b = SceneBuilder(texels_per_m)
-    footprints: list[Footprint] = []
-    known: list[KnownPoint] = []
     low, high = PASSAGE_Y_M
     floors = (
         (0.0, 0.0, 6.4, low), (6.4, 0.0, LENGTH_M, low), (0.0, low, LENGTH_M, high),
@@ -180,32 +176,17 @@ def build_rooms(texels_per_m: float) -> Scene:
         b.rectangle([xa, ya, 0], *size, "terrazzo" if tiled else "wood", slab_m=0.4, plank_m=0.16)
         b.rectangle([xa, yb, HEIGHT_M], size[0], [0, ya - yb, 0], "plaster", rgb=_WHITE,
                     dirt=_DIRT, detail=0.6)  # fmt: skip
-    _inner_walls(b, footprints)
-    _outer_walls(b, footprints)
+    _inner_walls(b)
+    _outer_walls(b)
     _outside(b)
     b.rectangle([-0.5, -0.5, _ROOF_M], [LENGTH_M + 1, 0, 0], [0, WIDTH_M + 1, 0], "concrete",
                 detail=0.1)  # fmt: skip
     for xa, ya, xb, yb, height, material, rgb in _FURNITURE:
-        colour: dict[str, Any] = {} if rgb is None else {"rgb": rgb}
-        b.box([xa, ya, 0], [xb, yb, height], material, faces=("-x", "+x", "-y", "+y", "+z"),
-              **colour)  # fmt: skip
-        footprints.append(Footprint((xa, ya, xb, yb), "furniture"))
+        colour = {} if rgb is None else {"rgb": rgb}
+        b.stand([xa, ya, 0], [xb, yb, height], material, faces=OPEN, **colour)
     for (x, y), facing, width, height, text in _PICTURES:
         along = _UPRIGHT[facing]
-        print_ = b.rectangle([x, y, 1.25], [width * along[0], width * along[1], 0], [0, 0, height],
-                             "poster", text=text, detail=1.6)  # fmt: skip
-        nx, ny, nz = print_.normal.tolist()
-        for corner, end in ((0, "a"), (2, "b")):
-            px, py, pz = print_.corners()[corner].tolist()
-            known.append(KnownPoint(f"picture-{text.lower()}-{end}", (px, py, pz), (nx, ny, nz)))
-    lamps = tuple(Lamp(((xa + xb) / 2, (ya + yb) / 2, HEIGHT_M - 0.2)) for xa, ya, xb, yb in floors)
-    return Scene(
-        name="rooms",
-        size_m=(LENGTH_M, WIDTH_M, HEIGHT_M),
-        surfaces=tuple(b.surfaces),
-        footprints=tuple(footprints),
-        known_points=tuple(known),
-        lamps=lamps,
-        texture_seed=TEXTURE_SEED,
-        walks=(_SHORT, _LONG),
-    )
+        right = [width * along[0], width * along[1], 0]
+        b.sign(f"picture-{text.lower()}", [x, y, 1.25], right, [0, 0, height], text)
+    b.lamps = [Lamp(((xa + xb) / 2, (ya + yb) / 2, HEIGHT_M - 0.2)) for xa, ya, xb, yb in floors]
+    return b.scene("rooms", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED, walks=(_SHORT, _LONG))

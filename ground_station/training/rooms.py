@@ -14,17 +14,16 @@ import numpy as np
 
 from ground_station.arrays import F64, U8
 from ground_station.geometry.camera import Camera
+from ground_station.simulator.building import OPEN, SceneBuilder
 from ground_station.simulator.imaging import AutoExposure, FrameMaker
 from ground_station.simulator.lighting import LIGHTS, Light, LitTextures, lit_textures, looking
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Lamp, Scene
-from ground_station.simulator.surfaces import SceneBuilder
 
 Rng = np.random.Generator
 
 _WALL = ("plaster", "plaster", "brick", "concrete", "wood")
 _SOLID = ("wood", "metal", "fabric", "concrete", "plaster", "foliage")
-_UPPER = ("-x", "+x", "-y", "+y", "+z")
 _OVER = 1.5
 _NEAR_M = 0.7
 _LEAST_DEVIATION = 12.0
@@ -127,7 +126,7 @@ class _Room:
             low = 0.0 if self.rng.random() < 0.7 else float(self.rng.uniform(0.3, 0.8))
             high = low + float(self.rng.uniform(0.1, 1.7))
             material = str(self.rng.choice(_SOLID))
-            faces = (*_UPPER, "-z") if low > 0 else _UPPER
+            faces = (*OPEN, "-z") if low > 0 else OPEN
             self.b.box([x, y, low], [x + w, y + d, high], material, faces=faces, rgb=self._rgb())
             if w > 0.5 and self.rng.random() < 0.4:
                 self.b.rectangle([x + 0.05, y + 0.05, high + 0.003], [w - 0.1, 0, 0],
@@ -173,20 +172,12 @@ def build_room(seed: int, number: int, texels_per_m: float = 80.0) -> Scene:
     for part in (room.floor_and_ceiling, room.walls, room.things, room.outside):
         part()
     length, width, height = room.size
-    lamps = [
+    room.b.lamps = [
         Lamp((x + w / 2, y + h / 2, height - 0.4))
         for x, w in _pieces(length, 3.5)
         for y, h in _pieces(width, 3.5)
     ]
-    return Scene(
-        name=f"room-{number}",
-        size_m=room.size,
-        surfaces=tuple(room.b.surfaces),
-        footprints=(),
-        known_points=(),
-        lamps=tuple(lamps),
-        texture_seed=int(rng.integers(2**31)),
-    )
+    return room.b.scene(f"room-{number}", room.size, int(rng.integers(2**31)))
 
 
 def _lit(scene: Scene, base: Light, rng: Rng) -> LitTextures:

@@ -12,10 +12,11 @@ import pytest
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.simulate import SimulationSettings, simulate
-from ground_station.simulator.surfaces import SceneBuilder, Surface
+from ground_station.simulator.surfaces import Surface
 
 TEXELS_PER_M = 100
 DOT_M = 0.10
