@@ -1,12 +1,15 @@
-"""Progress of a long job: a bar on a terminal, plain lines in a log."""
+"""Progress of a long job: a bar on a terminal, plain lines in a log; and its end by Ctrl-C."""
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from types import FrameType
 
 from tqdm import tqdm
 
@@ -22,6 +25,30 @@ def silent() -> Iterator[None]:
         yield
     finally:
         _SILENT.reset(before)
+
+
+@contextmanager
+def stop_noted(*numbers: int) -> Iterator[list[bool]]:
+    """Inside, these signals only set the list's one element, so that a step is done whole or not.
+
+    A second Ctrl-C is obeyed. Signals come to the main thread only: in others nothing is set.
+    """
+    noted = [False]
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if noted[0] and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        noted[0] = True
+
+    before = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Progress:

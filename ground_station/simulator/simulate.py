@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ from ground_station.arrays import F32, F64, I64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
+from ground_station.progress import stop_noted
 from ground_station.recording.encoding import H264Encoder
 from ground_station.simulator import dynamics, handheld, scenes
 from ground_station.simulator.imaging import (
@@ -194,24 +193,6 @@ def time_ns_of(times_s: npt.ArrayLike) -> I64:
 
 
 @contextmanager
-def _interrupt_noted() -> Iterator[list[bool]]:
-    """Inside, Ctrl-C only sets the list's one element, so that a frame is written whole or not."""
-    noted = [False]
-    if threading.current_thread() is not threading.main_thread():
-        yield noted  # signals come to the main thread only
-        return
-
-    def note(_number: int, _frame: FrameType | None) -> None:
-        noted[0] = True
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield noted
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
 def _recording(path: Path) -> Iterator[RecordingWriter]:
     """A recording written beside and renamed when it is closed properly."""
     try:
@@ -296,7 +277,7 @@ def _record(
         return radiance
 
     taken = 0
-    with _recording(settings.out) as writer, _interrupt_noted() as interrupted:
+    with _recording(settings.out) as writer, stop_noted(signal.SIGINT) as interrupted:
         _write_head(writer, settings, flight, stamps[0])
         exposure = AutoExposure(maker.sensor, seen(float(times[0]), 0.0))
         for k, t in enumerate(times.tolist()):

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import cv2
@@ -24,7 +21,7 @@ from ground_station.features.inference import Network
 from ground_station.features.methods.rootsift import RootSift
 from ground_station.features.pixels import PixelFeatures
 from ground_station.features.settings import LearnedSettings
-from ground_station.progress import Progress
+from ground_station.progress import Progress, stop_noted
 from ground_station.training import checkpoint, corpus, curve, teacher, validation
 from ground_station.training.batches import batches
 from ground_station.training.errors import TrainingError
@@ -193,7 +190,7 @@ class _Run:
         )
         # A log has lines enough of its own.
         bar = Progress("steps", recipe.steps - step) if sys.stderr.isatty() else nullcontext()
-        with _stop_noted() as stopped, bar, closing(stream):
+        with stop_noted(signal.SIGINT, signal.SIGTERM) as stopped, bar, closing(stream):
             for batch in stream:
                 made = self.trainer.step(step, batch)
                 # Read only where it is logged: a GPU would wait for each number.
@@ -274,24 +271,3 @@ def _say(name: str, figures: validation.Figures) -> None:
         f"pair), repeatability {100 * figures.repeatability:.1f} %, {figures.error_px:.2f} px",
         file=sys.stderr,
     )
-
-
-@contextmanager
-def _stop_noted() -> Iterator[list[bool]]:
-    """Inside, Ctrl-C and SIGTERM only set the list's element; the second Ctrl-C is obeyed."""
-    noted = [False]
-    if threading.current_thread() is not threading.main_thread():
-        yield noted
-        return
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        if noted[0] and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        noted[0] = True
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield noted
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
