@@ -7,8 +7,15 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError
+from ground_station.errors import GroundStationError, InputError
 from pi_firmware.wire import files
+
+
+def check_places(*paths: str | Path | None) -> None:
+    """Raises `InputError` where a file that is to be written has no folder; None is no file."""
+    for path in paths:
+        if path is not None and not Path(path).resolve().parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist")
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -74,15 +74,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints or calibrates; raises a `BlimpError` with one line for what a person can fix."""
+    from ground_station.files import check_places
+
     printing = args.inputs == ["board"]
     for name in _OF_VIEWS if printing else _OF_BOARD:
         if getattr(args, name) is not None:
             flag = "--" + name.replace("_", "-")
             where = "is for calibrating" if printing else "is for 'blimp calibrate board'"
             raise CalibrationError(f"{flag} {where}")
-    for out in (args.out, args.json, args.report):
-        if out is not None and not out.resolve().parent.is_dir():
-            raise CalibrationError(f"{out}: its folder does not exist")
+    check_places(args.out, args.json, args.report)
     return _print(args) if printing else _calibrate(args)
 
 

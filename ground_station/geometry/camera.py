@@ -14,6 +14,7 @@ import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -169,6 +170,16 @@ class Camera:
         """The camera as the keys of its file: those of its model."""
         foreign = foreign_keys(self.model)
         return {name: value for name, value in asdict(self).items() if name not in foreign}
+
+    def as_page(self) -> dict[str, Any]:
+        """The camera as pages are told it, for JSON: size, `K` (3, 3), lens numbers and model."""
+        return {
+            "width_px": self.width_px,
+            "height_px": self.height_px,
+            "K": self.matrix.tolist(),
+            "distortion": self.distortion.tolist(),
+            "model": self.model,
+        }
 
 
 def foreign_keys(model: str) -> list[str]:

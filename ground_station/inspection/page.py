@@ -156,7 +156,6 @@ def _figures(
     scale: float,
 ) -> dict[str, Any]:
     low, high = (scale * bound for bound in bounds)
-    camera = map_.info.camera
     grid = scale * np.array(found.origin)
     cells = scale * found.cell_m * found.cell
     area = np.array([low[:2], high[:2]])
@@ -168,13 +167,7 @@ def _figures(
         "scale": scale,
         "bounds": {"min": low.tolist(), "max": high.tolist()},
         "area": {"min": area[0].tolist(), "max": area[1].tolist()},
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "K": camera.matrix.tolist(),
-            "distortion": camera.distortion.tolist(),
-            "model": camera.model,
-        },
+        "camera": map_.info.camera.as_page(),
         "plan": _placed(plan, scale) if plan is not None else None,
         "grid": {
             "origin": grid.tolist(),

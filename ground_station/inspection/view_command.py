@@ -44,15 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the page; raises `BlimpError` for what a person can fix."""
-    from ground_station.errors import InputError
+    from ground_station.files import check_places
     from ground_station.inspection import page
     from ground_station.inspection.localizability import localizability, plan_of
     from ground_station.map.levelling import levelled
     from ground_station.map.store import load
 
-    for out in (args.out, args.json):
-        if out and not Path(out).resolve().parent.is_dir():
-            raise InputError(f"{out}: its folder does not exist")
+    check_places(args.out, args.json)
     map_ = load(args.map)
     plan, upright = plan_of(map_), levelled(map_)
     found = localizability(

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Writes the recording; raises `BlimpError` with one line."""
     from ground_station.errors import InputError
+    from ground_station.files import check_places
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.resizing import for_pictures
     from ground_station.progress import Progress
@@ -45,8 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.recording.look import look
     from ground_station.recording.open import open_input, parse_range
 
-    if not args.out.resolve().parent.is_dir():
-        raise InputError(f"{args.out}: its folder does not exist")
+    check_places(args.out)
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
     if isinstance(source, FlightRecording):
         raise InputError(f"{args.input}: is a recording already: blimp replay {args.input}")

@@ -188,13 +188,7 @@ def test_the_picture_is_the_newest_and_its_landmarks_lie_on_it(
 
 def test_the_frustum_is_the_cameras_own(shown: Watched) -> None:
     own = Camera(width_px=640, height_px=480, k1=0.1673, k2=-0.2605, p1=-1.3e-5, p2=-0.00203)
-    told = {
-        "width_px": 640,
-        "height_px": 480,
-        "K": own.matrix.tolist(),
-        "distortion": own.distortion.tolist(),
-        "model": own.model,
-    }
+    told = own.as_page()
     load = "import('/static/js/view_rays.js').then((m) =>"
     rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told)
     per_side = shown.page.evaluate(f"() => {load} m.PER_SIDE)")
@@ -207,10 +201,7 @@ def test_the_frustum_is_the_cameras_own(shown: Watched) -> None:
     plain = np.array(shown.page.evaluate(f"() => {load} m.viewRays(null))"))
     assert np.allclose(plain, rays, atol=0.05)
     wide = Camera(fx_px=244.0, fy_px=245.0, model="fisheye", k1=-0.021, k2=0.0043)
-    fisheye = told | {
-        "K": wide.matrix.tolist(), "distortion": wide.distortion.tolist(), "model": "fisheye",
-    }  # fmt: skip
-    rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", fisheye)
+    rays = shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", wide.as_page())
     assert np.allclose(rays, wide.undistort(wide.drawn_in(border)), atol=1e-6)
     told["distortion"] = [50.0, -900.0, 3.0, 3.0, 1000.0]
     wild = np.array(shown.page.evaluate(f"(camera) => {load} m.viewRays(camera))", told))

@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Extends; raises `BlimpError` for what a person can fix."""
-    from ground_station.errors import InputError, MapError
-    from ground_station.files import write_json
+    from ground_station.errors import MapError
+    from ground_station.files import check_places, write_json
     from ground_station.geometry.camera import load_camera
     from ground_station.map_update.extension.extend import extend_map
     from ground_station.mapping.settings import load_settings
@@ -46,9 +46,7 @@ def run(args: argparse.Namespace) -> int:
     settings = load_settings(args.settings)
     if args.out and Path(args.out).resolve() == Path(args.map).resolve():
         raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
-    for path in (args.json, args.out):
-        if path and not Path(path).resolve().parent.is_dir():
-            raise InputError(f"{path}: its folder does not exist")
+    check_places(args.json, args.out)
     _, result = extend_map(
         args.map,
         args.inputs,

@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can fix."""
-    from ground_station.errors import InputError, MapError
-    from ground_station.files import write_json
+    from ground_station.errors import MapError
+    from ground_station.files import check_places, write_json
     from ground_station.map.observations import load_observations
     from ground_station.mapping.refinement.refine import refine_map
     from ground_station.mapping.settings import load_settings
@@ -50,9 +50,7 @@ def run(args: argparse.Namespace) -> int:
     settings = load_settings(args.settings)
     if args.out and Path(args.out).resolve() == Path(args.map).resolve():
         raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
-    for path in (args.json, args.out):
-        if path and not Path(path).resolve().parent.is_dir():
-            raise InputError(f"{path}: its folder does not exist")
+    check_places(args.json, args.out)
     flights = [load_observations(path) for path in args.observations]
     refined, result = refine_map(args.map, flights, settings, args.out)
     report = result.report

@@ -79,7 +79,6 @@ class Maps:
             from ground_station.service.cameras import camera_of
 
             info = store.load_info(folder)
-            camera = camera_of(self._settings, info)
             positions = store.load_positions(folder)
             low = positions.min(axis=0) if len(positions) else np.zeros(3)
             high = positions.max(axis=0) if len(positions) else np.zeros(3)
@@ -90,13 +89,7 @@ class Maps:
                 "extent_m": (high - low).round(3).tolist(),
                 "bounds": {"min": low.round(3).tolist(), "max": high.round(3).tolist()},
                 "features": info.features,
-                "camera": {
-                    "width_px": camera.width_px,
-                    "height_px": camera.height_px,
-                    "K": camera.matrix.tolist(),
-                    "distortion": camera.distortion.tolist(),
-                    "model": camera.model,
-                },
+                "camera": camera_of(self._settings, info).as_page(),
             }
 
         details = self._once(name, "details", ("map.toml", "landmarks.safetensors"), read)
