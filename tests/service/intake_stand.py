@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS / "stream"), str(TESTS / "faults")]
+sys.path[:0] = [str(TESTS / "stream"), str(TESTS / "faults")]
+# It has folders of the packages' names, without an __init__: these come first where they are found.
+sys.path += [str(TESTS.parent), str(TESTS)]
 
 from impaired_link import ImpairedLink, Impairment  # noqa: E402
 from numbered_flight import (  # noqa: E402
