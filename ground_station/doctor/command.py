@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ground_station.service import add_settings_arguments
+from ground_station.service import add_lan_argument, add_settings_arguments
 
 if TYPE_CHECKING:
     from ground_station.doctor.findings import Check, Finding
@@ -29,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.set_defaults(next="blimp init    (which step from payload to flight is next)")
     add_settings_arguments(parser)
-    parser.add_argument(
-        "--lan", nargs="?", const="", metavar="INTERFACE", help="as of `blimp serve`"
-    )
+    add_lan_argument(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the findings here, too")
 
 

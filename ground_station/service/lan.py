@@ -83,6 +83,13 @@ def on(settings: StationSettings, interface: str = "") -> StationSettings:
     )
 
 
+def announced(settings: StationSettings, interface: str) -> StationSettings:
+    """The settings that `on` makes, told to who started the command."""
+    heard = on(settings, interface)
+    print(told(heard), flush=True)
+    return heard
+
+
 def told(settings: StationSettings) -> str:
     """What a person must know of it, in lines: where it listens, and what a payload needs."""
     telemetry = settings.telemetry

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ground_station.service import add_settings_arguments
+from ground_station.service import add_lan_argument, add_settings_arguments
 from pi_firmware.wire.text import printable
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _EPILOG = """\
 examples:
   blimp record --out recordings
   blimp record --out recordings --seconds 60 --camera camera.toml
-  blimp record --config station.toml --set telemetry.listen='["tls/0.0.0.0:7447"]'
+  blimp record --out recordings --lan       # payloads on the network, with `blimp keys`
 
 It takes the place of `blimp serve` and listens where that would: one of the two can run. A file
 ends at the configuration's recording.max_file_MB or max_file_s, and the next begins. The exit
@@ -44,13 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="CAMERA.toml", help="calibration that is put into the recordings"
     )
     add_settings_arguments(parser)
+    add_lan_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Records until a signal or the given time; raises a `BlimpError` when it cannot start."""
     from ground_station.errors import InputError
     from ground_station.geometry.camera import load_camera
-    from ground_station.service import settings
+    from ground_station.service import lan, settings
     from ground_station.service.intake.process import Intake
 
     if args.seconds is not None and not (math.isfinite(args.seconds) and args.seconds > 0):
@@ -62,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         recording = dataclasses.replace(loaded.recording, folder=str(args.out))
         loaded = dataclasses.replace(loaded, recording=recording)
+    if args.lan is not None:
+        loaded = lan.announced(loaded, args.lan)
     path = args.camera or loaded.map.camera
     camera = load_camera(path) if path else None
     stop = threading.Event()

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from ground_station.service import add_settings_arguments
+from ground_station.service import add_lan_argument, add_settings_arguments
 
 _EPILOG = """\
 examples:
@@ -27,10 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--demo", action="store_true", help="play the sample flight, over loopback only"
     )
-    parser.add_argument(
-        "--lan", nargs="?", const="", metavar="INTERFACE",
-        help="heard and found by payloads on that network, as wlan0 (default: the only one)",
-    )  # fmt: skip
+    add_lan_argument(parser)
     parser.add_argument(
         "--check", action="store_true", help="check the configuration and what it names, and exit"
     )
@@ -51,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
     if args.lan is not None:
         if args.demo:
             raise InputError("--demo plays over loopback only; leave out --demo or --lan")
-        loaded = lan.on(loaded, args.lan)
-        print(lan.told(loaded), flush=True)
+        loaded = lan.announced(loaded, args.lan)
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(
             loaded.map, folder=str(settings.SAMPLE), shelf=str(settings.SAMPLE.parent)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from ground_station import cli
 from ground_station.errors import InputError
 from ground_station.keys.authority import Authority
 from ground_station.service import lan, settings
@@ -91,6 +92,24 @@ def test_under_sudo_the_keys_are_those_of_the_person(
 
 def test_loopback_is_no_network() -> None:
     assert "lo" not in lan.interfaces()
+
+
+def test_a_recording_without_the_service_hears_what_the_service_would(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Started(Exception):
+        pass
+
+    def intake(loaded: StationSettings, *_: object, **__: object) -> None:
+        assert loaded.telemetry.listen == ["tls/0.0.0.0:7447"] and loaded.video.host == "0.0.0.0"
+        assert loaded.recording.folder == "flights"
+        raise Started
+
+    Authority.create(data).add("ground", "main")
+    monkeypatch.setattr("ground_station.service.intake.process.Intake", intake)
+    with pytest.raises(Started):
+        cli.main(["record", "--lan", "wlan0", "--out", "flights"])
+    assert "telemetry tcp 7447 (TLS)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [["--lan", "nosuch0"], ["--lan", "--demo"]])
