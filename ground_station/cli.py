@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any, NoReturn
 
 from ground_station import __version__, next_command
 from pi_firmware.wire.errors import BlimpError
@@ -37,9 +39,29 @@ _COMMANDS = (
 )
 
 
+_ADVICE = {
+    errno.ENOENT: "{prog} --help has an example",
+    errno.EADDRINUSE: "another blimp serve or record? blimp doctor says who has it",
+    errno.ENOSPC: "df -h says what is full",
+    errno.EACCES: "ls -ld says whose it is",
+}
+"""What to do next where the system's own reason ends an error."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, and where an example is."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.set_defaults(prog=self.prog)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; {self.prog} --help has an example\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """The whole command line, built without importing anything heavy."""
-    result = argparse.ArgumentParser(
+    result = _Parser(
         prog="blimp",
         description="Localization for indoor blimps: simulate, map, localize, evaluate.",
         epilog="Example: blimp evaluate estimate.txt truth.txt --align se3",
@@ -71,7 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"next: {args.next}")
         return status
     except BlimpError as error:
-        print(f"blimp {args.command}: {error}", file=sys.stderr)
+        told = str(error)
+        for number, advice in _ADVICE.items():
+            if told.endswith(os.strerror(number)):
+                told += f"; {advice.format(prog=args.prog)}"
+        print(f"blimp {args.command}: {told}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"blimp {args.command}: interrupted", file=sys.stderr)

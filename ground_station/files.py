@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,22 @@ from ground_station.errors import GroundStationError, InputError
 from pi_firmware.wire import files
 
 
-def check_places(*paths: str | Path | None) -> None:
-    """Raises `InputError` where a file that is to be written has no folder; None is no file."""
+def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
+    """Refuses before the work what could not be written after it; None is skipped.
+
+    Raises `InputError` for a folder that is not there or not writable, or in the file's own place.
+    """
     for path in paths:
-        if path is not None and not Path(path).resolve().parent.is_dir():
-            raise InputError(f"{path}: its folder does not exist")
+        if path is None:
+            continue
+        folder = Path(path).resolve().parent
+        if not folder.is_dir():
+            make = f"mkdir -p {shlex.quote(str(Path(path).parent))}"
+            raise InputError(f"{path}: its folder does not exist; make it: {make}")
+        if not are_folders and Path(path).is_dir():
+            raise InputError(f"{path}: is a folder; name a file in it")
+        if not os.access(folder, os.W_OK):
+            raise InputError(f"{path}: no permission to write in {folder}; name another place")
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -64,7 +64,8 @@ def opened(path: Path, *, checksum: bool, board: str = "") -> Iterator[Image]:
                 )
             image = Image(path, file, size, _stretches(path, file, size), boot, found, version)
         except OSError as error:
-            raise DeployError(f"{path}: {error.strerror or error}") from None
+            hint = "; make image builds one" if isinstance(error, FileNotFoundError) else ""
+            raise DeployError(f"{path}: {error.strerror or error}{hint}") from None
         yield image
 
 

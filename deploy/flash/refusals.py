@@ -19,8 +19,10 @@ def find(machine: Machine, path: Path) -> Disk | None:
         facts = path.stat()
     except OSError as error:
         hint = ""
-        if isinstance(error, FileNotFoundError) and not path.is_relative_to("/dev"):
-            hint = f"; to write an image file, make it as large as the card: truncate -s 8G {path}"
+        if isinstance(error, FileNotFoundError):
+            hint = "; put the card in, and lsblk -o NAME,SIZE,MODEL,RM names it"
+            if not path.is_relative_to("/dev"):
+                hint = f"; to write a file, make it as large as the card: truncate -s 8G {path}"
         raise DeployError(f"{path}: {error.strerror or error}{hint}") from None
     if stat.S_ISREG(facts.st_mode):
         loop = machine.loop_on(path.resolve())

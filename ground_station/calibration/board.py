@@ -20,6 +20,7 @@ from ground_station.arrays import F64
 from ground_station.calibration.errors import CalibrationError
 from ground_station.files import write_text
 from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
 
 DICTIONARIES = [f"{bits}X{bits}_{size}" for bits in (4, 5, 6, 7) for size in (50, 100, 250, 1000)]
 """OpenCV's predefined dictionaries of markers, without its prefix `DICT_`."""
@@ -147,10 +148,14 @@ def new_board(columns: int, rows: int, square_mm: float) -> Board:
 
 def load_board(path: str | Path) -> Board:
     """Reads a board's file; raises `ConfigError` or `CalibrationError` with one line."""
-    document = config.read(path)
+    made = "blimp calibrate board --out board.pdf writes a board's file"
+    try:
+        document = config.read(path)
+    except ConfigError as error:
+        raise CalibrationError(f"{error}; {made}") from None
     missing = [name for name in _REQUIRED if name not in document]
     if missing:
-        raise CalibrationError(f"{path}: the key '{missing[0]}' is missing")
+        raise CalibrationError(f"{path}: the key '{missing[0]}' is missing; {made}")
     return config.from_mapping(document, Board, where=str(path))
 
 

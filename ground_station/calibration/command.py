@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ground_station.calibration.errors import CalibrationError
+from ground_station.files import check_outputs
 
 if TYPE_CHECKING:
     from ground_station.calibration.board import Board
@@ -74,7 +75,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints or calibrates; raises a `BlimpError` with one line for what a person can fix."""
-    from ground_station.files import check_places
 
     printing = args.inputs == ["board"]
     for name in _OF_VIEWS if printing else _OF_BOARD:
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             flag = "--" + name.replace("_", "-")
             where = "is for calibrating" if printing else "is for 'blimp calibrate board'"
             raise CalibrationError(f"{flag} {where}")
-    check_places(args.out, args.json, args.report)
+    check_outputs(args.out, args.json, args.report)
     return _print(args) if printing else _calibrate(args)
 
 

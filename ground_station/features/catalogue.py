@@ -41,7 +41,10 @@ def find(name: str) -> Model:
     found = [path for folder in (SHIPPED, users()) for path in _files(folder) if path.stem == name]
     if not found:
         known = ", ".join(names()) or "none"
-        raise FeatureError(f"features: there is no model '{name:.80}' (known: {known})")
+        raise FeatureError(
+            f"features: there is no model '{name:.80}' (known: {known});"
+            " blimp models import FILE brings one"
+        )
     models = [model.read(path) for path in found]
     if len({each.sha256 for each in models}) > 1:
         raise FeatureError(

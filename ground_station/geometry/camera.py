@@ -199,6 +199,7 @@ THESIS_CAMERA = Camera(k1=0.1673, k2=-0.2605, p1=-1.3e-5, p2=-0.00203, k3=0.0, r
 """Pi camera v2.1 at 640×480 as calibrated in the thesis; the readout time is the simulator's."""
 
 
+_MADE_BY = "blimp calibrate makes a camera file"
 _REQUIRED = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 
 
@@ -209,9 +210,12 @@ def load_camera(path: str | Path) -> Camera:
     """
     try:
         document = config.read(path)
+    except ConfigError as error:
+        raise CameraError(f"{error}; {_MADE_BY}") from None
+    try:
         missing = [name for name in _REQUIRED if name not in document]
         if missing:
-            raise CameraError(f"the key '{missing[0]}' is missing")
+            raise CameraError(f"the key '{missing[0]}' is missing; {_MADE_BY}")
         model = document.get("model", Camera.model)
         for name in foreign_keys(model) if model in list(MODELS) else ():
             if name in document:  # even as 0: its writer thought of another lens

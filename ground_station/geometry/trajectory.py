@@ -85,6 +85,9 @@ def seconds_to_ns(text: str) -> int:
     return sign * (int(whole or 0) * 1_000_000_000 + int((fraction + "0" * 9)[:9]))
 
 
+_LINE = "time_s x y z qx qy qz qw"
+
+
 def read_tum(path: str | Path) -> Trajectory:
     """Reads `timestamp tx ty tz qx qy qz qw` lines (seconds, metres), sorted by time.
 
@@ -98,7 +101,7 @@ def read_tum(path: str | Path) -> Trajectory:
     except OSError as error:
         raise GeometryError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise GeometryError(f"{path}: not a text file") from None
+        raise GeometryError(f"{path}: not a text file; wanted: lines of {_LINE}") from None
     rows: list[tuple[int, list[float]]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -107,16 +110,18 @@ def read_tum(path: str | Path) -> Trajectory:
         try:
             time_ns, values = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
         except (ValueError, OverflowError):
-            raise GeometryError(f"{path}, line {number}: not a number in {line!r:.80}") from None
+            raise GeometryError(
+                f"{path}, line {number}: not a number in {line!r:.80}; wanted: {_LINE}"
+            ) from None
         if not -(2**63) <= time_ns < 2**63:
             raise GeometryError(f"{path}, line {number}: the time {words[0]:.40} s is out of range")
         if len(values) != 7 or not np.all(np.isfinite(values)):
-            raise GeometryError(f"{path}, line {number}: eight finite numbers are needed")
+            raise GeometryError(f"{path}, line {number}: eight finite numbers are needed: {_LINE}")
         if not 1e-6 <= math.hypot(*values[3:]) <= 1e100:  # beyond, its square is infinite
             raise GeometryError(f"{path}, line {number}: the quaternion is zero or too large")
         rows.append((time_ns, values))
     if not rows:
-        raise GeometryError(f"{path}: it holds no poses")
+        raise GeometryError(f"{path}: it holds no poses; wanted: lines of {_LINE}")
     rows.sort(key=lambda row: row[0])
     times = np.array([row[0] for row in rows], dtype=np.int64)
     table = np.array([row[1] for row in rows])

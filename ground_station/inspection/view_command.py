@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ground_station.files import write_json
+from ground_station.files import check_outputs, write_json
 from ground_station.map.table import print_table
 
 if TYPE_CHECKING:
@@ -44,13 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the page; raises `BlimpError` for what a person can fix."""
-    from ground_station.files import check_places
     from ground_station.inspection import page
     from ground_station.inspection.localizability import localizability, plan_of
     from ground_station.map.levelling import levelled
     from ground_station.map.store import load
 
-    check_places(args.out, args.json)
+    check_outputs(args.out, args.json)
     map_ = load(args.map)
     plan, upright = plan_of(map_), levelled(map_)
     found = localizability(

@@ -59,7 +59,7 @@ class Authority:
             for name in self.members:
                 credentials.check_name(name)
         except FileNotFoundError:
-            raise KeysError(f"{folder}: no authority here; make one with 'init'") from None
+            raise KeysError(f"{folder}: no authority here; make one: blimp keys init") from None
         except OSError as error:
             raise KeysError(f"{folder}: {error.strerror or error}") from None
         except (

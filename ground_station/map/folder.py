@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 import os
+import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,18 @@ PICTURE = "map.png"
 """What a build draws of its map; it is not kept where another map takes the place."""
 
 
+def check_is_map(folder: Path) -> None:
+    """Raises `MapError`, with the command that makes one, unless a map lies in the folder."""
+    if (folder / "map.toml").exists():
+        return
+    if folder.is_file():
+        made = f"blimp map build {shlex.quote(str(folder))} --out maps/NAME"
+        raise MapError(f"{folder}: is a file, not a map's folder; {made} makes a map of a video")
+    what = "a folder without a map (map.toml)" if folder.is_dir() else "there is no such map"
+    made = f"blimp map build INPUT --out {shlex.quote(str(folder))}"
+    raise MapError(f"{folder}: {what}; {made} makes one")
+
+
 def check_target(folder: Path) -> None:
     """Raises `MapError` unless a map may be written to `folder`.
 
@@ -27,7 +40,9 @@ def check_target(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise MapError(f"{folder}: is a file, not a folder for a map")
+        raise MapError(
+            f"{folder}: is a file, not a folder for a map; name a new one, as --out maps/NAME"
+        )
     entries = sorted(folder.iterdir())
     if (folder / "map.toml").is_file() and (folder / "landmarks.safetensors").is_file():
         return

@@ -18,6 +18,7 @@ from ground_station.arrays import F32, F64, I32, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.descriptors import Descriptors, open_descriptors, quantised
+from ground_station.map.folder import check_is_map
 from ground_station.map.modes import MOST, Modes
 from pi_firmware.wire import config, files
 from pi_firmware.wire.errors import ConfigError
@@ -207,11 +208,7 @@ def load_info(folder: str | Path) -> MapInfo:
     """Reads `map.toml`; raises `MapError` with one line."""
     folder = Path(folder)
     path = folder / "map.toml"
-    build = f"blimp map build INPUT --out {folder} makes one"
-    if not folder.is_dir():
-        raise MapError(f"{folder}: there is no such map; {build}")
-    if not path.exists():
-        raise MapError(f"{folder}: a folder without a map (map.toml); {build}")
+    check_is_map(folder)
     try:
         document = config.read(path)
         features, camera = document.get("features"), document.get("camera")
@@ -314,7 +311,7 @@ def _read(
             metadata = file.metadata() or {}
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise MapError(f"{path}: {reason}") from None
+        raise MapError(f"{path}: {reason}; copy the map again, or build it again") from None
     for name, (dtype, shape) in every.items():
         if name not in arrays:
             if name not in wanted:

@@ -98,7 +98,9 @@ def _only_topic(path: str | Path, topics: Iterable[str]) -> str:
     """The topic of estimates; those of a ground station begin with the payload's name."""
     found = sorted(name for name in topics if name.endswith(ESTIMATE_TOPIC))
     if not found:
-        raise InputError(f"{path}: no poses on {ESTIMATE_TOPIC} of any payload")
+        raise InputError(
+            f"{path}: no poses on {ESTIMATE_TOPIC}; blimp localize makes them, --topic takes others"
+        )
     if len(found) > 1:
         raise InputError(f"{path}: poses on {', '.join(found)}; say which by --topic")
     return found[0]

@@ -34,10 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the file; raises `BlimpError` with one line."""
-    from ground_station.files import check_places, write_text
+    from ground_station.files import check_outputs, write_text
     from ground_station.recording.export import ExportError, read_poses, tum, write_mcap
 
-    check_places(args.out)
+    check_outputs(args.out)
     if args.out.exists() and args.recording.exists() and args.out.samefile(args.recording):
         raise ExportError(f"{args.out}: that is the recording itself")
     poses = read_poses(args.recording, args.topic)

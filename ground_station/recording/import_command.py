@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Writes the recording; raises `BlimpError` with one line."""
     from ground_station.errors import InputError
-    from ground_station.files import check_places
+    from ground_station.files import check_outputs
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.resizing import for_pictures
     from ground_station.progress import Progress
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.recording.look import look
     from ground_station.recording.open import open_input, parse_range
 
-    check_places(args.out)
+    check_outputs(args.out)
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
     if isinstance(source, FlightRecording):
         raise InputError(f"{args.input}: is a recording already: blimp replay {args.input}")

@@ -37,7 +37,7 @@ def open_input(
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     if not head:
-        raise InputError(f"{path}: the file is empty")
+        raise InputError(f"{path}: the file is empty; copy it again from where it was made")
     if head == MAGIC or path.suffix.lower() == ".mcap":
         return FlightRecording(path, wanted)
     if path.suffix.lower() in _ANNEX_B_SUFFIXES or _starts_as_annex_b(head):

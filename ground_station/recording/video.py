@@ -93,7 +93,10 @@ class VideoFile:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
-            raise InputError(f"{self.path}: not a video that can be read ({reason})") from None
+            raise InputError(
+                f"{self.path}: not a video that can be read ({reason}); wanted: a video, a"
+                " folder of images or a recording (.mcap)"
+            ) from None
         if not container.streams.video:
             container.close()
             raise InputError(f"{self.path}: it has no video stream")

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ground_station.errors import InputError
+from ground_station.map.folder import check_is_map
 from ground_station.service import bus_messages, processes
 from ground_station.service.bus import Bus, Router
 from ground_station.service.bus_messages import EventMessage, PayloadMessage, ProcessMessage
@@ -185,9 +186,7 @@ def _check_map(folder: Path) -> None:
 
     The localizers read the map itself: this process stays small for as long as the service runs.
     """
-    if not (folder / "map.toml").exists():
-        what = "a folder without a map" if folder.is_dir() else "there is no such map"
-        raise InputError(f"{folder}: {what}; blimp map build INPUT --out {folder} makes one")
+    check_is_map(folder)
     if config.read(folder / "map.toml").get("frame") != "world":
         raise InputError(f"{folder}: it is not registered to a floor plan; see blimp map register")
 

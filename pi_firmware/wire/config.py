@@ -110,6 +110,8 @@ def read(path: str | Path) -> dict[str, Any]:
         return parse(data.decode())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file, and TOML was expected") from None
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError, too
         raise ConfigError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
 

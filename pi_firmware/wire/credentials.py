@@ -57,7 +57,9 @@ def load(folder: str | Path) -> Credentials:
     folder = Path(folder)
     for name in (AUTHORITIES, CERTIFICATE, KEY):
         if not (folder / name).is_file():
-            raise TelemetryError(f"certificates in {folder}: '{name}' is missing")
+            raise TelemetryError(
+                f"certificates in {folder}: '{name}' is missing; blimp keys writes such a folder"
+            )
     try:
         document = json.loads((folder / ACCESS).read_bytes())
     except OSError as error:

@@ -20,8 +20,11 @@ PART = ".part"
 def replacing(path: Path) -> Iterator[Path]:
     """Gives a name beside `path`; what is written there takes its place when the block ends well.
 
-    Otherwise nothing of it is left. Raises `OSError`.
+    Otherwise nothing of it is left. Raises `OSError`, also for what is a device or a pipe: renamed
+    over by root, the machine would be without its /dev/full.
     """
+    if path.parent == Path("/dev") or (path.exists() and not (path.is_file() or path.is_dir())):
+        raise OSError(errno.EINVAL, "a device or a pipe, not a file")
     part = path.with_name(path.name + PART)
     try:
         yield part

@@ -289,7 +289,9 @@ class RecordingReader:
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from None
         if magic != MAGIC:
-            raise RecordingError(f"{self.path}: not an MCAP recording")
+            raise RecordingError(
+                f"{self.path}: no MCAP recording; blimp import makes one of a video"
+            )
 
     def messages(self, topics: set[str] | None = None) -> Iterator[tuple[Channel, McapMessage]]:
         """All messages of `topics` (all topics when None), in file order, up to a cut."""

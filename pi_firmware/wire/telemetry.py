@@ -141,7 +141,7 @@ def open_session(
                 continue
             reason = "the port is in use" if in_use else str(error).splitlines()[0][:160]
             if "Unable to connect" in reason:
-                reason = "nobody is there, or takes this certificate"
+                reason = "nobody is there, or takes this certificate; is blimp serve running there?"
             where = ", ".join([*endpoints, *connect]) or "no endpoint"
             raise TelemetryError(f"telemetry at {where}: {reason}") from None
     raise AssertionError("unreachable")

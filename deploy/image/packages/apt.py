@@ -61,8 +61,9 @@ def sources(archives: Sequence[Archive]) -> str:
         keyring = Path(archive.keyring).absolute()
         if not keyring.is_file():
             raise DeployError(
-                f"archive {archive.name}: keyring {keyring} is not there: install the package that "
-                f"brings it, or give --keyring {archive.name}=FILE"
+                f"archive {archive.name}: keyring {keyring} is not there: install {keyring.stem}; "
+                "without such a package, take it from the archive's own pool, unpack "
+                f"it (dpkg -x) and give its file: --keyring {archive.name}=FILE"
             )
         stanzas.append(
             f"Types: deb\nURIs: {archive.url}\nSuites: {' '.join(archive.suites)}\n"

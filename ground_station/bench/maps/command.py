@@ -100,7 +100,7 @@ def _study(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     from ground_station.errors import InputError
-    from ground_station.files import check_places
+    from ground_station.files import check_outputs
 
     for name, value, low, high in (
         ("--seeds", args.seeds, 1, 100),
@@ -112,4 +112,4 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{name} is {value}; allowed: {low} to {high}")
     if bool(args.study) == bool(args.campus):
         raise InputError("bench map measures --study SET or --campus N; give one of them")
-    check_places(args.json, args.plot)
+    check_outputs(args.json, args.plot)

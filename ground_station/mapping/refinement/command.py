@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import MapError
-    from ground_station.files import check_places, write_json
+    from ground_station.files import check_outputs, write_json
     from ground_station.map.observations import load_observations
     from ground_station.mapping.refinement.refine import refine_map
     from ground_station.mapping.settings import load_settings
@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     settings = load_settings(args.settings)
     if args.out and Path(args.out).resolve() == Path(args.map).resolve():
         raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
-    check_places(args.json, args.out)
+    check_outputs(args.json)
+    check_outputs(args.out, are_folders=True)
     flights = [load_observations(path) for path in args.observations]
     refined, result = refine_map(args.map, flights, settings, args.out)
     report = result.report

@@ -151,14 +151,14 @@ def _make(args: argparse.Namespace, out: Path) -> int:
 
 def _accept(args: argparse.Namespace, out: Path) -> int:
     from ground_station.errors import InputError
+    from ground_station.files import check_outputs
     from ground_station.replay.cases import golden
     from ground_station.replay.cases.outcome import read_outcome
 
     for name in ("by", "tolerance_m", "tolerance_deg"):
         if getattr(args, name) is None:
             raise InputError(f"--accept needs {_option(name)}")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: its folder does not exist")
+    check_outputs(out)
     if out.exists() and not args.force:
         raise InputError(f"{out}: it exists already; --force overwrites it")
     missing_max = golden.MISSING if args.missing_max is None else args.missing_max

@@ -12,7 +12,7 @@ import numpy as np
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
-from ground_station.files import write_text
+from ground_station.files import check_outputs, write_text
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
@@ -73,8 +73,7 @@ def make_case(asked: Asked) -> Made:
     out = asked.out
     if out.suffix != ".toml" or not out.stem:
         raise InputError(f"{out}: a case is a .toml file")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: its folder does not exist")
+    check_outputs(out)
     _free(out, asked.force)
     map_ = store.load(asked.map)
     prefix = _prefix(asked)

@@ -184,6 +184,9 @@ def _read_run(path: Path) -> Run:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
         document = json.loads(path.read_bytes(), parse_constant=_refuse)
+    except FileNotFoundError:
+        made = f"blimp replay RECORDING --map MAP --out {path.parent}"
+        raise InputError(f"{path.parent}: no run's outcome is there; {made} writes one") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     except (ValueError, RecursionError):
