@@ -566,6 +566,37 @@ def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
     shown.page.click('.plan [data-do="swap"]')
 
 
+def test_values_are_put_in_another_order_by_hand_and_keys_and_stay_so(
+    shown: Watched, station: FlownStation
+) -> None:
+    order = "[...document.querySelectorAll('.rail > [id]')].map((card) => card.id).join(' ')"
+    tops = (
+        "[...document.querySelectorAll('.rail > [id]')].map((card) =>"
+        " card.getBoundingClientRect().top).every((top, k, all) => !k || top > all[k - 1])"
+    )
+    assert shown.page.evaluate(order) == "battery radio board timing"
+    shown.page.click('#timing [data-do="up"]')
+    shown.page.keyboard.press("Enter")  # it has the focus, still
+    assert shown.page.evaluate(order) == "battery timing radio board"
+    another = shown.page.context.new_page()
+    another.goto(station.url)
+    another.wait_for_selector('#link[data-phase="open"]')
+    assert another.evaluate(order) == "battery timing radio board" and another.evaluate(tops)
+    another.set_viewport_size({"width": 390, "height": 844})
+    assert another.evaluate(tops)
+    another.click('#battery [data-do="up"]')  # the first goes to the end
+    assert another.evaluate(order) == "timing radio board battery"
+    another.evaluate("localStorage.setItem('blimp.values', 'frames nonsense radio')")
+    another.reload()
+    another.wait_for_selector('#link[data-phase="open"]')
+    assert another.evaluate(order) == "battery board timing radio"
+    another.evaluate("localStorage.removeItem('blimp.values')")
+    another.close()
+    for _ in range(2):
+        shown.page.click('#timing [data-do="up"]')
+    assert shown.page.evaluate(order) == "battery radio board timing"
+
+
 def test_who_is_signed_out_is_asked_for_the_token(browser: Any, tmp_path: Path) -> None:
     with flown(tmp_path, Payload("blimp-1")) as station:
         watched = Watched(browser, station)

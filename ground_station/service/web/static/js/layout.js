@@ -1,9 +1,9 @@
 // @ts-check
-/** Where the three views lie and which colours the page has: chosen here, and remembered. */
+/** Where views and values lie and which colours the page has: chosen here, and remembered. */
 import { byId, setAttribute } from "./dom.js";
 import { recall, remember } from "./remembered.js";
 
-const [MAIN, SCHEME] = ["blimp.main-view", "blimp.colours"];
+const [MAIN, ORDER, SCHEME] = ["blimp.main-view", "blimp.values", "blimp.colours"];
 const SYSTEM_DARK = "(prefers-color-scheme: dark)";
 
 export class Layout {
@@ -15,6 +15,9 @@ export class Layout {
       view.querySelector('[data-do="swap"]')?.addEventListener("click", () => this.enlarge(view));
       view.querySelector('[data-do="full"]')?.addEventListener("click", () => fill(view));
     }
+    this.values = [.../** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll(".rail > [id]"))];
+    for (const name of recall(ORDER).split(" ")) this.values.find((value) => value.id === name)?.parentElement?.append(byId(name));
+    for (const value of this.values) value.querySelector('[data-do="up"]')?.addEventListener("click", () => this.lift(value));
     document.body.classList.toggle("unfillable", !document.fullscreenEnabled);
     this.schemes = [.../** @type {NodeListOf<HTMLElement>} */ (byId("schemes").querySelectorAll("button"))];
     for (const button of this.schemes) button.addEventListener("click", () => this.colour(button.dataset.scheme ?? ""));
@@ -30,6 +33,15 @@ export class Layout {
     if (!large || large === view) return;
     [large.dataset.place, view.dataset.place] = [view.dataset.place, large.dataset.place];
     remember(MAIN, view.classList[1]);
+  }
+
+  /** One place up; the first one goes to the end. @param {HTMLElement} value */
+  lift(value) {
+    const above = value.previousElementSibling;
+    if (above?.id) above.before(value);
+    else value.parentElement?.append(value);
+    /** @type {HTMLElement} */ (value.querySelector('[data-do="up"]')).focus(); // which is lost in moving
+    remember(ORDER, [.../** @type {HTMLElement} */ (value.parentElement).children].map((one) => one.id).join(" ").trim());
   }
 
   /** @param {string} scheme light, dark, or as the system has it */
