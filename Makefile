@@ -3,7 +3,7 @@
 BLIMP := .venv/bin/blimp
 
 .PHONY: help setup demo serve test check bench experiments budget hil soak soak-service limits faults fuzz \
-  soak-stream install-service uninstall-service image flash update hil-image lock sample picture virtual-camera
+  soak-stream install-service uninstall-service image release flash update hil-image lock sample picture virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -29,6 +29,9 @@ image: setup  ## Build a card (root or sudo): BOARD=zero2w|qemu, BOARD=zerow BAS
 	@sh deploy/packages.sh deploy/image/apt-packages.txt
 	@$$([ "$$(id -u)" = 0 ] || echo sudo) .venv/bin/python -m deploy.image \
 	  --board "$(or $(BOARD),zero2w)" $(if $(BASE),--base "$(BASE)") $(OPTIONS)
+
+release: setup  ## Compress, sign and list an image for others: IMAGE=FILE URL=https://WHERE/IT/WILL/BE
+	@.venv/bin/python -m deploy.publish "$(IMAGE)" --url "$(URL)" $(OPTIONS)
 
 flash: setup  ## Write a card: DEVICE=/dev/sdX IMAGE=FILE PAYLOAD=blimp-1 WIFI=SSID|FILE.toml COUNTRY=DE
 	@case "$$FLASH_WIFI" in *.toml) wifi=--wifi ;; *) wifi=--wifi-ssid ;; esac; \

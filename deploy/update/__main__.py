@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,9 +12,9 @@ from deploy.errors import DeployError
 from deploy.image.packages import fetch_wheels, load_board
 from deploy.progress import Progress
 from deploy.update import bundle as bundles
+from deploy.update.bundle import CHECKOUT
 from deploy.update.card import Card, is_healthy
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 _CACHE = CHECKOUT / "out/cache/image"  # where the image builder keeps them, too
 _EXAMPLE = """example:
   python -m deploy.update --payload blimp-1 --host 192.168.4.20
@@ -80,7 +79,7 @@ def _update(given: argparse.Namespace) -> int:
     for option, path in (("identity", given.identity), ("site", given.site)):
         if path is not None and not path.exists():
             raise DeployError(f"--{option} {path}: not there")
-    key = _release_key(given.keys)
+    key = bundles.release_key(given.keys, _say)
     card = Card(given.payload, host, key.parents[1], given.identity, given.port)
     state = card.ask("status")
     try:
@@ -108,18 +107,6 @@ def _update(given: argparse.Namespace) -> int:
         return 0
     _say(f"{given.payload} went back to {last['previous'] or factory.version}: {last['reason']}")
     return 1
-
-
-def _release_key(keys: Path | None) -> Path:
-    """The key that signs, made by `blimp keys` when this authority has none yet."""
-    folder = ["--folder", str(keys)] if keys else []
-    words = [sys.executable, "-m", "ground_station.cli", "keys", *folder, "release"]
-    done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise DeployError((done.stderr.strip() or "blimp keys failed").splitlines()[-1])
-    if done.stderr.strip():
-        _say(done.stderr.strip().splitlines()[-1])
-    return Path(done.stdout.strip().splitlines()[-1]).absolute()
 
 
 def _say(text: str) -> None:

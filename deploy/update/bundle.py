@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import subprocess
+import sys
 import tarfile
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,6 +22,8 @@ from deploy.errors import DeployError
 from deploy.image import checkout as git
 from deploy.image import release as release_tree
 from deploy.run import run
+
+CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,18 @@ def make(files: Mapping[str, bytes], key: Path, replaces: str = "") -> Bundle:
     }
     data = _json(document)
     return Bundle(manifest.parse(data), data, sign(data, key), files)
+
+
+def release_key(keys: Path | None, say: Callable[[str], None] = lambda line: None) -> Path:
+    """The key that signs, made by `blimp keys` when this authority has none yet."""
+    folder = ["--folder", str(keys)] if keys else []
+    words = [sys.executable, "-m", "ground_station.cli", "keys", *folder, "release"]
+    done = subprocess.run(words, cwd=CHECKOUT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise DeployError((done.stderr.strip() or "blimp keys failed").splitlines()[-1])
+    if done.stderr.strip():
+        say(done.stderr.strip().splitlines()[-1])
+    return Path(done.stdout.strip().splitlines()[-1]).absolute()
 
 
 def sign(data: bytes, key: Path) -> bytes:
