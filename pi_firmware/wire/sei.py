@@ -23,13 +23,12 @@ from __future__ import annotations
 
 import math
 import struct
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pi_firmware.wire import annexb
 
-UUID = uuid.UUID("6f0fd9ec-2c0b-4c1b-9d86-4f2a5d6b1e07").bytes
+UUID = bytes.fromhex("6f0fd9ec2c0b4c1b9d864f2a5d6b1e07")
 VERSION = 1
 _BODY = struct.Struct(">BBHIqqffff")
 _USER_DATA_UNREGISTERED = 5
