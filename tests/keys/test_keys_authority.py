@@ -254,7 +254,7 @@ def test_one_program_at_a_time_changes_an_authority(
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["keys", "--folder", str(tmp_path / "k")]
     assert main([*base, "list"]) == 2
-    assert "make one with 'init'" in capsys.readouterr().err
+    assert "make one: blimp keys init" in capsys.readouterr().err
     assert main([*base, "init"]) == main([*base, "ground", "main"]) == 0
     assert main([*base, "payload", "blimp-1", "--days", "20"]) == 0
     assert main([*base, "check"]) == 1
