@@ -175,7 +175,10 @@ def test_the_command_accepts_a_run_once(folders: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--compare", "a", "gone"], "gone: no run's outcome is there; blimp replay RECORDING --map MAP --out gone"),
+        (
+            ["--compare", "a", "gone"],
+            "gone: no run's outcome is there; blimp replay RECORDING --map MAP --out gone",
+        ),
         (["--compare", "a", "b", "--out", "p.txt"], "p.txt: the page is an .html file"),
         (["--compare", "a", "b", "--fail-over-m", "nan"], "--fail-over-m is nan; allowed: 0"),
         (["--compare", "a", "b", "--fail-over-deg", "-1"], "--fail-over-deg is -1.0"),

@@ -37,7 +37,7 @@ def test_what_is_good_is_said() -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (("map.folder=tests",), "tests: a folder without a map (map.toml); blimp map build INPUT --out tests"),
+        (("map.folder=tests",), "tests: a folder without a map (map.toml); blimp map build"),
         (("map.folder=nosuch",), "nosuch: there is no such map; blimp map build INPUT --out"),
         (("map.camera=/nosuch.toml",), "/nosuch.toml: No such file or directory"),
         (("telemetry.certificates=/nosuch", TLS), "/nosuch"),
