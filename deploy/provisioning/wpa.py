@@ -14,6 +14,8 @@ from deploy.provisioning.model import OPEN, WPA2, WPA3, Provisioning, Wifi
 _HEAD = """\
 # Written by the card from blimp.toml: changes made here are lost.
 ctrl_interface=/run/wpa_supplicant
+# Protected management frames where access point and radio have them: forged ones cut no link.
+pmf=1
 """
 _SECRET = re.compile(r"^\s*((?:psk|sae_password)=[0-9a-f]+)\s*$", re.ASCII | re.MULTILINE)
 _SECRET_OF = {WPA2: "psk=", WPA3: "sae_password="}
@@ -43,11 +45,13 @@ def wpa_supplicant_conf(provisioning: Provisioning, stored: str = "") -> str:
         # WPA3 asks for protected management frames, and some routers for one way of deriving the
         # password's element only: both are tried (sae_pwe=2).
         lines += ["proto=RSN", "pairwise=CCMP"]
-        lines += ["key_mgmt=SAE", "ieee80211w=2"] if wifi.security == WPA3 else ["key_mgmt=WPA-PSK"]
+        sae = ["key_mgmt=SAE", "ieee80211w=2"]
+        # An access point that insists on protected frames may take a key by SHA-256 only.
+        lines += sae if wifi.security == WPA3 else ["key_mgmt=WPA-PSK WPA-PSK-SHA256"]
         lines.append(_secret(wifi) if wifi.password else _kept(wifi, stored))
-    sae = "sae_pwe=2\n" if wifi.security == WPA3 else ""
+    element = "sae_pwe=2\n" if wifi.security == WPA3 else ""
     block = "".join(f"    {line}\n" for line in lines)
-    return f"{_HEAD}country={wifi.country}\n{sae}network={{\n{block}}}\n"
+    return f"{_HEAD}country={wifi.country}\n{element}network={{\n{block}}}\n"
 
 
 def _secret(wifi: Wifi) -> str:

@@ -110,6 +110,10 @@ def test_the_real_program_reads_the_same_bytes(tmp_path: Path, security: str, ss
     assert "Failed to read or parse" not in said and "unknown" not in said.lower(), said
     assert _dumped(said, "ssid") == ssid
     assert "country='DE'" in said and "scan_ssid=1" in said
+    protected, required = "pmf=1" in said.splitlines(), "ieee80211w=2" in said
+    assert protected and required is (security == "wpa3")
+    keys = {"open": "0x4", "wpa2": "0x102", "wpa3": "0x400"}  # none, PSK and PSK-SHA256, SAE
+    assert f"key_mgmt: {keys[security]}\n" in said, said
     if security == "wpa3":
         assert _dumped(said, "sae_password") == password.encode()
     elif security == "wpa2":
