@@ -125,12 +125,13 @@ def _run(
             outcome = None
             for line in _lines(program, limit_s):
                 if line["kind"] == "flying":
-                    for pid, cores in (
-                        (program.pid, under.ground_cores),
-                        (int(line["payload"]), under.payload_cores),
+                    payload = int(line["payload"])
+                    for pid, cores, spared in (
+                        (program.pid, under.ground_cores, (payload,)),
+                        (payload, under.payload_cores, ()),
                     ):
                         if cores:
-                            held.append(throttles.enter_context(throttled(pid, cores)))
+                            held.append(throttles.enter_context(throttled(pid, cores, spared)))
                 elif line["kind"] == "landed":
                     throttles.close()
                 elif line["kind"] == "result":

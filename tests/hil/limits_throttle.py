@@ -1,4 +1,6 @@
-"""Less processor for a process: by the kernel where it can, else by stopping it in turns."""
+"""Less processor for a process and all that it has started or will start: by the kernel where it
+can, else by stopping them in turns.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 PERIOD_S = 0.010
@@ -92,42 +94,63 @@ def method() -> str:
     return group[0] if group else STOPPING
 
 
-@contextlib.contextmanager
-def throttled(pid: int, cores: float) -> Iterator[str]:
-    """Leaves a process this much of the processor, up to 1 core, meanwhile; gives the method.
+def tree(pid: int, spared: Collection[int] = ()) -> set[int]:
+    """A process and its descendants now, without the spared ones and theirs (proc(5), stat)."""
+    parents: dict[int, int] = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
+    found: set[int] = set()
+    wave = {pid} & parents.keys()
+    while wave:
+        found |= wave
+        wave = {one for one, of in parents.items() if of in wave} - found - set(spared)
+    return found
 
-    By stopping, the process is held to one core and runs for the share `cores` of each 20 ms.
+
+@contextlib.contextmanager
+def throttled(pid: int, cores: float, spared: Collection[int] = ()) -> Iterator[str]:
+    """Leaves a process and its descendants, those that come later too, this much of the processor.
+
+    Together they have up to 1 core meanwhile; `spared` ones, and what those have started, are left
+    alone. Gives the method. By stopping, they are held to one core and run for the share `cores` of
+    each 20 ms.
     """
     if not 0.0 < cores <= 1.0:
         raise ValueError(f"cores: {cores:g} is not in (0, 1]")
     group = usable_group()
     if group is None:
-        with stopped_in_turn(pid, cores):
+        with stopped_in_turn(pid, cores, spared):
             yield STOPPING
         return
     name, parent, version = group
     with Group(parent, version) as one:
         one.limit(cores)
-        with contextlib.suppress(ProcessLookupError):  # it has just ended
-            one.take(pid)
+        taken: set[int] = set()
+        while found := tree(pid, spared) - taken:  # one may start another before it is taken
+            for member in found:
+                with contextlib.suppress(ProcessLookupError):  # it has just ended
+                    one.take(member)
+            taken |= found
         yield name
 
 
 @contextlib.contextmanager
-def stopped_in_turn(pid: int, cores: float) -> Iterator[None]:
-    """Holds a process to one core and stops it for the rest of each turn; a child of this one."""
+def stopped_in_turn(pid: int, cores: float, spared: Collection[int] = ()) -> Iterator[None]:
+    """Holds a process and its descendants to one core and stops them for the rest of each turn."""
     core = min(os.sched_getaffinity(0))
-    with contextlib.suppress(OSError):  # it has just ended, or one of its threads
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            os.sched_setaffinity(int(task.name), {core})
+    for member in tree(pid, spared):
+        with contextlib.suppress(OSError):  # it has just ended, or one of its threads
+            for task in Path(f"/proc/{member}/task").iterdir():
+                os.sched_setaffinity(int(task.name), {core})
     closing = threading.Event()
 
     def turn() -> None:
-        with contextlib.suppress(ProcessLookupError):
-            while not closing.wait(cores * TURN_S):
-                os.kill(pid, signal.SIGSTOP)
-                closing.wait((1.0 - cores) * TURN_S)
-                os.kill(pid, signal.SIGCONT)
+        while not closing.wait(cores * TURN_S):
+            held = tree(pid, spared)
+            _send(signal.SIGSTOP, held)
+            closing.wait((1.0 - cores) * TURN_S)
+            _send(signal.SIGCONT, held)
 
     thread = threading.Thread(target=turn, name="throttle", daemon=True)
     if cores < 1.0:
@@ -138,5 +161,9 @@ def stopped_in_turn(pid: int, cores: float) -> Iterator[None]:
         closing.set()
         if thread.is_alive():
             thread.join()
+
+
+def _send(number: signal.Signals, pids: Collection[int]) -> None:
+    for pid in pids:
         with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGCONT)
+            os.kill(pid, number)

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import limits_stand
 import limits_trial
 import pytest
 from limits_axes import Conditions
 from limits_stand import Flight, TrialError, measure
-from limits_throttle import Group, method, stopped_in_turn, throttled, usable_group
+from limits_throttle import Group, method, stopped_in_turn, throttled, tree, usable_group
 from limits_trial import SEAM_S, SETTLE_S, Outcome, Round, Trial, due, judge, round_of, since_found
 
 from ground_station.errors import InputError
@@ -152,6 +155,50 @@ def test_a_process_is_held_back_by_stopping_it_in_turn(busy: subprocess.Popen[by
     assert state(busy.pid) in "RS"
 
 
+FAMILY = """
+import subprocess, sys
+busy = [sys.executable, "-c", "while True: pass"]
+born = [subprocess.Popen(busy) for _ in range(2)]
+print(*(one.pid for one in born), flush=True)
+sys.stdin.readline()
+born.append(subprocess.Popen(busy))
+print(born[-1].pid, flush=True)
+sys.stdin.readline()
+for one in born:
+    one.kill()
+    one.wait()
+"""
+
+
+def held(pid: int, limit_s: float = 30.0) -> bool:
+    """Whether a process is seen stopped, or in a group with less of the processor."""
+    until_s = time.monotonic() + limit_s
+    while time.monotonic() < until_s:
+        if state(pid) == "T" or "/blimp-limits-" in Path(f"/proc/{pid}/cgroup").read_text():
+            return True
+        time.sleep(0.001)
+    return False
+
+
+@pytest.mark.parametrize("hold", [throttled, stopped_in_turn])
+def test_what_a_process_has_started_and_will_start_is_held_back_with_it(
+    hold: Callable[[int, float, tuple[int, ...]], AbstractContextManager[object]],
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", FAMILY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as family:
+        assert family.stdin is not None and family.stdout is not None
+        child, other = map(int, family.stdout.readline().split())
+        with hold(family.pid, 0.1, (other,)):
+            print(file=family.stdin, flush=True)
+            later = int(family.stdout.readline())
+            assert tree(family.pid, (other,)) == {family.pid, child, later}
+            assert [held(pid) for pid in (family.pid, child, later)] == [True] * 3
+            assert not held(other, 0.5)
+        assert not any(held(pid, 0.5) for pid in (child, later))
+        print(file=family.stdin, flush=True)
+
+
 def test_the_throttle_survives_the_end_of_whom_it_holds(busy: subprocess.Popen[bytes]) -> None:
     for hold in (throttled, stopped_in_turn, throttled):
         with hold(busy.pid, 0.5):
@@ -188,6 +235,28 @@ def test_a_flight_over_a_link_with_a_firmware_held_back_is_flown_and_told() -> N
     assert 0.0 <= measured.share == outcome.share <= 1.0
     assert measured.link["received"] == measured.link["delayed"] > 10
     assert measured.others_cores is not None and measured.took_s > 2.0
+
+
+def test_receiver_and_localizer_are_held_back_and_not_the_firmware(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    programs: list[str] = []
+
+    @contextlib.contextmanager
+    def told(pid: int, cores: float, spared: tuple[int, ...]) -> Iterator[str]:
+        with throttled(pid, cores, spared) as by:
+            for held in tree(pid, spared):
+                words = Path(f"/proc/{held}/cmdline").read_text().split("\0")
+                programs.append(words[2] if words[1] == "-m" else Path(words[1]).name)
+            yield by
+
+    monkeypatch.setattr(limits_stand, "throttled", told)
+    under = Conditions(ground_cores=0.9, rate_hz=5.0)
+    measured = measure(Flight(ATRIUM / "flight.mcap", ATRIUM, 2.0), under, seed=1)
+    assert measured.held_by == method() and measured.why == ""
+    assert sorted(programs) == [
+        "ground_station.service.intake", "ground_station.service.localizing", "limits_trial.py",
+    ]  # fmt: skip
 
 
 def test_a_recording_that_is_missing_is_no_limit(tmp_path: Path) -> None:
