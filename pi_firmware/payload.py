@@ -27,6 +27,8 @@ from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 _FLUSH_LIMIT_S = 10.0
 _COMMAND_LIMIT_S = 30.0
 _LOOK_S = 1.0
+_RENEWED_S = 10.0
+"""A session that was opened anew hears the ground station within this."""
 
 
 class Payload:
@@ -42,7 +44,7 @@ class Payload:
         self.ssrc = link.draw_ssrc(settings.link)
         self._stop = threading.Event()
         self._afterwards: list[str] = []
-        self._looks_s = 0.0
+        self._looks_s, self._renewed = 0.0, False
         self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
         key = link.load_key(settings.telemetry.certificates) if settings.link.encrypted else None
         self._link = link.Link(settings.link, self.ssrc, key)
@@ -174,12 +176,19 @@ class Payload:
         self._link.flush()
 
     def _look_for_ground(self) -> None:
-        """A radio that came late, or has a new address, is not looked on by the session we have."""
+        """A radio that came late, or has a new address, is not looked on by the session we have.
+
+        The ground station of before is tried again; another one is found by another process only.
+        """
         now_s = time.monotonic()
         if now_s < self._looks_s or self.settings.telemetry.discover == "":
             return
         self._looks_s = now_s + _LOOK_S
-        if self._telemetry.outdated and self._ground.seen is None:
+        if not self._telemetry.outdated or self._ground.seen is not None:
+            self._renewed = False
+        elif not self._renewed and self._telemetry.renew():
+            self._renewed, self._looks_s = True, now_s + _RENEWED_S
+        else:
             raise UnrecoverableError("telemetry.discover: the interface has another address by now")
 
     def _leave(self, unit: Unit) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ipaddress
 import json
 import re
@@ -52,8 +53,14 @@ class Session:
         return address is not None and address != self.scouting
 
     def close(self) -> None:
-        """Sends what is queued and closes; a second call does nothing."""
-        self.zenoh.close()
+        """Sends what is queued and closes; a second call does nothing.
+
+        It takes up to 10 s where the other side of a link has gone without a word.
+        """
+        import zenoh
+
+        with contextlib.suppress(zenoh.ZError):  # whoever would answer has gone
+            self.zenoh.close()
 
 
 def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]:

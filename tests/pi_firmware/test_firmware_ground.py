@@ -1,10 +1,14 @@
 """The payload follows the ground station that takes its video, and believes no other report."""
 
 import math
+import time
+from types import SimpleNamespace
 
 import pytest
 
+from pi_firmware.capture import UnrecoverableError
 from pi_firmware.ground import Ground
+from pi_firmware.payload import Payload
 from pi_firmware.settings import LinkSettings
 from pi_firmware.wire.messages import LinkReport
 
@@ -135,3 +139,46 @@ def test_a_ground_that_cannot_show_frames_gets_an_idr_but_not_a_flood_of_them() 
     assert following.capture.reports == []  # the bit rate follows the report of each second
     following.report(ssrc=SSRC + 1, wants_idr=True)
     assert following.capture.idrs == asked
+
+
+class Looking:
+    """What a payload's look for its ground station asks of the rest of it."""
+
+    def __init__(self, *, known: bool) -> None:
+        self.settings = SimpleNamespace(telemetry=SimpleNamespace(discover="wlan0"))
+        self._ground = SimpleNamespace(seen=None)
+        self._telemetry = SimpleNamespace(outdated=True, renew=self._renew)
+        self._looks_s, self._renewed = 0.0, False
+        self._known, self.renewals = known, 0
+
+    def _renew(self) -> bool:
+        self.renewals += self._known
+        return self._known
+
+    def look(self) -> None:
+        Payload._look_for_ground(self)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_at_another_address_the_ground_of_before_is_tried_once_and_then_another_process(
+    known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    looking = Looking(known=known)
+    if known:
+        looking.look()
+        now[0] += 9.0
+        looking.look()
+        assert looking.renewals == 1
+        looking._ground.seen = object()
+        now[0] += 2.0
+        looking.look()
+        looking._ground.seen = None  # it is lost once more: that is tried again, too
+        now[0] += 2.0
+        looking.look()
+        assert looking.renewals == 2
+        now[0] += 11.0
+    with pytest.raises(UnrecoverableError, match="another address"):
+        looking.look()
+    assert looking.renewals == 2 * known
