@@ -218,7 +218,6 @@ class ForwardCorrection:
         self._gst = gstreamer.load()
         self._payloader = pipeline.get_by_name("payloader")
         self._pad = self._payloader.get_static_pad("src")
-        self._mtu_bytes = self._payloader.get_property("mtu")
         self.sender = sender
         self._frame: list[bytes] = []
         self._probe: int | None = None
@@ -243,8 +242,8 @@ class ForwardCorrection:
         else:
             self._pad.remove_probe(self._probe)
             self._probe = None
-        room_bytes = ulpfec.OVERHEAD_BYTES if wanted else 0
-        self._payloader.set_property("mtu", self._mtu_bytes - room_bytes)
+        room_bytes = ulpfec.OVERHEAD_BYTES if wanted else -ulpfec.OVERHEAD_BYTES
+        self._payloader.set_property("mtu", self._payloader.get_property("mtu") - room_bytes)
 
     def _pass(self, pad: Any, info: Any) -> Any:
         """Lets packets through, and behind a frame's last one its corrections."""

@@ -27,6 +27,12 @@ DISCOVERED = "auto"
 _QUEUE_UNITS = 30  # a second: a busy board catches up, a network that hangs does not
 _RESOLVE_S = 2.0
 _FLUSH_LIMIT_NS = 5_000_000_000
+_VANISHING, _SMALLER, _LEAST_BYTES = 0.3, 0.85, 500
+"""Packets get so much smaller, down to what IPv4 carries anywhere, while so many are lost."""
+_ROUNDING_BYTES = 40
+"""Of its packets a payloader fills the largest to within so much, corrections' room included."""
+_SHRUNK_S = 1.2
+"""By then nothing that the ground reports on was sent before."""
 
 
 def draw_ssrc(link: LinkSettings) -> int:
@@ -100,6 +106,8 @@ class Link:
             element.set_property("key", self._gst.Buffer.new_wrapped(key))
         self._source = self._pipeline.get_by_name("link")
         self._sink = self._pipeline.get_by_name("out")
+        self._payloader = self._pipeline.get_by_name("payloader")
+        self._shrunk_s = float("-inf")
         self._retransmission: retransmission.Retransmission | None = None
         self.rtx_ssrc: int | None = None
         """What is asked for again comes with it; None: nothing does."""
@@ -164,7 +172,23 @@ class Link:
         return True
 
     def report(self, report: LinkReport, now_s: float) -> float:
-        """Takes what the ground saw; the share of corrections beside what is sent, of late."""
+        """Takes what the ground saw; the share of corrections beside what is sent, of late.
+
+        Where many packets are lost and none of full size comes, the path's MTU is less than
+        thought, and packets get smaller (RFC 8899's black hole): for good, it costs little.
+        """
+        full_bytes, largest_bytes = self._payloader.get_property("mtu"), report.largest_bytes
+        if (
+            largest_bytes is not None
+            and (report.dropped or 0.0) > _VANISHING
+            and largest_bytes + _ROUNDING_BYTES < full_bytes
+            and full_bytes > _LEAST_BYTES
+            and now_s - self._shrunk_s > _SHRUNK_S
+        ):
+            self._shrunk_s, smaller_bytes = now_s, max(_LEAST_BYTES, int(_SMALLER * full_bytes))
+            self._payloader.set_property("mtu", smaller_bytes)
+            said = f"RTP packets of {full_bytes} bytes do not arrive; {smaller_bytes} from now on"
+            print(f"pi_firmware: {said}", file=sys.stderr, flush=True)
         return self._correction.report(report, now_s) if self._correction is not None else 0.0
 
     def send(self, access_unit: bytes, clock_ns: int, *, idr: bool) -> bool:

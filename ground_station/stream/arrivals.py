@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from ground_station.stream.rtp import MAX_JUMP, Packet
+from ground_station.stream.rtp import HEADER_BYTES, MAX_JUMP, Packet
 from pi_firmware.wire.delay import WINDOW_NS, StandingDelay
 
 LOSS_NS = 1_000_000_000
@@ -18,6 +18,8 @@ _SILENCE_NS = 150_000_000
 """What is missing after so long without any packet fell to an outage and to no overflow."""
 _OVERTAKEN_NS = 50_000_000
 _MOST_MISSING = 512
+_ENOUGH = 10
+"""Of so many packets one has the size of the largest that are sent, if such come through."""
 _JUMP_NS = 10_000_000_000
 _FLAT_NS = 15_000_000
 _FLAT_FOR_NS = 3_000_000_000
@@ -31,7 +33,8 @@ class Flow:
     `received_kbps` are the payloads of its packets, each once, and of its corrections;
     `retransmitted_kbps` of them are of packets that were sent again. `queue_s` is what frames
     waited on the way, `dropped` the share of packets, 0 to 1, that were lost while others came,
-    whether or not they were mended, and `burst` how many of these in a row.
+    whether or not they were mended, and `burst` how many of these in a row. `largest_bytes` is of
+    the largest packet of the last second, its header too, None for less than ten packets.
     """
 
     received_kbps: float
@@ -39,6 +42,7 @@ class Flow:
     dropped: float
     retransmitted_kbps: float = 0.0
     burst: float | None = None
+    largest_bytes: int | None = None
 
 
 @dataclass
@@ -107,6 +111,9 @@ class Arrivals:
                 dropped=missed / sent if self._packets else 0.0,
                 retransmitted_kbps=again * 8e6 / span_ns,
                 burst=len(self._missing) / runs if runs else None,
+                largest_bytes=HEADER_BYTES + max(size for _, size in self._packets)
+                if len(self._packets) >= _ENOUGH
+                else None,
             )
 
     def _is_new(self, packet: Packet) -> bool:

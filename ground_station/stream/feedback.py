@@ -337,6 +337,7 @@ class Feedback:
             packets_corrected=tally.corrected,
             answered=tally.again,
             burst=flow.burst if flow is not None else None,
+            largest_bytes=flow.largest_bytes if flow is not None else None,
         )
 
     def _publish(self, payload_id: str, report: messages.LinkReport) -> None:

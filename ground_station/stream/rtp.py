@@ -11,7 +11,7 @@ from ground_station.stream.retransmission import LIVE_NS, Retransmission
 from pi_firmware.wire import video
 from pi_firmware.wire.annexb import NAL_AUD, NAL_IDR, NAL_SLICE, NAL_SPS, START_CODE
 
-_HEADER_BYTES = 12
+HEADER_BYTES = 12
 _STAP_A, _FU_A = 24, 28
 _FU_START, _FU_END = 0x80, 0x40
 MAX_JUMP = 3000
@@ -56,14 +56,14 @@ def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None
 
     Of a retransmission and a correction `ssrc` is their own stream's, and not the original's.
     """
-    if len(datagram) < _HEADER_BYTES:
+    if len(datagram) < HEADER_BYTES:
         return None
     first, second, sequence, timestamp, ssrc = struct.unpack_from(">BBHII", datagram)
     kind = second & 0x7F
     if first >> 6 != 2 or kind not in video.PAYLOAD_TYPES:
         return None
     again, corrects = kind == video.RTX_PAYLOAD_TYPE, kind == video.CORRECTION_PAYLOAD_TYPE
-    start = _HEADER_BYTES + 4 * (first & 0x0F)
+    start = HEADER_BYTES + 4 * (first & 0x0F)
     if first & 0x10:  # header extension
         if len(datagram) < start + 4:
             return None

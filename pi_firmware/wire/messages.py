@@ -229,7 +229,7 @@ class LinkReport(Message):
     """
 
     SCHEMA: ClassVar[str] = "blimp.link"
-    MINOR: ClassVar[int] = 4
+    MINOR: ClassVar[int] = 5
 
     ground: str  # its name
     video_port: int  # where it takes the video
@@ -249,6 +249,7 @@ class LinkReport(Message):
     packets_corrected: int = 0
     answered: int = 0  # retransmissions, whether or not their packets had been corrected meanwhile
     burst: float | None = None  # packets that were missing in a row, on average, of late
+    largest_bytes: int | None = None  # the largest RTP packet of the last second, of ten and more
 
 
 @dataclass(frozen=True)

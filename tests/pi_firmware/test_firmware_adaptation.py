@@ -56,7 +56,7 @@ def test_an_older_grounds_long_round_trip_lowers_the_rate_without_any_loss() -> 
 
 def test_an_older_grounds_report_is_read_without_what_it_does_not_measure() -> None:
     new = json.loads(messages.encode(flows(800.0, 0.1, 0.02)))
-    assert new["schema"] == "blimp.link/1.4"
+    assert new["schema"] == "blimp.link/1.5"
     old = {name: value for name, value in new.items() if name not in ("queue_s", "dropped")}
     del old["received_kbps"]
     read = messages.decode(LinkReport, json.dumps(old | {"schema": "blimp.link/1.1"}).encode())

@@ -53,6 +53,16 @@ def taken(*groups: list[Packet]) -> Arrivals:
     return arrivals
 
 
+def test_the_largest_packet_is_told_once_there_are_enough() -> None:
+    came = packets(range(60))
+    came[-70] = replace(came[-70], payload=bytes(1300))
+    assert flow(taken(came), 60).largest_bytes == 1312
+    came[-200] = replace(came[-200], payload=bytes(1350))  # more than a second ago
+    assert flow(taken(came), 60).largest_bytes == 1312
+    few = came[:100] + came[-9:]
+    assert flow(taken(few), 60).largest_bytes is None
+
+
 def at(frame: int) -> int:
     return START_NS + frame * FRAME_MS * MS
 
