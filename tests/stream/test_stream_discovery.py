@@ -1,13 +1,13 @@
 """A payload finds its ground station on the network that it is told of, and on no other."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from namespaces import unshared
 
 from ground_station.keys.authority import Authority
 from ground_station.stream.telemetry import TelemetryListener
@@ -21,14 +21,7 @@ HOSTS = Path(__file__).with_name("two_hosts.py")
 @pytest.fixture
 def namespaces() -> list[str]:
     """The command that runs another one in network namespaces of its own."""
-    if shutil.which("unshare") is None or shutil.which("ip") is None:
-        pytest.skip("unshare or ip is missing")
-    command = ["unshare", "-rn"]
-    probe = "ip link set lo up && ip link add a0 type veth peer name b0"
-    tried = subprocess.run([*command, "sh", "-c", probe], capture_output=True, text=True)
-    if tried.returncode:
-        pytest.skip(f"network namespaces are not allowed here: {tried.stderr.strip()[:100]}")
-    return command
+    return unshared()
 
 
 @pytest.fixture

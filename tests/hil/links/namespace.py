@@ -72,20 +72,19 @@ class NamespaceLink:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="blimp-netns-")))
             self._ground, self._payload = _keys(folder / "keys")
             # It holds the namespace, ends with its standard input, and all with it.
-            holder = stack.enter_context(_Holder())
-            self._pid = holder.pid
+            self._host = stack.enter_context(Holder())
             number = os.getpid()
             self._address = f"10.{200 + number // 250 % 50}.{number % 250}."
-            self._cable = f"hil{self._pid}"
+            self._cable = f"hil{self._host.pid}"
             _ip("link", "add", self._cable, "type", "veth", "peer", "name", "eth0", "netns",
-                str(self._pid))  # fmt: skip
+                str(self._host.pid))  # fmt: skip
             _ip("address", "add", f"{self._address}1/30", "dev", self._cable)
             _ip("link", "set", self._cable, "up")
-            self._inside("ip", "link", "set", "lo", "up")
-            self._inside("ip", "address", "add", f"{self._address}2/30", "dev", "eth0")
-            self._inside("ip", "link", "set", "eth0", "up")
+            self._host.run("ip", "link", "set", "lo", "up")
+            self._host.run("ip", "address", "add", f"{self._address}2/30", "dev", "eth0")
+            self._host.run("ip", "link", "set", "eth0", "up")
             if words := netem(self._link):
-                self._inside("tc", "qdisc", "add", "dev", "eth0", "root", "netem", *words)
+                self._host.run("tc", "qdisc", "add", "dev", "eth0", "root", "netem", *words)
             self._stack = stack.pop_all()
         return self
 
@@ -137,7 +136,7 @@ class NamespaceLink:
             "link": {**config["link"], "host": f"{self._address}1"},
             "telemetry": {**config["telemetry"], "certificates": str(self._payload)},
         }
-        firmware = _Firmware(config, folder, ("nsenter", "-t", str(self._pid), "-n"))
+        firmware = _Firmware(config, folder, self._host.prefix)
         try:
             firmware.wait_loaded()
             yield firmware
@@ -161,14 +160,20 @@ class NamespaceLink:
             if over:
                 return
 
-    def _inside(self, *words: str) -> None:
-        _run("nsenter", "-t", str(self._pid), "-n", *words)
 
-
-class _Holder:
+class Holder:
     """A process that is alone in a network namespace; a context manager."""
 
-    def __enter__(self) -> _Holder:
+    @property
+    def prefix(self) -> tuple[str, ...]:
+        """What runs a program inside."""
+        return ("nsenter", "-t", str(self.pid), "-n")
+
+    def run(self, *words: str) -> str:
+        """Runs a program inside; its output. Raises `NamespaceError` with one line."""
+        return run(*self.prefix, *words)
+
+    def __enter__(self) -> Holder:
         self._process = subprocess.Popen(
             ["unshare", "-n", "sh", "-c", "echo ready; exec cat"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -264,10 +269,11 @@ def _keys(folder: Path) -> tuple[Path, Path]:
 
 
 def _ip(*words: str) -> None:
-    _run("ip", *words)
+    run("ip", *words)
 
 
-def _run(*words: str) -> None:
+def run(*words: str) -> str:
+    """Runs a program; its output. Raises `NamespaceError` with one line."""
     done = subprocess.run(
         words, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=_LIMIT_S,
         check=False,
@@ -275,6 +281,7 @@ def _run(*words: str) -> None:
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no word"])[-1]
         raise NamespaceError(f"{' '.join(words[:4])}: {said}")
+    return done.stdout
 
 
 def _tried(*words: str) -> bool:
