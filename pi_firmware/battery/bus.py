@@ -8,6 +8,7 @@ holds SDA low is the kernel's business (its bus recovery), not possible from her
 from __future__ import annotations
 
 import contextlib
+import errno
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,7 +49,8 @@ class WordBus:
 
     `open_bus` opens the bus and may raise `OSError`. A failed transfer (errno 121, remote I/O, is
     the usual one) is tried four times with growing pauses; then the bus is opened again and the
-    transfer tried four times more; then it is a `GaugeError`. Not safe from several threads.
+    transfer tried four times more; then it is a `GaugeError`. One that timed out (held low)
+    is tried once each time. Not safe from several threads.
     """
 
     def __init__(
@@ -102,6 +104,8 @@ class WordBus:
                 except OSError as error:
                     self._counts.errors += 1
                     last = error
+                    if error.errno == errno.ETIMEDOUT:  # held low: each attempt would take 1 s
+                        break
         self.close()
         reason = (last.strerror if last else "") or str(last)
         raise GaugeError(f"{self._name}: does not answer: {reason}")

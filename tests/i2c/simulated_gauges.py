@@ -165,14 +165,14 @@ class Max17048Chip:
 class Faults:
     """What goes wrong: every n-th read fails with errno 121 or gives `nonsense`; 0: never.
 
-    A bus with a line that is held low gives each transfer up after `stuck_s`, as the kernel does.
+    With SDA held low each transfer ends with errno 110 after `stuck_s`; the kernel waits for 1 s.
     """
 
     absent: bool = False
     fail_every: int = 0
     nonsense_every: int = 0
     nonsense: int = 0xFFFF
-    stuck_s: float = 0.0
+    stuck_s: float | None = None
 
 
 class FakeBus:
@@ -181,7 +181,7 @@ class FakeBus:
     def __init__(self, chip: Chip, address: int, faults: Faults | None = None) -> None:
         self._chip, self._address = chip, address
         self.faults = faults or Faults()
-        self.reads = 0
+        self.reads = self.timeouts = 0
 
     def read_word_data(self, i2c_addr: int, register: int) -> int:
         """As `smbus2.SMBus.read_word_data`."""
@@ -203,9 +203,10 @@ class FakeBus:
         """Nothing to release."""
 
     def _acknowledge(self, address: int) -> None:
-        if self.faults.stuck_s:
+        if self.faults.stuck_s is not None:
+            self.timeouts += 1
             time.sleep(self.faults.stuck_s)
-            raise TimeoutError(errno.ETIMEDOUT, "Connection timed out")
+            raise OSError(errno.ETIMEDOUT, "Connection timed out")
         if self.faults.absent or address != self._address:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")
 

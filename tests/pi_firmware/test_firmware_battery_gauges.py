@@ -156,6 +156,19 @@ def test_a_gauge_that_is_gone_is_said_after_a_bounded_time_and_comes_back() -> N
     assert gauge.read(NOW).voltage == pytest.approx(3.9)
 
 
+def test_a_bus_that_is_held_low_is_asked_once_and_once_more_when_opened_again() -> None:
+    """Each of its transfers costs a second: eight of them would hide the failure for long."""
+    bus, counts = (
+        simulated.FakeBus(simulated.Ina219Chip(), 0x40, simulated.Faults(stuck_s=0)),
+        Counts(),
+    )
+    with pytest.raises(GaugeError, match="does not answer"):
+        words(bus, counts).read(ina.BUS_VOLTAGE)
+    assert (bus.timeouts, counts.errors, counts.reopened) == (2, 2, 1)
+    bus.faults.stuck_s = None
+    assert words(bus, counts).read(ina.CONFIGURATION) == 0x399F
+
+
 def test_a_bus_that_cannot_be_opened_is_a_gauge_that_does_not_answer() -> None:
     def opened() -> simulated.FakeBus:
         raise FileNotFoundError(errno.ENOENT, "No such file or directory")
