@@ -88,8 +88,9 @@ soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, cl
 	@mkdir -p out
 	@.venv/bin/python tests/faults/soak.py --hours "$(or $(HOURS),0.5)" --loss 0.02 --out out/soak.json
 
-faults: setup  ## Faults across payload and ground: the matrix and 15 random walks (OPTIONS=--long)
+faults: setup  ## Faults across payload and ground: roaming, the matrix and 15 walks (OPTIONS=--long)
 	@mkdir -p out/faults
+	@.venv/bin/python -m pytest -q tests/faults/roaming.py
 	@.venv/bin/python tests/faults/scenarios/run.py matrix --keep out/faults --out out/faults/matrix.json
 	@.venv/bin/python tests/faults/scenarios/run.py walks --keep out/faults --out out/faults/walks.json $(OPTIONS)
 

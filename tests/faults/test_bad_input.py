@@ -69,7 +69,7 @@ def test_a_file_that_is_no_recording(tmp_path: Path) -> None:
     fake = tmp_path / "fake.mcap"
     fake.write_bytes(os.urandom(4096))
     line = refuse(BLIMP, "map", "build", fake, "--out", tmp_path / "map")
-    assert "fake.mcap: not an MCAP recording" in line
+    assert "fake.mcap: no MCAP recording" in line
 
 
 def test_a_recording_cut_before_its_first_frame(tmp_path: Path) -> None:

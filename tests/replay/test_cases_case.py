@@ -98,7 +98,7 @@ def test_what_does_not_fit_is_refused_by_name(
 def test_a_file_that_is_no_toml_or_not_there_is_refused(folder: Path) -> None:
     for content in (b"title = ", b"\xff\xfe", b"a = " + b"[" * 5000):
         (folder / "bad.toml").write_bytes(content)
-        with pytest.raises(BlimpError, match=r"^[^\n]*bad\.toml: not valid TOML"):
+        with pytest.raises(BlimpError, match=r"^[^\n]*bad\.toml: not .*TOML"):
             load_case(folder / "bad.toml")
     with pytest.raises(BlimpError, match=r"none\.toml: No such file"):
         load_case(folder / "none.toml")

@@ -43,7 +43,7 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
     stream = SimpleNamespace(ssrc=77, counters=Counters(), bytes=0)
     payload = Payload("blimp-1", None, lambda *_: None, recorder)
     payload.follow(stream)  # type: ignore[arg-type]
-    listener = SimpleNamespace(clock=lambda _: None, round_trip_s=lambda _: None)
+    listener = SimpleNamespace(name="main", clock=lambda _: None, round_trip_s=lambda _: None)
 
     def told() -> tuple[int, int]:
         frames = payload.note(None, listener, encrypted=False).frames  # type: ignore[arg-type]

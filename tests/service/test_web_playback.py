@@ -213,7 +213,7 @@ def test_a_page_is_told_that_a_long_one_is_being_read(
     ("name", "data", "reason"),
     [
         ("none.mcap", None, "there is no recording"),
-        ("not.mcap", b"not one", "not an MCAP recording"),
+        ("not.mcap", b"not one", "no MCAP recording"),
         ("empty.mcap", b"\x89MCAP0\r\n", "nothing in it can be read"),
         ("..%2Fflight.mcap", None, ""),
     ],

@@ -316,7 +316,7 @@ def make_noise(folder: Path) -> Path:
     ("make", "named"),
     [
         (make_missing, "No such file"),
-        (make_text, "not an MCAP recording"),
+        (make_text, "no MCAP recording"),
         (make_without_video, "no video"),
         (make_without_parameter_sets, "no parameter sets"),
         (make_noise, "no parameter sets"),

@@ -1,6 +1,7 @@
 """What befalls a radio's network costs seconds: video, poses and telemetry come back by themselves.
 
-All cases are flown one after another, by `roaming_hosts.py`, in network namespaces of its own.
+All cases are flown one after another, by `roaming_hosts.py`, in network namespaces of its own. They
+have bounds in seconds, and fly in `make faults`: `make test` does not collect this by its name.
 """
 
 from __future__ import annotations
