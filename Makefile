@@ -90,9 +90,9 @@ soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, cl
 
 faults: setup  ## Faults across payload and ground: roaming, the matrix and 15 walks (OPTIONS=--long)
 	@mkdir -p out/faults
-	@.venv/bin/python -m pytest -q tests/faults/roaming.py
 	@.venv/bin/python tests/faults/scenarios/run.py matrix --keep out/faults --out out/faults/matrix.json
 	@.venv/bin/python tests/faults/scenarios/run.py walks --keep out/faults --out out/faults/walks.json $(OPTIONS)
+	@.venv/bin/python -m pytest -q tests/faults/roaming.py
 
 fuzz: setup  ## Fuzz what reads from outside, SECONDS=120 a reader: READERS="rtp maps"
 	@.venv/bin/python tests/fuzz/run.py $(READERS) --seconds "$(or $(SECONDS),120)"

@@ -30,6 +30,7 @@ from standing import ATRIUM, Service  # noqa: E402
 
 GROUND, PAYLOAD, TELEMETRY_PORT = "10.9.0.1", "10.9.0.2", 7447
 RATE_HZ = 10.0
+_BETWEEN = ("air", "wire")
 _TWIN = """
 import socket, struct, sys, time
 own, address = bytes.fromhex(sys.argv[2].replace(":", "")), socket.inet_aton(sys.argv[3])
@@ -67,13 +68,20 @@ class Hosts:
         with contextlib.ExitStack() as stack:
             self.air, self.payload, self.other = (stack.enter_context(Holder()) for _ in range(3))
             run("ip", "link", "set", "lo", "up")
-            self.air.run("ip", "link", "add", "air", "type", "bridge")
-            self.air.run("ip", "link", "set", "air", "up")
-            for name, address in (("ground", GROUND), ("payload", PAYLOAD), ("other", "")):
+            # Two bridges: what is too large for the way between them vanishes unseen by any host.
+            for bridge in ("wire", "air"):
+                self.air.run("ip", "link", "add", bridge, "type", "bridge")
+                self.air.run("ip", "link", "set", bridge, "up")
+            self.air.run("ip", "link", "add", "to-air", "type", "veth", "peer", "name", "to-wire")
+            self.air.run("ip", "link", "set", "to-air", "master", "wire", "up")
+            self.air.run("ip", "link", "set", "to-wire", "master", "air", "up")
+            for name, address, bridge in (
+                ("ground", GROUND, "wire"), ("payload", PAYLOAD, "air"), ("other", "", "air"),
+            ):  # fmt: skip
                 host = getattr(self, name, None)
                 run("ip", "link", "add", f"{name}0", "type", "veth", "peer", "name", f"to-{name}")
                 run("ip", "link", "set", f"to-{name}", "netns", str(self.air.pid))
-                self.air.run("ip", "link", "set", f"to-{name}", "master", "air", "up")
+                self.air.run("ip", "link", "set", f"to-{name}", "master", bridge, "up")
                 if host is not None:
                     run("ip", "link", "set", f"{name}0", "netns", str(host.pid))
                 inside = host.run if host is not None else run
@@ -87,9 +95,9 @@ class Hosts:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def ports(self, *words: str) -> None:
-        """Sets something of the access point's side of both."""
-        for name in ("ground", "payload"):
+    def ports(self, *words: str, names: tuple[str, str] = ("ground", "payload")) -> None:
+        """Sets something of the access point's side of both, or of the way between its bridges."""
+        for name in names:
             self.air.run("ip", "link", "set", f"to-{name}", *words)
 
     def neighbour(self, inside: Callable[..., str], address: str) -> str:
@@ -231,7 +239,7 @@ def deauthenticated(flight: Flight) -> str:
 def narrow(flight: Flight) -> str:
     """Packets of more than 1,280 bytes vanish at the access point, without a word."""
     hosts = flight.hosts
-    hosts.ports("mtu", "1280")
+    hosts.ports("mtu", "1280", names=_BETWEEN)
     with contextlib.suppress(NamespaceError):
         hosts.payload.run("ping", "-c1", "-W1", "-Mdo", "-s1300", GROUND)
         return "a packet of 1,300 bytes came through"
@@ -241,7 +249,7 @@ def narrow(flight: Flight) -> str:
 
 def wide(flight: Flight) -> str:
     """The access point as it was."""
-    flight.hosts.ports("mtu", "1500")
+    flight.hosts.ports("mtu", "1500", names=_BETWEEN)
     return ""
 
 
