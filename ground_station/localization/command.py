@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from ground_station.errors import InputError
-    from ground_station.files import write_json
+    from ground_station.files import check_outputs, write_json
     from ground_station.geometry.camera import load_camera
     from ground_station.geometry.resizing import for_pictures
     from ground_station.geometry.trajectory import read_tum
@@ -109,9 +109,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.smoothed and settings.pose.solver != "rolling":
         raise LocalizationError("--smoothed: only the solver 'rolling' has a smoother")
-    for out in (args.out, args.json, args.observations, args.smoothed):
-        if out and not Path(out).resolve().parent.is_dir():
-            raise InputError(f"{out}: its folder does not exist")
+    check_outputs(args.out, args.json, args.observations, args.smoothed)
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
     map_ = store.load(args.map)
     if not map_.info.registered:

@@ -54,6 +54,8 @@ blimp localize atrium --map walk.mp4 --out e
     blimp map build walk.mp4 --out maps/NAME
 blimp localize nosuch.mp4 --map atrium --out e
     blimp localize --help has an example
+blimp localize walk.mp4 --map atrium --out empty
+    empty: is a folder; name a file in it
 blimp localize walk.mp4 --map nosuch --out e
     blimp map build INPUT --out nosuch
 blimp localize walk.mp4 --map empty --out e

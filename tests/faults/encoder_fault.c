@@ -1,28 +1,13 @@
 /* An x264 that stalls, for LD_PRELOAD. The 64-bit number at the start of the file ENCODER_FAULT:
  * 0 it encodes, 1 it takes pictures and gives none, 2 it does not come back from a call. */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <fcntl.h>
+#include "shim.h"
 #include <link.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <stdlib.h>
-#include <string.h>
-#include <sys/mman.h>
-#include <unistd.h>
 
 static volatile const int64_t *fault;
 
 __attribute__((constructor)) static void open_fault(void)
 {
-    const char *path = getenv("ENCODER_FAULT");
-    int file = path ? open(path, O_RDONLY | O_CLOEXEC) : -1;
-    if (file < 0)
-        return;
-    void *mapped = mmap(NULL, sizeof(int64_t), PROT_READ, MAP_SHARED, file, 0);
-    close(file);
-    if (mapped != MAP_FAILED)
-        fault = mapped;
+    fault = shim_numbers("ENCODER_FAULT");
 }
 
 /* The encoder was loaded by a plug-in and is in nobody's default scope. */

@@ -1,30 +1,15 @@
 /* A disk that fails, for LD_PRELOAD: what is written to recordings. The 64-bit number at the start
  * of the file FILE_FAULT: 0 none, above it the error of each write, sync and new file, -1 a disk
  * that takes nothing until it is 0 again. The number behind it counts what befell. */
-#define _GNU_SOURCE
-#include <dlfcn.h>
+#include "shim.h"
 #include <errno.h>
-#include <fcntl.h>
-#include <stdarg.h>
-#include <stdint.h>
 #include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <sys/mman.h>
-#include <unistd.h>
 
 static volatile int64_t *fault; /* and behind it the count */
 
 __attribute__((constructor)) static void open_fault(void)
 {
-    const char *path = getenv("FILE_FAULT");
-    int file = path ? open(path, O_RDWR | O_CLOEXEC) : -1;
-    if (file < 0)
-        return;
-    void *mapped = mmap(NULL, 2 * sizeof(int64_t), PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
-    close(file);
-    if (mapped != MAP_FAILED)
-        fault = mapped;
+    fault = shim_numbers("FILE_FAULT");
 }
 
 static int is_recording(const char *path)
@@ -71,12 +56,11 @@ int fdatasync(int file)
 
 int open64(const char *path, int flags, ...)
 {
-    static int (*real)(const char *, int, ...);
+    if (flags & O_CREAT && fails(path, -1))
+        return -1;
     va_list more;
     va_start(more, flags);
-    int mode = flags & (O_CREAT | __O_TMPFILE) ? va_arg(more, int) : 0;
+    int file = system_open64(path, flags, more);
     va_end(more);
-    if (!real)
-        real = (int (*)(const char *, int, ...))dlsym(RTLD_NEXT, "open64");
-    return flags & O_CREAT && fails(path, -1) ? -1 : real(path, flags, mode);
+    return file;
 }

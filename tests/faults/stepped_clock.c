@@ -1,29 +1,16 @@
 /* A wall clock that can be stepped while a program runs, for LD_PRELOAD: what it reads is moved by
  * the 64-bit number of nanoseconds at the start of the file STEPPED_CLOCK. Monotonic clocks go on. */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <fcntl.h>
-#include <stdint.h>
-#include <stdlib.h>
-#include <sys/mman.h>
+#include "shim.h"
 #include <sys/time.h>
 #include <time.h>
-#include <unistd.h>
 
 static volatile const int64_t *step_ns;
 static int (*real_clock_gettime)(clockid_t, struct timespec *);
 
 __attribute__((constructor)) static void open_step(void)
 {
-    const char *path = getenv("STEPPED_CLOCK");
     real_clock_gettime = (int (*)(clockid_t, struct timespec *))dlsym(RTLD_NEXT, "clock_gettime");
-    int file = path ? open(path, O_RDONLY | O_CLOEXEC) : -1;
-    if (file < 0)
-        return;
-    void *mapped = mmap(NULL, sizeof(int64_t), PROT_READ, MAP_SHARED, file, 0);
-    close(file);
-    if (mapped != MAP_FAILED)
-        step_ns = mapped;
+    step_ns = shim_numbers("STEPPED_CLOCK");
 }
 
 int clock_gettime(clockid_t clock, struct timespec *now)
