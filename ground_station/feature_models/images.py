@@ -8,6 +8,7 @@ lines, letters, walls of the simulator's materials. Grey, (H, W) uint8.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -16,6 +17,8 @@ from ground_station.arrays import F32, U8
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
 Rng = np.random.Generator
+Kind = Callable[[tuple[int, int], Rng], tuple[F32, F32]]
+"""Paints a patch and its mask, both (rows, columns), of linear radiance and 0..1."""
 
 _PER_BANK = 40
 """Pictures that share a bank of fields: a bank takes as long as several pictures."""
@@ -34,7 +37,7 @@ def procedural(seed: int, index: int, size: tuple[int, int]) -> U8:
     """Picture `index` of a seed, (rows, columns); the same each time."""
     rng = np.random.default_rng([seed, 1, index])
     bank = _bank(seed, index // _PER_BANK)
-    painters = (leaves, leaves, leaves, field, walls, walls, shapes, shapes)
+    painters = (leaves, leaves, leaves, field, walls, walls, shapes, shapes, plain, rows, screens)
     painter = painters[index % len(painters)]
     large = (round(size[0] * _OVER), round(size[1] * _OVER))
     radiance = painter(bank, large, rng)
@@ -138,27 +141,70 @@ def walls(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
     return canvas
 
 
+def plain(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
+    """A corridor's walls: faint grain, light that falls off, edges of panels, few small things."""
+    high, wide = size
+    grain = _texture(bank, size, rng) - 1
+    canvas = 1 + np.float32(np.exp(rng.uniform(np.log(0.03), np.log(0.5)))) * grain
+    for _ in range(int(rng.integers(1, 5))):  # walls, floor and doors meet along straight lines
+        place, way = rng.uniform(0, 1, 2) * (wide, high), rng.normal(0, 1, 2)
+        far = way / np.hypot(*way) * (wide + high)
+        side = np.array([-far[1], far[0]])
+        mask = np.zeros(size, np.float32)
+        corners = np.array([place - far, place + far, place + far + side, place - far + side])
+        cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1.0, cv2.LINE_AA)
+        canvas = canvas * (1 + np.float32(rng.normal(0, 0.25)) * mask)
+    kinds = (_polygon, _lines, _text, _grating)
+    for _ in range(int(rng.integers(1, 9))):
+        canvas = _put(canvas, kinds[int(rng.integers(len(kinds)))], (0.03, 0.25), rng)
+    return np.asarray(np.maximum(canvas, 0.02), np.float32)
+
+
+def rows(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
+    """The same thing again and again, as doors and lamps are, with small differences between."""
+    high, wide = size
+    motif = walls if rng.random() < 0.5 else shapes
+    h, w = (int(side / rng.integers(2, 6)) for side in size)
+    one = cv2.resize(motif(bank, (2 * h, 2 * w), rng), (w, h), interpolation=cv2.INTER_AREA)
+    tiles = np.tile(one, (-(-high // h), -(-wide // w)))[:high, :wide]
+    canvas = np.asarray(tiles * _texture(bank, size, rng), np.float32)
+    for _ in range(int(rng.integers(0, 12))):
+        canvas = _put(canvas, _text if rng.random() < 0.6 else _polygon, (0.04, 0.15), rng)
+    return canvas
+
+
+def screens(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
+    """Bright rectangles with writing in a dim room."""
+    canvas = walls(bank, size, rng) * np.float32(rng.uniform(0.1, 0.6))
+    for _ in range(int(rng.integers(1, 5))):
+        canvas = _put(canvas, _text, (0.2, 0.6), rng, float(rng.uniform(1, 4)))
+    return np.asarray(canvas, np.float32)
+
+
+def _put(canvas: F32, kind: Kind, share: tuple[float, float], rng: Rng, level: float = 1.0) -> F32:
+    """A shape of some share of the picture's sides, turned, over the canvas."""
+    rows, columns = canvas.shape
+    h, w = (int(side * np.exp(rng.uniform(*np.log(share)))) + 8 for side in canvas.shape)
+    patch, mask = kind((h, w), rng)
+    turn = cv2.getRotationMatrix2D((w / 2, h / 2), float(rng.normal(0, 35)), 1.0)
+    x, y = rng.uniform(-0.2, 1.0, 2) * (columns, rows)
+    turn = turn + np.array([[0, 0, x], [0, 0, y]])
+    over = cv2.warpAffine(mask, turn, (columns, rows), flags=cv2.INTER_LINEAR)
+    tone = cv2.warpAffine(patch, turn, (columns, rows), flags=cv2.INTER_LINEAR)
+    return np.asarray(canvas * (1 - over) + np.float32(level) * tone * over, np.float32)
+
+
 def _word(rng: Rng) -> str:
     return "".join(rng.choice(_LETTERS, int(rng.integers(1, 9))).tolist())
 
 
 def shapes(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
     """What people make: chequers, gratings, polygons, lines, discs and letters on a background."""
-    rows, columns = size
     canvas = _texture(bank, size, rng) if rng.random() < 0.7 else np.ones(size, np.float32)
     canvas = canvas * np.float32(rng.uniform(0.1, 0.8))
     kinds = (_chequers, _grating, _polygon, _lines, _text, _text, _polygon)
     for _ in range(int(rng.integers(8, 40))):
-        kind = kinds[int(rng.integers(len(kinds)))]
-        h, w = (int(s * np.exp(rng.uniform(np.log(0.06), np.log(0.5)))) + 8 for s in size)
-        patch, mask = kind((h, w), rng)
-        turn = cv2.getRotationMatrix2D((w / 2, h / 2), float(rng.normal(0, 35)), 1.0)
-        x, y = rng.uniform(-0.2, 1.0, 2) * (columns, rows)
-        turn = turn + np.array([[0, 0, x], [0, 0, y]])
-        flags = cv2.INTER_LINEAR
-        over = cv2.warpAffine(mask, turn, (columns, rows), flags=flags)
-        tone = cv2.warpAffine(patch, turn, (columns, rows), flags=flags)
-        canvas = canvas * (1 - over) + tone * over
+        canvas = _put(canvas, kinds[int(rng.integers(len(kinds)))], (0.06, 0.5), rng)
     grime = _texture(bank, size, rng)
     return np.asarray(canvas * (0.6 + 0.4 * grime), np.float32)
 

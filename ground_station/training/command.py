@@ -10,12 +10,12 @@ from pathlib import Path
 from ground_station.training.errors import TrainingError
 
 _EXAMPLE = """\
-Example: blimp models train --size wren --teacher alike-n --out out/training/wren
-         blimp models train --out out/training/wren --resume
+Example: blimp models train --size swift --teacher alike-n --out out/training/swift
+         blimp models train --out out/training/swift --resume
          blimp models train --out out/training/final --decay-from \\
-             out/training/wren/checkpoints/step-0010000.safetensors
+             out/training/swift/checkpoints/step-0010000.safetensors
 
-         blimp models train --device cuda --batch 64 --steps 6000 --rate 0.003
+         blimp models train --device cpu --batch 8 --rate 0.0015 --fresh 1
 
 The teacher is ALIKE, brought by `blimp models import alike-n.safetensors`. All pictures are made by
 code. A killed run goes on with --resume where its last checkpoint stands. Torch is needed:
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXAMPLE
     parser.set_defaults(next="blimp models list")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--size", default="wren", help="wren (default)")
+    parser.add_argument("--size", default="swift", help="swift (default)")
     parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")
     parser.add_argument("--resume", action="store_true", help="go on where this folder stands")
     parser.add_argument(
@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--corpus", type=Path, help="folder of the pictures (out/training/corpus)")
     parser.add_argument("--seed", type=int, help="of pictures, weights and pairs (1)")
     for name, text in (
-        ("pictures", "textures in the corpus"),
+        ("textures", "pictures without a room that there are at one time"),
+        ("fresh", "new ones a step"),
         ("rooms", "rooms in the corpus"),
         ("batch", "pairs a step"),
         ("steps", "length of the run"),
@@ -82,7 +83,8 @@ def run(args: argparse.Namespace) -> int:
     if args.steps is not None:  # a short run has a short end
         given.setdefault("decay", min(Recipe.decay, args.steps // 4))
         given["warm_up"] = min(Recipe.warm_up, args.steps // 4)
-    numbers = {k: getattr(args, k) for k in ("pictures", "rooms", "seed")}
+        given["place_from"] = min(Recipe.place_from, args.steps // 4)
+    numbers = {k: getattr(args, k) for k in ("rooms", "seed")}
     corpus = replace(CorpusSettings(), **{k: v for k, v in numbers.items() if v is not None})
     out = args.out or Path("out/training") / args.size
     machine = Machine(
@@ -97,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         Recipe(**given, corpus=corpus),
         out=out,
         corpus_folder=args.corpus or Path("out/training/corpus"),
-        teacher=args.teacher,
+        teacher_name=args.teacher,
         machine=machine,
         resume=args.resume,
         decay_from=args.decay_from,

@@ -80,6 +80,9 @@ class _OnnxOperations:
     def double(self, x: str) -> str:
         return self._graph.resize_bilinear(x, 2)
 
+    def fold(self, x: str, side: int) -> str:
+        return self._graph.node("SpaceToDepth", [x], blocksize=side)
+
 
 def export(shape: Shape, weights: Weights, path: str | Path, source: str) -> ModelInfo:
     """Writes the model's file, atomically; raises `TrainingError` naming a weight that is wrong.

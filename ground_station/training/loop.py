@@ -17,18 +17,19 @@ import torch
 from ground_station.features import model
 from ground_station.features.cells import CellFeatures
 from ground_station.features.extractor import Extractor
+from ground_station.features.extractors import of_network
 from ground_station.features.inference import Network
 from ground_station.features.methods.rootsift import RootSift
-from ground_station.features.pixels import PixelFeatures
+from ground_station.features.model_info import Model
 from ground_station.features.settings import LearnedSettings
 from ground_station.progress import Progress, stop_noted
 from ground_station.training import checkpoint, corpus, curve, teacher, validation
-from ground_station.training.batches import batches
+from ground_station.training.batches import Source, held_out
 from ground_station.training.errors import TrainingError
 from ground_station.training.export import export
 from ground_station.training.losses import Losses
 from ground_station.training.network import FeatureNetwork
-from ground_station.training.pairs import Pair, PairSource
+from ground_station.training.pairs import Batch
 from ground_station.training.recipe import Recipe, finite, is_due, pairs_seen
 from ground_station.training.trainer import Trainer
 
@@ -76,7 +77,7 @@ def train(
     *,
     out: Path,
     corpus_folder: Path,
-    teacher: str,
+    teacher_name: str,
     machine: Machine,
     resume: bool = False,
     decay_from: Path | None = None,
@@ -111,20 +112,14 @@ def train(
             raise TrainingError(f"the checkpoint is of another recipe: {', '.join(other)} differ")
         trainer.restore(start)
         step, before_s = start.step, float(start.state.get("seconds", 0))
-    corpus.make(corpus_folder, recipe.corpus, teacher, machine.jobs)
-    held_folder = corpus_folder / "held-out"
-    corpus.make(held_folder, recipe.held_out(), teacher, machine.jobs)
-    size = (recipe.rows, recipe.columns)
-    source = PairSource(
-        corpus.Corpus(corpus_folder, recipe.corpus), recipe.seed, size, recipe.points
-    )
-    held = PairSource(corpus.Corpus(held_folder, recipe.held_out()), 0, size, recipe.points)
-    run = _Run(recipe, trainer, out, machine, before_s, [
-        held.pair(0, k) for k in range(_HELD_OUT_PAIRS)
-    ], fresh)  # fmt: skip
-    run.begins(teacher, step)
+    corpus.make(corpus_folder, recipe.corpus, machine.jobs)
+    found = teacher.load(teacher_name)
+    source = Source(recipe, teacher.Teacher(found, device), corpus_folder, device)
+    held = held_out(recipe, corpus_folder, _HELD_OUT_PAIRS)
+    run = _Run(recipe, trainer, out, machine, before_s, held, fresh)
+    run.begins(found.sha256, step)
     if fresh:
-        run.baselines(teacher, step)
+        run.baselines(found, step)
     return run.go(source, step)
 
 
@@ -138,7 +133,7 @@ def _recipe_of(start: checkpoint.Checkpoint) -> dict[str, Any]:
 class _Run:
     def __init__(
         self, recipe: Recipe, trainer: Trainer, out: Path, machine: Machine, before_s: float,
-        held: list[Pair], fresh: bool,
+        held: Batch, fresh: bool,
     ) -> None:  # fmt: skip
         self._fresh = fresh
         self.recipe, self.trainer, self.machine, self.held = recipe, trainer, machine, held
@@ -156,38 +151,32 @@ class _Run:
             self.log = curve.Log(self.out / "log.jsonl", -1 if self._fresh else step)
         return self.log
 
-    def begins(self, teacher_name: str, step: int) -> None:
+    def begins(self, teacher_sha256: str, step: int) -> None:
         """Notes what goes on from here: a resumed run may have a larger corpus."""
-        teacher_sha256 = teacher.load(teacher_name).sha256
         self.note(step).add(
             "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256,
             device=str(self.trainer.device), bfloat16=self.trainer.bfloat16,
         )  # fmt: skip
 
-    def baselines(self, teacher_name: str, step: int) -> None:
+    def baselines(self, found: Model, step: int) -> None:
         """What others make of the same held-out pairs."""
-        found = teacher.load(teacher_name)
         others: dict[str, Extractor] = {
             "rootsift": RootSift(_MOST_POINTS),
-            found.info.name: PixelFeatures(
-                Network(found, threads=self.machine.threads), _MOST_POINTS, LearnedSettings()
-            ),
+            found.info.name: of_network(Network(found, threads=self.machine.threads), _MOST_POINTS),
         }
         for name, extractor in others.items():
             figures = validation.figures(extractor, self.held)
             self.note(step).add("baseline", step=step, name=name, **asdict(figures))
             _say(name, figures)
 
-    def go(self, source: PairSource, step: int) -> dict[str, Any]:
+    def go(self, source: Source, step: int) -> dict[str, Any]:
         """The steps that are left; an interrupt ends them after a checkpoint."""
         recipe, machine = self.recipe, self.machine
         log = self.note(step)
         names = [field.name for field in fields(Losses)]
         sums = torch.zeros(len(names), device=self.trainer.device)
         count, since_s, written = 0, time.monotonic(), step
-        stream = batches(
-            source, recipe.batch, step, recipe.steps, machine.jobs, self.trainer.device
-        )
+        stream = source.batches(step, recipe.steps, machine.jobs)
         # A log has lines enough of its own.
         bar = Progress("steps", recipe.steps - step) if sys.stderr.isatty() else nullcontext()
         with stop_noted(signal.SIGINT, signal.SIGTERM) as stopped, bar, closing(stream):
@@ -255,7 +244,7 @@ class _Run:
             mean = FeatureNetwork(self.trainer.shape)
         mean.load_state_dict({k: v.cpu() for k, v in self.trainer.mean.items()})
         mean.eval()
-        image = torch.from_numpy(self.held[0].images[:1, None].astype(np.float32) / 255)
+        image = self.held.images[:1]
         with torch.no_grad():
             wanted = mean(image)
         said = network.run(image.numpy())

@@ -52,6 +52,9 @@ class _TorchOperations:
     def double(self, x: Tensor) -> Tensor:
         return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
+    def fold(self, x: Tensor, side: int) -> Tensor:
+        return functional.pixel_unshuffle(x, side)
+
 
 def _key(name: str) -> str:
     """torch's names of modules have no dots."""

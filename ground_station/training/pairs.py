@@ -1,184 +1,133 @@
 """Training pairs: two views of one place, each in its own light, and what is where in both.
 
-A pair is a function of seed, step and place in the batch alone: where training stands in its data
-is one number.
+A batch is a function of the places there are, seed and step alone.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
-import numpy.typing as npt
-from scipy.spatial import cKDTree
+import torch
+from torch import Tensor
+from torch.nn import functional
 
-from ground_station.arrays import F32, F64, U8, Bools
-from ground_station.feature_models.degrade import degrade
-from ground_station.training.corpus import Corpus, Place
-from ground_station.training.topology import CELL_PX, LOGITS
-from ground_station.training.warps import WarpLimits, apply, inside, pair_of_views
+from ground_station.training.degradation import degraded
+from ground_station.training.topology import CELL_PX
+from ground_station.training.views import Chance, Size, Views, inside, pairs_of_views
 
 # SuperPoint (DeTone et al., CVPR-W 2018, section 3.4) labels one pixel of a cell; here a point's
 # weight is shared among the four pixels around it, so that its fraction of a pixel can be learned.
 
-
-def confidence(scores: F32, low: float, high: float) -> F32:
-    """The teacher's scores (N,) as chances that a point is one: a ramp from `low` to `high`."""
-    return np.asarray(np.clip((scores - low) / (high - low), 0, 1), np.float32)
-
-
-def soft_cells(points_px: F32, chances: F32, shape: tuple[int, int]) -> F32:
-    """Labels (65, H/8, W/8) of points (N, 2), x then y, px, for a picture of `shape` (H, W).
-
-    Channel k < 64 is pixel (k // 8, k % 8) of the cell, 64 is "none"; each cell sums to 1. Points
-    out of the picture are left out; weight that falls on pixels beyond its edge is lost.
-    """
-    rows, columns = shape
-    mass = np.zeros(rows * columns, np.float32)
-    base = np.floor(points_px).astype(np.int64)
-    part = points_px - base
-    for dy in (0, 1):
-        for dx in (0, 1):
-            x, y = base[:, 0] + dx, base[:, 1] + dy
-            inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-            share = np.where(dx, part[:, 0], 1 - part[:, 0])
-            share = share * np.where(dy, part[:, 1], 1 - part[:, 1]) * chances
-            np.add.at(mass, (y * columns + x)[inside], share[inside].astype(np.float32))
-    h, w = rows // CELL_PX, columns // CELL_PX
-    cells = mass.reshape(h, CELL_PX, w, CELL_PX).transpose(1, 3, 0, 2).reshape(-1, h, w)
-    total = cells.sum(axis=0)
-    result = np.empty((LOGITS, h, w), np.float32)
-    result[:-1] = cells / np.maximum(total, 1)
-    result[-1] = np.maximum(1 - total, 0)
-    return result
-
-
-Rng = np.random.Generator
-
 _CHANCE_SCORES = (0.05, 0.35)
 """Average teacher scores at which a point counts nothing and wholly."""
 _APART_PX = 3.0
-"""In a view, two points nearer than this are one: the stronger stays."""
+"""In a view, a point nearer than this to a stronger one is none."""
 _MARGIN_PX = 4.0
+_JITTER_PX = 0.3
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two views and their truth; arrays of fixed shapes, so that pairs stack to batches.
+class Places:
+    """`pictures` (N, H, W) uint8; `lights` (P, 2): each place's two; `points_px` (P, K, 2),
+    strongest first, and `scores` (P, K) of the teacher, 0 where there is no point."""
 
-    `images` (2, H, W) uint8; `labels` (2, 65, H/8, W/8) float16; `known` (2, H/8, W/8) bool: cells
-    of which the labels say something; `points_px` (2, P, 2) float32, the same P points in both;
-    `used` (P,) bool: the first so many are points; `teacher` (P, D) float16, nought where there is
-    no descriptor; `second_from_first` (3, 3) float64.
+    pictures: Tensor
+    lights: Tensor
+    points_px: Tensor
+    scores: Tensor
+
+
+@dataclass(frozen=True)
+class Batch:
+    """As the losses take it, of B pairs: `images` (2B, 1, H, W), `labels` (2B, 65, H/8, W/8),
+    `known` (2B, H/8, W/8) bool, cells that lie in the picture; `points_px` (2B, P, 2), a pair's the
+    same P points in both, of which `used` (B, P) are any; `views`."""
+
+    images: Tensor
+    labels: Tensor
+    known: Tensor
+    points_px: Tensor
+    used: Tensor
+    views: Views
+
+
+def soft_cells(points_px: Tensor, chances: Tensor, size: Size) -> Tensor:
+    """Labels (V, 65, H/8, W/8) of points (V, K, 2), px, for views of `size` (H, W).
+
+    Channel k < 64 is pixel (k // 8, k % 8) of the cell, 64 is "none"; each cell sums to 1. Weight
+    that falls on pixels beyond the edge is lost.
     """
-
-    images: U8
-    labels: npt.NDArray[np.float16]
-    known: Bools
-    points_px: F32
-    used: Bools
-    teacher: npt.NDArray[np.float16]
-    second_from_first: F64
-
-
-def view_of(picture: U8, matrix: F64, size: tuple[int, int]) -> U8:
-    """A view of (rows, columns) through `matrix`, from its pixels to the picture's."""
-    scale = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
-    if scale > 1.1:  # smaller than the picture: what a view's pixel collects
-        sigma = float(0.5 * np.sqrt(scale**2 - 1))
-        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma), np.uint8)
-    return np.asarray(
-        cv2.warpPerspective(
-            picture, matrix, size[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REFLECT_101,
-        ),
-        np.uint8,
-    )  # fmt: skip
+    rows, columns = size
+    mass = torch.zeros(len(points_px), rows * columns, device=points_px.device)
+    base = points_px.floor()
+    part = points_px - base
+    for dy in (0, 1):
+        for dx in (0, 1):
+            x, y = base[:, :, 0] + dx, base[:, :, 1] + dy
+            good = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+            share = (part[:, :, 0] if dx else 1 - part[:, :, 0]) * (
+                part[:, :, 1] if dy else 1 - part[:, :, 1]
+            )
+            at = torch.where(good, y * columns + x, 0).long()
+            mass.scatter_add_(1, at, torch.where(good, share * chances, 0))
+    cells = functional.pixel_unshuffle(mass.view(-1, 1, rows, columns), CELL_PX)
+    total = cells.sum(dim=1, keepdim=True)
+    return torch.cat([cells / total.clamp(min=1), (1 - total).clamp(min=0)], dim=1)
 
 
-def _known_cells(matrix: F64, picture: tuple[int, ...], size: tuple[int, int]) -> Bools:
-    """Cells (h, w) of a view whose four corners lie well inside the picture."""
-    y, x = np.meshgrid(
-        np.arange(0, size[0] + 1, CELL_PX) - 0.5, np.arange(0, size[1] + 1, CELL_PX) - 0.5,
-        indexing="ij",
-    )  # fmt: skip
-    corners = apply(matrix, np.stack([x.ravel(), y.ravel()], axis=1))
-    good = inside(corners, (picture[0], picture[1]), _MARGIN_PX).reshape(x.shape)
-    return np.asarray(good[:-1, :-1] & good[1:, :-1] & good[:-1, 1:] & good[1:, 1:])
+def _known(views: Views, picture: Size) -> Tensor:
+    """Cells (V, h, w) whose four corners lie well inside the picture."""
+    rows, columns = views.size
+    device = views.lens.device
+    y, x = (torch.arange(0, n + 1, CELL_PX, device=device) - 0.5 for n in (rows, columns))
+    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=2)
+    corners = views.onto_picture(grid.view(1, -1, 2).expand(len(views.lens), -1, -1))
+    good = inside(corners, picture, _MARGIN_PX).unflatten(1, grid.shape[:2])
+    return good[:, :-1, :-1] & good[:, 1:, :-1] & good[:, :-1, 1:] & good[:, 1:, 1:]
 
 
-def _thinned(points_px: F64) -> Bools:
-    """Which points (N,), strongest first, have no stronger one nearer than `_APART_PX`."""
-    keep = np.ones(len(points_px), bool)
-    for a, b in sorted(cKDTree(points_px).query_pairs(_APART_PX)):
-        if keep[a]:
-            keep[b] = False
-    return keep
+def make(
+    places: Places, chance: Chance, pairs: int, size: Size, points: int, lens: bool = True
+) -> Batch:
+    """Pairs of views of (rows, columns), multiples of 16, with `points` pairs of points at most.
 
-
-def make_pair(
-    place: Place, rng: Rng, size: tuple[int, int], points: int, strength: float = 1.0
-) -> Pair:
-    """Two views of (rows, columns), multiples of 8, with `points` pairs of points at most.
-
-    Where teacher's points are too few, points by chance fill up: descriptors are for everywhere.
+    Half of the points are the teacher's where it has so many, the others anywhere: descriptors are
+    for everywhere. Without `lens` the two views of a pair differ by a homography.
     """
-    picture = place.views.shape[1:]
-    matrices = pair_of_views(rng, (picture[0], picture[1]), size, WarpLimits(), strength)
-    lights = rng.integers(0, len(place.views), 2)
-    images, labels, known, places = [], [], [], []
-    chances = confidence(place.scores, *_CHANCE_SCORES)
-    for matrix, light in zip(matrices, lights.tolist(), strict=True):
-        images.append(degrade(view_of(place.views[light], matrix, size), rng))
-        at = apply(np.linalg.inv(matrix), place.points_px)
-        seen = np.flatnonzero(inside(at, size, -0.5))
-        strong = seen[_thinned(at[seen])]
-        labels.append(soft_cells(at[strong].astype(np.float32), chances[strong], size))
-        known.append(_known_cells(matrix, picture, size))
-        places.append(at)
-    second_from_first = np.linalg.inv(matrices[1]) @ matrices[0]
-    second_from_first /= second_from_first[2, 2]
-    both = np.flatnonzero(inside(places[0], size, _MARGIN_PX) & inside(places[1], size, _MARGIN_PX))
-    both = rng.permutation(both)[:points]
-    first = places[0][both] + rng.normal(0, 0.3, (len(both), 2))
-    filling = rng.uniform(_MARGIN_PX, np.array(size[::-1]) - 1 - _MARGIN_PX, (points, 2))
-    first = np.concatenate([first, filling])
-    second = apply(second_from_first, first)
-    base = apply(matrices[0], first)
-    good = inside(second, size, _MARGIN_PX) & inside(base, (picture[0], picture[1]), _MARGIN_PX)
-    chosen = np.flatnonzero(good)[:points]
-    teacher = np.zeros((len(first), place.descriptors.shape[1]), np.float16)
-    teacher[: len(both)] = place.descriptors[both]
-    count = len(chosen)
-    at_both = np.zeros((2, points, 2), np.float32)
-    at_both[0, :count], at_both[1, :count] = first[chosen], second[chosen]
-    vectors = np.zeros((points, teacher.shape[1]), np.float16)
-    vectors[:count] = teacher[chosen]
-    return Pair(
-        images=np.stack(images),
-        labels=np.stack(labels).astype(np.float16),
-        known=np.stack(known),
-        points_px=at_both,
-        used=np.arange(points) < count,
-        teacher=vectors,
-        second_from_first=second_from_first,
+    picture = (places.pictures.shape[1], places.pictures.shape[2])
+    chosen = chance.whole(len(places.lights), pairs)
+    views = pairs_of_views(chance, pairs, picture, size, lens)
+    lit = places.lights[chosen].gather(1, chance.whole(2, pairs, 2)).flatten()
+    images = degraded(views.taken(places.pictures[lit].float() / 255), chance)
+
+    of_place = places.points_px[chosen]
+    at = views.of_picture(of_place.repeat_interleave(2, 0))
+    low, high = _CHANCE_SCORES
+    chances = ((places.scores[chosen] - low) / (high - low)).clamp(0, 1).repeat_interleave(2, 0)
+    seen = inside(at, size, -0.5) & (chances > 0)
+    near = torch.cdist(at, at) < _APART_PX
+    covered = (near.tril(-1) & seen[:, None, :]).any(dim=2)
+    labels = soft_cells(at, chances * (seen & ~covered), size)
+
+    both = (inside(at, size, _MARGIN_PX) & (chances > 0)).unflatten(0, (-1, 2)).all(dim=1)
+    first = at[::2] + chance.normal(_JITTER_PX, *at[::2].shape)
+    sides = torch.tensor(size[::-1], device=at.device)
+    anywhere = _MARGIN_PX + chance.uniform(0, 1, pairs, 2 * points, 2) * (
+        sides - 1 - 2 * _MARGIN_PX
     )
-
-
-@dataclass(frozen=True)
-class PairSource:
-    """Pairs by step and place in the batch."""
-
-    corpus: Corpus
-    seed: int
-    size: tuple[int, int]
-    points: int
-
-    def pair(self, step: int, index: int) -> Pair:
-        """The same each time it is asked for."""
-        rng = np.random.default_rng([self.seed, 5, step, index])
-        place = self.corpus[int(rng.integers(len(self.corpus)))]
-        # Some pairs differ in light only, as frames of a hovering blimp do.
-        strength = float(rng.choice([0.1, 0.5, 1.0], p=[0.15, 0.35, 0.5]))
-        return make_pair(place, rng, self.size, self.points, strength)
+    wanted = torch.where(both, chance.uniform(0, 1, *both.shape), -1)
+    picked = wanted.topk(points // 2, dim=1)
+    first = torch.cat(
+        [first.gather(1, picked.indices[:, :, None].expand(-1, -1, 2)), anywhere], dim=1
+    )
+    second = views.across(first, 0)
+    good = inside(second, size, _MARGIN_PX) & inside(
+        views.every_other(0).onto_picture(first), picture, _MARGIN_PX
+    )
+    good[:, : points // 2] &= picked.values >= 0
+    order = (~good).to(torch.uint8).argsort(dim=1, stable=True)[:, :points]
+    used = good.gather(1, order)
+    index = order[:, :, None].expand(-1, -1, 2)
+    both_px = torch.stack([first.gather(1, index), second.gather(1, index)], dim=1)
+    points_px = torch.where(used[:, None, :, None], both_px, 0).flatten(0, 1)
+    return Batch(images[:, None], labels, _known(views, picture), points_px, used, views)

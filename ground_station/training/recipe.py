@@ -10,9 +10,6 @@ from ground_station.training.corpus import CorpusSettings
 from ground_station.training.errors import TrainingError
 from ground_station.training.topology import shape_of
 
-HELD_OUT_SEED = 1_000_003
-"""Added to the corpus' seed for the pairs that validate: other textures, other rooms."""
-
 _LENGTHS = ("steps", "decay", "warm_up", "place_from")
 """When what begins and ends: a run may be made longer or shorter while it goes."""
 
@@ -21,35 +18,43 @@ _LENGTHS = ("steps", "decay", "warm_up", "place_from")
 class Recipe:
     """Everything that decides the weights, but for the machine's rounding."""
 
-    size: str = "wren"
+    size: str = "swift"
     seed: int = 1
     corpus: CorpusSettings = field(default_factory=CorpusSettings)
+    textures: int = 4096
+    """Pictures without a room that there are at one time, the oldest going first."""
+    first_textures: int = 512
+    fresh: int = 2
+    """New ones a step."""
     rows: int = 240
     columns: int = 320
-    batch: int = 8
+    batch: int = 64
     """Pairs a step."""
-    points: int = 192
+    points: int = 256
     """Pairs of points a pair of views, for the descriptors."""
-    steps: int = 40_000
-    warm_up: int = 500
-    decay: int = 8_000
+    steps: int = 6_800
+    warm_up: int = 200
+    decay: int = 2_600
     """The last so many steps, over which the rate goes to nought."""
-    rate: float = 1.5e-3
+    rate: float = 3e-3
     weight_decay: float = 1e-4
     average: float = 0.999
     """Of the weights that are exported: what each step leaves of the mean so far."""
-    place_from: int = 17_500
-    """The first step that also learns where between the pixels a key point is (`places`)."""
+    place_from: int = 400
+    """The first step that also learns from the detector's own peaks (`losses.peak_losses`)."""
 
     def __post_init__(self) -> None:
         """Raises `TrainingError` with one line for a number that trains nothing."""
         shape_of(self.size)
         limits: dict[str, tuple[float, float]] = {
             "seed": (0, 2**31),
+            "textures": (16, 10**6),
+            "first_textures": (16, 10**6),
+            "fresh": (0, 10**4),
             "rows": (64, 2048),
             "columns": (64, 2048),
             "batch": (1, 4096),
-            "points": (8, 2048),
+            "points": (16, 2048),
             "steps": (1, 10_000_000),
             "warm_up": (0, self.steps),
             "decay": (0, self.steps),
@@ -91,14 +96,6 @@ class Recipe:
             int(other.get(name, getattr(self, name))) for name in _LENGTHS
         )
         return replace(self, steps=steps, decay=decay, warm_up=warm_up, place_from=place_from)
-
-    def held_out(self) -> CorpusSettings:
-        """What validates."""
-        c = self.corpus
-        return replace(
-            c, seed=c.seed + HELD_OUT_SEED, pictures=min(40, max(c.pictures, 1)),
-            rooms=min(2, c.rooms), places=min(20, c.places),
-        )  # fmt: skip
 
     def as_dict(self) -> dict[str, Any]:
         """For checkpoint and log."""

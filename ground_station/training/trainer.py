@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
-from ground_station.training.batches import Batch
 from ground_station.training.checkpoint import Arrays, Checkpoint
 from ground_station.training.errors import TrainingError
 from ground_station.training.export import Weights
 from ground_station.training.losses import Losses, LossSettings, losses
 from ground_station.training.network import FeatureNetwork, exported
+from ground_station.training.pairs import Batch
 from ground_station.training.recipe import Recipe
 from ground_station.training.topology import shape_of
 
@@ -51,10 +51,8 @@ class Trainer:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             logits, descriptors = self.network(images)
         result = losses(
-            logits, descriptors, batch.labels, batch.known, batch.points_px, batch.used,
-            batch.teacher, batch.second_from_first, self.recipe.place_from <= number,
-            self._settings,
-        )  # fmt: skip
+            logits, descriptors, batch, self.recipe.place_from <= number, self._settings
+        )
         self.optimizer.zero_grad(set_to_none=True)
         result.total.backward()
         clip_grad_norm_(self.network.parameters(), _MOST_GRADIENT)

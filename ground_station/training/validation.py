@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from ground_station.feature_models.homographic import NEAR_PX, compared
 from ground_station.features.extractor import Extractor
-from ground_station.training.pairs import Pair
+from ground_station.training.pairs import Batch
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,13 @@ class Figures:
     error_px: float
 
 
-def figures(extractor: Extractor, pairs: list[Pair]) -> Figures:
-    """How well an extractor finds a view's key points again in the other."""
+def figures(extractor: Extractor, pairs: Batch) -> Figures:
+    """How well an extractor finds a view's key points again in the other; no lens may bend them."""
+    images = (pairs.images[:, 0] * 255).round().to(torch.uint8).numpy()
+    matrices = (pairs.views.from_picture[1::2] @ pairs.views.to_picture[::2]).double().numpy()
     found = [
-        compared(extractor, pair.images[0], pair.images[1], pair.second_from_first)
-        for pair in pairs
+        compared(extractor, images[2 * k], images[2 * k + 1], matrix / matrix[2, 2])
+        for k, matrix in enumerate(matrices)
     ]
     pooled = np.concatenate([each.nearest_px for each in found])
     pooled = pooled[pooled <= NEAR_PX]

@@ -22,7 +22,7 @@ def teacher(path: Path, seed: int = 0) -> str:
     sharp *= np.array([6, -6, 3, -3], np.float32)[:, None, None, None]
     parts = [graph.relu(graph.conv(image, sharp))]
     for scale in (2, 8):
-        small = graph.node("AveragePool", [image], kernel_shape=[scale] * 2, strides=[scale] * 2)
+        small = graph.max_pool(image, scale)
         weight = rng.standard_normal((4, 3, 1, 1)).astype(np.float32)
         parts.append(graph.resize_bilinear(graph.relu(graph.conv(small, weight)), scale, True))
     x = graph.concat(parts)
