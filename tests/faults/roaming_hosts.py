@@ -30,6 +30,7 @@ from standing import ATRIUM, Service  # noqa: E402
 
 GROUND, PAYLOAD, TELEMETRY_PORT = "10.9.0.1", "10.9.0.2", 7447
 RATE_HZ = 10.0
+CARD = TESTS.parent / "deploy/board/root/etc/sysctl.d/10-blimp.conf"
 _BETWEEN = ("air", "wire")
 _TWIN = """
 import socket, struct, sys, time
@@ -89,6 +90,8 @@ class Hosts:
                 inside("ip", "link", "set", f"{name}0", "up", "gso_max_segs", "1")
                 if address:
                     inside("ip", "addr", "add", f"{address}/24", "dev", f"{name}0")
+            for key, value in re.findall(r"(?m)^(\S+) = (\S+)$", CARD.read_text()):
+                self.payload.run("sh", "-c", f"echo {value} > /proc/sys/{key.replace('.', '/')}")
             self._stack = stack.pop_all()
         return self
 

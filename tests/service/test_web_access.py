@@ -433,9 +433,11 @@ def test_bodies_are_bounded(opened):
 
 def test_a_flood_of_posts_is_refused_and_others_are_not(opened):
     client, web = opened
-    statuses = [client.post("/api/recording", json={}).status_code for _ in range(200)]
-    assert statuses.count(422) < 150 and 429 in statuses
-    assert client.post("/api/recording", json={}).headers["retry-after"]
+    answers = [client.post("/api/recording", json={}) for _ in range(200)]
+    refused = [answer for answer in answers if answer.status_code == 429]
+    assert 50 < len(refused) < 200
+    # Not the next one's: on a slow machine one more may be allowed by then.
+    assert all(answer.headers["retry-after"] for answer in refused)
     assert client.get("/api/state").status_code == 200
     web.access.check_rate("10.9.9.9")  # another address
 
