@@ -75,8 +75,8 @@ class Source:
     ) -> None:
         self._recipe, self._teacher, self._device = recipe, teacher, device
         size = (recipe.corpus.rows, recipe.corpus.columns)
-        numbers = range(max(0, recipe.corpus.rooms - 1))
-        self._rooms = sum(len(corpus.read(folder, k, size)) for k in numbers)
+        rooms = [corpus.read(folder, k, size) for k in range(recipe.corpus.rooms - 1)]
+        self._rooms = sum(len(room) for room in rooms)
         most = self._rooms + recipe.textures
         self._places = Places(
             torch.empty(LIGHTS * self._rooms + recipe.textures, *size, dtype=torch.uint8,
@@ -86,8 +86,8 @@ class Source:
             torch.zeros(most, _POINTS, device=device),
         )  # fmt: skip
         first = 0
-        for number in numbers:
-            views = torch.from_numpy(corpus.read(folder, number, size))
+        for number, room in enumerate(rooms):
+            views = torch.from_numpy(room)
             self._put(first, LIGHTS * first, views, Chance(device, recipe.seed, 1, number))
             first += len(views)
 

@@ -13,7 +13,7 @@ _EXAMPLE = """\
 Example: blimp models train --size swift --teacher alike-n --out out/training/swift
          blimp models train --out out/training/swift --resume
          blimp models train --out out/training/final --decay-from \\
-             out/training/swift/checkpoints/step-0010000.safetensors
+             out/training/swift/checkpoints/step-0005000.safetensors
 
          blimp models train --device cpu --batch 8 --rate 0.0015 --fresh 1
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXAMPLE
     parser.set_defaults(next="blimp models list")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--size", default="swift", help="swift (default)")
+    parser.add_argument("--size", default="swift", help="swift (default) or wren")
     parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")
     parser.add_argument("--resume", action="store_true", help="go on where this folder stands")
     parser.add_argument(

@@ -1,7 +1,8 @@
 """What light, lens, sensor and link do to views, many at once: `feature_models.degrade` in torch.
 
-In the order in which it happens: light, shadow and gloss, defocus and motion along a path,
-exposure and tone curve, noise, compression. Views are (V, H, W), 0..1 as codes outside and linear
+In the order in which it happens: light, shadow and gloss, defocus and motion along a path, exposure
+and tone curve, noise, compression. The other one encodes in earnest and needs no torch, which
+models that users bring are measured without. Views are (V, H, W), 0..1 as codes outside and linear
 in between. H and W are multiples of 8.
 """
 

@@ -61,23 +61,15 @@ def test_settings_that_make_no_corpus_are_refused():
         CorpusSettings(places=0)
 
 
-@pytest.mark.parametrize("damage", ["cut", "garbage", "a picture", "gone"])
+@pytest.mark.parametrize("damage", ["cut", "garbage", "gone", "another size"])
 def test_a_damaged_room_is_refused_by_name(folder, damage):
     path = corpus.shard_path(folder, 1)
     data = path.read_bytes()
-    if damage == "cut":
-        path.write_bytes(data[:2000])
-    elif damage == "garbage":
-        path.write_bytes(b"\xff" * 20)
-    elif damage == "a picture":
-        path.write_bytes(data[:-400] + bytes(400))
-    else:
+    size = (SIZE[0] + 32, SIZE[1]) if damage == "another size" else SIZE
+    if damage == "gone":
         path.unlink()
-    if damage == "a picture":  # a decoder may take what is left of it
-        assert corpus.read(folder, 0, SIZE).shape == (3, 2, *SIZE)
-        with pytest.raises(TrainingError, match=r"room-0000\.safetensors"):
-            corpus.read(folder, 0, (SIZE[0] + 32, SIZE[1]))
-        return
+    elif damage != "another size":
+        path.write_bytes(data[:2000] if damage == "cut" else b"\xff" * 20)
     with pytest.raises(TrainingError, match=r"room-0001\.safetensors") as raised:
-        corpus.read(folder, 1, SIZE)
+        corpus.read(folder, 1, size)
     assert "\n" not in str(raised.value)
