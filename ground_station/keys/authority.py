@@ -202,7 +202,9 @@ class Authority:
                 problems.append(f"{name}: takes no releases of this authority; 'release' fixes it")
             if common != name or held.name != name:
                 problems.append(f"{name}: the certificate is {common}'s")
-            if set(held.peers) != set(self._peers(name)):
+            if (set(held.peers), set(held.stations)) != (
+                set(self._peers(name)), set(self._stations(name)),
+            ):  # fmt: skip
                 problems.append(f"{name}: its access list is not the authority's")
             if until - now < datetime.timedelta(days=soon_days):
                 problems.append(f"{name}: ends on {until:%Y-%m-%d}; 'renew' fixes it")
@@ -214,6 +216,12 @@ class Authority:
     def _peers(self, name: str) -> list[str]:
         other = GROUND if name.startswith(PAYLOAD) else PAYLOAD
         return [peer for peer in self.live() if peer.startswith(other + ".")]
+
+    def _stations(self, name: str) -> list[str]:
+        """The other ground stations that a ground station may work side by side with."""
+        if name.startswith(PAYLOAD):
+            return []
+        return [one for one in self.live() if one.startswith(GROUND + ".") and one != name]
 
     def _sign(self, name: str, days: int, folder: Path) -> None:
         pair = certificates.make_certificate(name, self._pair(self.signing), _until(days))
@@ -243,7 +251,8 @@ class Authority:
         signers = self._signers()
         live = self.live()
         for name in live:
-            access = {"schema": credentials.SCHEMA, "name": name, "peers": self._peers(name)}
+            access: dict[str, Any] = {"schema": credentials.SCHEMA, "name": name}
+            access |= {"peers": self._peers(name), "stations": self._stations(name)}
             folder = self.of(name)
             write_private(folder / credentials.AUTHORITIES, bundle, replace=True)
             write_private(folder / credentials.ACCESS, _json(access), replace=True)

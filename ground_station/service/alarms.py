@@ -24,6 +24,7 @@ LOSS_HIGH, LOSS_NO_MORE_HIGH = 0.05, 0.03
 SILENT_S, RESTARTED_S = 5.0, 30.0
 RESUMED_S = 120.0
 GONE_FOR_S = 600.0
+CLOCKS_APART_S = 1.0
 DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
 HOT_C, NO_MORE_HOT_C = 80.0, 76.0
 
@@ -101,9 +102,12 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
     yield from _of_recording(state, standing)
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
+    yield from _of_stations(_table(state, "fleet"))
     for payload_id, view in _table(state, "payloads").items():
         if not isinstance(view, dict):
             continue
+        if _table(view, "payload").get("relayed") and view.get("alive"):
+            continue  # its own station does, and says it
         if not view.get("alive"):
             yield from _of_gone(payload_id, view)
             continue
@@ -255,6 +259,31 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
         if reason.startswith(NO_MAP) and isinstance(view, dict) and view.get("alive"):
             refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
     yield from refused.values()
+
+
+def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
+    for other in fleet.get("stations") or ():
+        name, age_s = other["name"], other["age_s"]
+        if age_s > SILENT_S:
+            text = f"nothing is heard of station '{name}'"
+            yield Alarm(f"station/{name}", WARNING, STATION, text)
+            continue
+        if abs(other["clock_s"]) > CLOCKS_APART_S:
+            ahead = "ahead of" if other["clock_s"] > 0 else "behind"
+            text = (
+                f"the clock of station '{name}' is {abs(other['clock_s']):.1f} s {ahead} this one's"
+            )
+            yield Alarm(f"station-clock/{name}", WARNING, STATION, f"{text}: timedatectl there?")
+        if not other["same_map"] and other["payloads"]:
+            text = (
+                f"station '{name}' flies in another map, '{other['map']}': its poses are not shown"
+            )
+            yield Alarm(f"station-map/{name}", INFO, STATION, text)
+    for payload_id, name in _table(fleet, "twins").items():
+        text = f"two payloads have this name: one flies here, one with station '{name}'"
+        yield Alarm(f"twin/{payload_id}", ALARM, payload_id, text)
+    for text in fleet.get("refused") or ():
+        yield Alarm(f"refused/{text[:80]}", WARNING, STATION, f"not joined: {text}")
 
 
 def _below(value: float | None, limit: float, stands: bool) -> bool:

@@ -146,6 +146,7 @@ class PayloadMessage(Message):
     refused: int = 0
     ended: bool = False
     station: str = ""  # another one, to which it sends its video
+    relayed: bool = False  # by that station, which sees it; nothing is judged here
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,12 @@ import os
 import pwd
 import socket
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 from ground_station import user_folders
 from ground_station.errors import InputError
-from ground_station.service.settings import StationSettings
+from ground_station.service.settings import FLEET_PORT, StationSettings
 from pi_firmware.wire import credentials, scouting
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import PORT, check_endpoint
@@ -71,8 +72,12 @@ def on(settings: StationSettings, interface: str = "") -> StationSettings:
     if telemetry.listen:
         certified = bool(telemetry.certificates)
         _, port = check_endpoint(telemetry.listen[0], certified=certified)
+    fleet = settings.fleet
+    if held.stations and not fleet.listen:  # who is alone has nobody to join it
+        fleet = dataclasses.replace(fleet, listen=[f"tls/{EVERYWHERE}:{FLEET_PORT}"])
     return dataclasses.replace(
         settings,
+        fleet=fleet,
         video=dataclasses.replace(settings.video, host=EVERYWHERE),
         telemetry=dataclasses.replace(
             telemetry,
@@ -81,6 +86,27 @@ def on(settings: StationSettings, interface: str = "") -> StationSettings:
             discoverable=interface,
         ),
     )
+
+
+def joined(settings: StationSettings, stations: Sequence[str]) -> StationSettings:
+    """The settings of a station that joins others, given by HOST or HOST:PORT.
+
+    Raises `InputError` with one line for what is no address, or without certificates.
+    """
+    if not settings.telemetry.certificates:
+        raise InputError("--join: stations know each other by certificates; add --lan")
+    join = list(settings.fleet.join)
+    for station in stations:
+        host, colon, port = station.rpartition(":")
+        endpoint = (
+            f"tls/{host}:{port}" if colon and port.isdigit() else f"tls/{station}:{FLEET_PORT}"
+        )
+        try:
+            check_endpoint(endpoint, certified=True)
+        except TelemetryError:
+            raise InputError(f"--join {station!r:.60}: expected HOST or HOST:PORT") from None
+        join.append(endpoint)
+    return dataclasses.replace(settings, fleet=dataclasses.replace(settings.fleet, join=join))
 
 
 def announced(settings: StationSettings, interface: str) -> StationSettings:
@@ -98,6 +124,7 @@ def told(settings: StationSettings) -> str:
     _, port = check_endpoint(telemetry.listen[0], certified=True)
     payloads = [peer.partition(".")[2] for peer in held.peers]
     name = payloads[0] if len(payloads) == 1 else "NAME"
+    side = [station.partition(".")[2] for station in held.stations]
     return "\n".join(
         (
             f"station '{held.member}' on {telemetry.discoverable}, {address}: telemetry tcp {port}"
@@ -107,6 +134,7 @@ def told(settings: StationSettings) -> str:
             else "hears nobody yet: blimp keys payload NAME, then start this again",
             f"a payload's card: make flash DEVICE=/dev/sdX IMAGE=FILE PAYLOAD={name} WIFI=SSID"
             " COUNTRY=DE",
+            *([f"joined by {', '.join(side)}: blimp serve --lan --join {address}"] if side else []),
             "it finds this station by itself on the same network, or by"
             f" OPTIONS='--ground {address}' where multicast does not pass",
             f"nothing comes? blimp doctor --lan {telemetry.discoverable}"

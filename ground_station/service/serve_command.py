@@ -13,6 +13,7 @@ examples:
   blimp serve --demo                      # the sample flight, played by the real firmware
   blimp serve --map maps/hall
   blimp serve --map maps/hall --lan       # for payloads on the network, with `blimp keys`
+  blimp serve --lan --join 192.168.4.1    # and beside the station there: one page for all
   blimp serve --config station.toml --set http.port=8081
 
 The dashboard is at http://127.0.0.1:8080/ then; service/station.toml names every key."""
@@ -28,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--demo", action="store_true", help="play the sample flight, over loopback only"
     )
     add_lan_argument(parser)
+    parser.add_argument(
+        "--join", action="append", default=[], metavar="STATION",
+        help="address of another station of the same authority; each one's page shows the payloads"
+        " of both",
+    )  # fmt: skip
     parser.add_argument(
         "--check", action="store_true", help="check the configuration and what it names, and exit"
     )
@@ -49,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
         if args.demo:
             raise InputError("--demo plays over loopback only; leave out --demo or --lan")
         loaded = lan.announced(loaded, args.lan)
+    if args.join:
+        loaded = lan.joined(loaded, args.join)
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(
             loaded.map, folder=str(settings.SAMPLE), shelf=str(settings.SAMPLE.parent)

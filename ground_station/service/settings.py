@@ -25,6 +25,8 @@ SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 """The map that ships, with the flight that `--demo` plays as the payload `DEMO_PAYLOAD`."""
 DEMO_PAYLOAD = "demo"
 RUN_FILE = "station.json"
+FLEET_PORT = 7448
+"""Where other stations join."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,21 @@ class TelemetrySettings:
                 check_endpoint(endpoint, certified=bool(self.certificates))
             except TelemetryError as error:
                 raise ValueError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """Other stations of the same authority, which show each other's payloads."""
+
+    listen: list[str] = key([])
+    join: list[str] = key([])
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.join):
+            try:
+                check_endpoint(endpoint, certified=True)
+            except TelemetryError as error:
+                raise ValueError(str(error).replace("telemetry", "fleet", 1)) from None
 
 
 @dataclass(frozen=True)
@@ -138,8 +155,11 @@ class StationSettings:
     recording: RecordingSettings = table(RecordingSettings)
     http: HttpSettings = table(HttpSettings)
     foxglove: FoxgloveSettings = table(FoxgloveSettings)
+    fleet: FleetSettings = table(FleetSettings)
 
     def __post_init__(self) -> None:
+        if (self.fleet.listen or self.fleet.join) and not self.telemetry.certificates:
+            raise ValueError("'fleet' needs 'telemetry.certificates' (blimp keys); --lan sets them")
         try:
             for name in (self.name, *self.payloads.ids):
                 check_payload_id(name)

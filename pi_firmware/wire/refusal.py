@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from pi_firmware.wire import credentials
@@ -21,17 +22,23 @@ if TYPE_CHECKING:
 _LIMIT_S = 2.0
 _EXPIRED, _NOT_YET_VALID = 10, 9  # X509_V_ERR_*, openssl-verification-options(1)
 _ALERTS = {
-    "UNKNOWN_CA": "it does not trust the authority of this payload's certificate",
-    "BAD_CERTIFICATE": "it refuses this payload's certificate",
-    "CERTIFICATE_UNKNOWN": "it refuses this payload's certificate",
-    "CERTIFICATE_EXPIRED": "by its clock this payload's certificate has expired",
-    "DECRYPT_ERROR": "it refuses this payload's certificate",
+    "UNKNOWN_CA": "it does not trust the authority of this machine's certificate",
+    "BAD_CERTIFICATE": "it refuses this machine's certificate",
+    "CERTIFICATE_UNKNOWN": "it refuses this machine's certificate",
+    "CERTIFICATE_EXPIRED": "by its clock this machine's certificate has expired",
+    "DECRYPT_ERROR": "it refuses this machine's certificate",
 }
 
 
-def refusal(endpoint: str, held: credentials.Credentials, limit_s: float = _LIMIT_S) -> str:
+def refusal(
+    endpoint: str,
+    held: credentials.Credentials,
+    limit_s: float = _LIMIT_S,
+    peers: Sequence[str] | None = None,
+) -> str:
     """Why nobody can be spoken to at `tls/HOST:PORT`, in words; empty when nothing is wrong there.
 
+    `peers` are the names that may answer there, by default those that `held` talks to.
     A host that does not answer at all refuses nothing. Takes `limit_s` a step at most, and raises
     nothing but what reading our own certificates raises.
     """
@@ -42,7 +49,7 @@ def refusal(endpoint: str, held: credentials.Credentials, limit_s: float = _LIMI
     except OSError:
         return ""
     with plain:
-        why = _shake(plain, context, held)
+        why = _shake(plain, context, held.peers if peers is None else peers)
     return f"{endpoint}: {why}" if why else ""
 
 
@@ -56,21 +63,21 @@ def _context(held: credentials.Credentials) -> ssl.SSLContext:
     return context
 
 
-def _shake(plain: socket.socket, context: ssl.SSLContext, held: credentials.Credentials) -> str:
+def _shake(plain: socket.socket, context: ssl.SSLContext, peers: Sequence[str]) -> str:
     import ssl
 
     try:
         with context.wrap_socket(plain) as spoken:
             name = _common_name(spoken)
-            if name not in held.peers:
-                return f"its certificate is {name or 'nobody'}'s, who is not on this payload's list"
+            if name not in peers:
+                return f"its certificate is {name or 'nobody'}'s, who is not on this machine's list"
             with contextlib.suppress(TimeoutError):
                 spoken.recv(1)
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in (_EXPIRED, _NOT_YET_VALID):
             now = time.strftime("%Y-%m-%d", time.gmtime())
             when = "has expired" if error.verify_code == _EXPIRED else "is not valid yet"
-            return f"by this board's clock ({now}) its certificate {when}"
+            return f"by this machine's clock ({now}) its certificate {when}"
         return "its certificate is another authority's"
     except ssl.SSLError as error:
         reason = error.reason or ""

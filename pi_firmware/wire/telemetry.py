@@ -104,6 +104,8 @@ def open_session(
     scout: str = "",
     discoverable: str = "",
     client_timeout_s: float | None = None,
+    rules: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] = MappingProxyType({}),
 ) -> Session:
     """Opens a session that listens and connects at these endpoints, and nowhere else.
 
@@ -119,6 +121,9 @@ def open_session(
     within that time, and whoever that is hands on what it says to its own peers. Otherwise it is a
     peer, which speaks to those it is linked with and hands on nothing between them.
 
+    `rules` stand in place of those between payloads and ground stations (`credentials.Rules`), and
+    `more` of other settings of Zenoh's.
+
     A listening port 0 stands for any free one. A peer that is not there yet is tried again in the
     background. Raises `TelemetryError` with one line, for one when an endpoint is in use.
     """
@@ -131,15 +136,15 @@ def open_session(
         check_endpoint(endpoint, certified=held is not None)
     interface = scouting.check(scout, discoverable, listen, certified=held is not None)
     address = scouting.await_address(interface) if interface else ""
-    more: dict[str, Any] = {}
+    more = dict(more)
     if address:
-        more = scouting.settings(interface, look=bool(scout), answer=bool(discoverable))
+        more |= scouting.settings(interface, look=bool(scout), answer=bool(discoverable))
     if client_timeout_s is not None:
         more |= {"mode": "client", "connect/timeout_ms": round(1000 * client_timeout_s)}
     for attempt in range(_ATTEMPTS):
         endpoints = [_with_port(endpoint, held is not None) for endpoint in listen]
         try:
-            config = session_config(endpoints, connect, held, more)
+            config = session_config(endpoints, connect, held, more, rules)
             return Session(zenoh.open(config), tuple(endpoints), interface, address)
         except zenoh.ZError as error:
             in_use = "in use" in str(error)
@@ -186,6 +191,7 @@ def session_config(
     connect: Sequence[str],
     held: credentials.Credentials | None = None,
     more: Mapping[str, Any] = MappingProxyType({}),
+    rules: Mapping[str, Any] | None = None,
 ) -> Any:
     """The `zenoh.Config` of a session that listens and connects at these endpoints only.
 
@@ -207,7 +213,7 @@ def session_config(
     }
     settings |= more
     if held is not None:
-        settings |= credentials.tls_settings(held)
+        settings |= credentials.tls_settings(held, rules)
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config

@@ -148,7 +148,7 @@ def test_the_wrong_ones_hear_nothing_command_nothing_and_are_told_of_once(
             ("foreign", "its certificate is another authority's"),
             ("expired", "its certificate has expired"),
             ("bare", "speaks no TLS"),
-            ("unlisted", "is ground.later's, who is not on this payload's list"),
+            ("unlisted", "is ground.later's, who is not on this machine's list"),
         ):
             line = program.wait(where[name])
             assert line.startswith("pi_firmware: telemetry: ") and words in line, name
@@ -186,7 +186,7 @@ def test_a_ground_station_that_does_not_trust_us_is_told(
     held = credentials.load(folders["payload"])
     with TelemetryListener(["tls/127.0.0.1:0"], certificates=wary) as listener:
         why = refusal(listener.endpoints[0], held)
-    assert why.startswith(listener.endpoints[0]) and "this payload's certificate" in why
+    assert why.startswith(listener.endpoints[0]) and "this machine's certificate" in why
 
 
 def test_a_good_ground_station_refuses_nothing(folders: dict[str, Path]) -> None:

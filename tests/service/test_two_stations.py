@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import socket
+import struct
 from pathlib import Path
+from typing import Any
 
 from intake_stand import eventually
+from payload_process import free_port
 from standing import Service
+from websockets.sync.client import connect
 
 PAYLOAD = "blimp-1"
 _LIMIT_S = 90.0
@@ -15,6 +20,62 @@ _LIMIT_S = 90.0
 def alarms(service: Service) -> dict[str, str]:
     """What its alarms say, by id."""
     return {alarm["id"]: alarm["text"] for alarm in service.state()["alarms"]}
+
+
+def picture_of(service: Service, payload_id: str) -> dict[str, Any]:
+    """The header of the first picture that a viewer gets of a payload."""
+    url = f"{service.url.replace('http', 'ws')}/api/live?payload={payload_id}"
+    with connect(url) as socket:
+        while True:
+            message = socket.recv(_LIMIT_S)
+            if isinstance(message, bytes):
+                (length,) = struct.unpack(">I", message[:4])
+                return dict(json.loads(message[4 : 4 + length]))
+
+
+def test_stations_that_joined_show_each_others_payloads(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    first = Service(tmp_path / "first", f"fleet.listen={json.dumps([fleet])}")
+    second = Service(
+        tmp_path / "second",
+        f"fleet.join={json.dumps([fleet])}",
+        name="spare",
+        authority=first.authority,
+    )
+    with (
+        first,
+        second,
+        first.fly("blimp-1", tmp_path / "one", rate_hz=10.0),
+        second.fly("blimp-2", tmp_path / "two", rate_hz=10.0),
+    ):
+        pages = (first, second)
+        for page in pages:
+            for name in ("blimp-1", "blimp-2"):
+                eventually(lambda page=page, name=name: page.tracking(name), _LIMIT_S)
+        assert first.payload("blimp-2")["payload"]["station"] == "spare"
+        assert second.payload("blimp-1")["payload"]["relayed"] is True
+        assert first.payload("blimp-1")["payload"]["relayed"] is False
+        assert len(second.payload("blimp-1")["trail"]) > 0
+        assert picture_of(second, "blimp-1")["payload"] == "blimp-1"
+        (other,) = second.state()["fleet"]["stations"]
+        assert other["name"] == "main" and other["payloads"] == ["blimp-1"]
+        answer = second.client.post("/api/payloads/blimp-1/relocalize")
+        assert answer.json()["done"], answer.text
+
+        def told(page: Service) -> bool:
+            texts = [event["text"] for event in page.state()["events"]]
+            return any("relocalize was asked for at station 'spare'" in text for text in texts)
+
+        for page in pages:
+            eventually(lambda page=page: told(page), _LIMIT_S)
+        first.kill()
+        eventually(lambda: "station/main" in alarms(second), _LIMIT_S)
+        assert second.tracking("blimp-2")
+        first.start()
+        eventually(lambda: second.tracking("blimp-1"), _LIMIT_S)
+        eventually(lambda: "station/main" not in alarms(second), _LIMIT_S)
 
 
 def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) -> None:

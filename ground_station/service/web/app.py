@@ -20,6 +20,7 @@ from ground_station import __version__
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
+from ground_station.service.fleet import Fleet
 from ground_station.service.settings import Run
 from ground_station.service.web import (
     control,
@@ -93,9 +94,20 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     metrics = Metrics(snapshot)
     access = Access(settings.http, token)
 
-    def picture(payload_id: str, message: bytes) -> None:
-        with contextlib.suppress(RuntimeError):  # before the loop, or after it
+    def show(payload_id: str, message: bytes) -> None:
+        with contextlib.suppress(RuntimeError, IndexError):  # before the loop, or after it
             loops[0].call_soon_threadsafe(viewers.picture, payload_id, message)
+
+    fleet = None
+    if settings.fleet.listen or settings.fleet.join:
+        fleet = Fleet(settings, bus, __version__, show)
+        snapshot.fleet = fleet.document
+    hub = fleet or bus
+
+    def picture(payload_id: str, message: bytes) -> None:
+        show(payload_id, message)
+        if fleet is not None:
+            fleet.picture(payload_id, message)
 
     loops: list[asyncio.AbstractEventLoop] = []
     video = Video(folder, settings.http.video_rate_hz, settings.http.jpeg_quality, picture)
@@ -113,9 +125,9 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loops[:] = [asyncio.get_running_loop()]
-        snapshot.listen(bus)
+        snapshot.listen(hub)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, metrics.estimate)
-        viewers.listen(bus, loops[0])
+        viewers.listen(hub, loops[0])
         ticking = asyncio.create_task(viewers.tick())
         try:
             yield
@@ -123,6 +135,8 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
             ticking.cancel()
             video.close()
             job.close()
+            if fleet is not None:
+                fleet.close()
 
     app = FastAPI(
         title="Blimp ground station",
@@ -142,7 +156,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     )
     app.include_router(state.router(snapshot, metrics))
     app.include_router(maps.router(shelf))
-    app.include_router(control.router(control.Control(bus, snapshot), shelf))
+    app.include_router(control.router(control.Control(hub, snapshot), shelf))
     app.include_router(recordings.router(recorded))
     app.include_router(jobs.router(guide.Guide(settings, shelf, recorded), job, snapshot))
     app.include_router(live.router(viewers, access.sessions.holds))

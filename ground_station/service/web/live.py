@@ -20,6 +20,7 @@ from ground_station.service.bus_messages import (
     FrameMessage,
     RecordingMessage,
 )
+from ground_station.service.fleet import Fleet
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.metrics import Metrics
 from ground_station.service.web.snapshot import PAYLOADS, TEXT, Snapshot
@@ -53,11 +54,13 @@ class Live:
         self._alive: frozenset[str] = frozenset()
         self._job_ran = False
         self._say: Callable[[str, EventMessage], None] = lambda *_: None
+        self._fleet: Fleet | None = None
 
     # What the bus says
 
-    def listen(self, bus: Bus, loop: asyncio.AbstractEventLoop) -> None:
+    def listen(self, bus: Bus | Fleet, loop: asyncio.AbstractEventLoop) -> None:
         """Hears what viewers are told; the bus's threads only hand it over."""
+        self._fleet = bus if isinstance(bus, Fleet) else None
 
         def later(call: Callable[[str, Any], None]) -> Callable[[str, Any], None]:
             def hand_over(payload_id: str, note: Any) -> None:
@@ -131,6 +134,12 @@ class Live:
         judged = {**state, "events": self._snapshot.events()}
         self._alarms = alarms.judge(judged, time.time_ns(), before)
         state["alarms"] = alarms.documents(self._alarms)
+        if self._fleet is not None:
+            own = [standing.alarm for standing in self._alarms.values()]
+            cpu = sum(process["cpu"] for process in state["processes"])
+            self._fleet.tell(own, self._looked_at(), cpu)
+            state["alarms"] += self._fleet.alarms()
+            self._want()
         self._snapshot.set_alarms(state["alarms"])
         for name in self._alarms.keys() - before.keys():
             self._alarm(self._alarms[name].alarm, active=True)
@@ -253,8 +262,11 @@ class Live:
 
     def _want(self) -> None:
         if self.video is not None:
-            wanted = (v.payload_id for v in self._viewers if v.video and v.payload_id)
-            self.video.want(frozenset(wanted))
+            elsewhere = self._fleet.wanted() if self._fleet is not None else frozenset()
+            self.video.want(self._looked_at() | elsewhere)
+
+    def _looked_at(self) -> frozenset[str]:
+        return frozenset(v.payload_id for v in self._viewers if v.video and v.payload_id)
 
 
 def router(live: Live, holds: Callable[[str], bool]) -> APIRouter:

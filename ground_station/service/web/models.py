@@ -181,6 +181,28 @@ class AlarmModel(BaseModel):
     since_ns: int
 
 
+class OtherStationModel(BaseModel):
+    """Another station: its clock less this one's (`clock_s`), the payloads that fly with it."""
+
+    name: str
+    version: str
+    map: str
+    same_map: bool
+    cpu: float
+    age_s: float
+    clock_s: float
+    recording: bool
+    payloads: list[str]
+
+
+class FleetModel(BaseModel):
+    """The other stations; payloads of one name, and who was refused and why."""
+
+    stations: list[OtherStationModel]
+    twins: dict[str, str]
+    refused: list[str]
+
+
 class StateModel(BaseModel):
     """The whole station, now."""
 
@@ -193,6 +215,7 @@ class StateModel(BaseModel):
     events: list[EventModel]
     alarms: list[AlarmModel]
     job: JobModel | None
+    fleet: FleetModel | None = None
 
 
 class FloorPlanModel(BaseModel):

@@ -27,6 +27,7 @@ from ground_station.service.bus_messages import (
     ProcessMessage,
     RecordingMessage,
 )
+from ground_station.service.fleet import Fleet
 from ground_station.service.settings import Run
 from ground_station.service.web.access import is_loopback
 from ground_station.service.web.trail import Trail
@@ -97,9 +98,10 @@ class Snapshot:
         self._recording_ns = 0
         self._alarms: list[dict[str, Any]] = []
         self.job: Callable[[], dict[str, Any] | None] = lambda: None
+        self.fleet: Callable[[], dict[str, Any] | None] = lambda: None
         self._evicted: Callable[[str], None] = lambda _: None
 
-    def listen(self, bus: Bus) -> None:
+    def listen(self, bus: Bus | Fleet) -> None:
         """Hears everything on the bus."""
         bus.subscribe(bus_messages.FRAME, FrameMessage, self.frame)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self.estimate)
@@ -262,7 +264,7 @@ class Snapshot:
 
     def document(self, *, full: bool = True) -> dict[str, Any]:
         """The whole state as plain JSON values; short of trails, points and events if not full."""
-        job = self.job()
+        job, fleet = self.job(), self.fleet()
         with self._lock:
             now_ns = self._clock_ns()
             station = self.run.station
@@ -298,6 +300,7 @@ class Snapshot:
                 "recording_age_s": _age_s(now_ns, self._recording_ns if recording else None),
                 "alarms": list(self._alarms),
                 "job": job,
+                "fleet": fleet,
             }
             if full:
                 result["events"] = list(self._events)[-EVENTS_SHOWN:]

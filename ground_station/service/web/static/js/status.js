@@ -4,6 +4,7 @@ import { byId, fields, icon, make, setAttribute, setIcon, setText, show } from "
 import { clockTime, duration } from "./format.js";
 import { lookOf } from "./states.js";
 
+const OTHER_STALE_S = 3;
 const PATIENCE_MS = 1200; // a connection that is back sooner is not worth a banner
 
 export class Status {
@@ -25,8 +26,9 @@ export class Status {
   }
 
   drawStation() {
-    const { station } = this.store;
-    setText(byId("station-name"), station.name || "Ground station");
+    const { station, fleet } = this.store;
+    const others = (fleet?.stations ?? []).filter((other) => other.age_s < OTHER_STALE_S).map((other) => other.name);
+    setText(byId("station-name"), [station.name || "Ground station", ...others].join(" + "));
     show(byId("demo"), Boolean(station.demo));
     setText(byId("version"), station.version ? `Ground station ${station.version}` : "");
   }
@@ -59,10 +61,12 @@ export class Status {
       setAttribute(choice.node, "data-state", look.key);
       setAttribute(choice.node, "aria-checked", String(is_chosen));
       setAttribute(choice.node, "tabindex", is_chosen ? "0" : "-1");
-      setAttribute(choice.node, "aria-label", `${payload.id}, ${look.word}`);
-      setAttribute(choice.node, "title", `${payload.id}: ${look.word}`);
+      const at = payload.note?.relayed ? payload.note.station : "";
+      const words = `${look.word}${at ? `, with station ${at}` : ""}`;
+      setAttribute(choice.node, "aria-label", `${payload.id}, ${words}`);
+      setAttribute(choice.node, "title", `${payload.id}: ${words}`);
       setIcon(choice.icon, look.icon);
-      setText(choice.word, look.word);
+      setText(choice.word, at ? `${look.word} · ${at}` : look.word);
     }
     for (const [id, choice] of this.choices) {
       if (store.payloads.has(id)) continue;

@@ -85,6 +85,8 @@ export class Store {
     this.job = null;
     /** Where a recording is that is shown in place of the live flight. @type {{at_s: number, playing: boolean, rate: number}|null} */
     this.playback = null;
+    /** The stations that this one flies beside. @type {import("./types.js").Fleet|null} */
+    this.fleet = null;
     /** @type {any[]} */
     this.processes = [];
     /** @type {import("./connection.js").Status} */
@@ -126,6 +128,7 @@ export class Store {
   take(snapshot) {
     if (snapshot.station) {
       this.station = { ...this.station, ...snapshot.station };
+      this.fleet = snapshot.fleet ?? null;
       this.changed("station");
     }
     for (const [id, entry] of Object.entries(snapshot.payloads ?? {})) {

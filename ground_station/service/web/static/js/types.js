@@ -42,6 +42,8 @@
  * @property {Record<string, any>|null} [health]
  * @property {Record<string, any>|null} [autopilot]
  * @property {string} [recording]
+ * @property {string} [station] another one, which gets its video
+ * @property {boolean} [relayed] by that one, which shows it
  *
  * @typedef {object} Event
  * @property {number} time_ns
@@ -76,6 +78,9 @@
  * @property {boolean} [demo]
  * @property {boolean} [loopback] heard on its own computer only
  *
+ * @typedef {object} Fleet
+ * @property {{name: string, age_s: number, payloads: string[]}[]} stations the others
+ *
  * @typedef {object} PayloadEntry
  * @property {PayloadNote|null} [payload]
  * @property {Estimate|null} [estimate] without its points in a `state`
@@ -95,6 +100,7 @@
  * @property {Event[]} [events]
  * @property {Alarm[]} [alarms]
  * @property {Job|null} [job]
+ * @property {Fleet|null} [fleet]
  * @property {{at_s: number, playing: boolean, rate: number}} [playback]
  *
  * @typedef {object} VideoHeader

@@ -1,0 +1,484 @@
+"""Ground stations side by side: each one's page shows the payloads of all.
+
+A station tells the others, over mutual TLS, of the payloads that fly with it: what its bus says of
+them, the pictures that somebody elsewhere looks at, and its alarms. Nothing is decided in common:
+each flies on alone when the others go.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from ground_station.service import bus_messages
+from ground_station.service.alarms import Alarm
+from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    Message,
+    N,
+    PayloadMessage,
+    RecordingMessage,
+    WallTime,
+)
+from ground_station.service.settings import StationSettings
+from pi_firmware.wire import credentials
+from pi_firmware.wire.credentials import IN, OUT, SERVE
+from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.keys import check_payload_id
+from pi_firmware.wire.refusal import refusal
+from pi_firmware.wire.telemetry import open_session
+
+ROOT = "fleet"
+FRESH_S = 3.0
+"""Older than this a station's word says nothing of now."""
+_KEPT_S = 600.0
+_TELL_S = 0.5
+_SEEN_HZ, _WATCHED_HZ = 5.0, 15.0
+"""Poses of a payload that somebody elsewhere looks at go there more often, with its points."""
+_LOOK_S = 5.0
+_MESSAGE_BYTES = 512 * 1024
+_STATIONS, _PAYLOADS, _ALARMS, _WANTS = 32, 64, 64, 16
+_TIMEOUT_S = 6.0
+_INTAKE, _LOCALIZER = "intake", "localizer/"
+_COMMAND = "payload-command"
+_ASKED = "asked"
+
+Word = Annotated[str, Meta(max_length=128)]
+Take = Callable[[str, Any], None]
+
+
+@dataclass(frozen=True, slots=True)
+class StationMessage(Message):
+    """How a station is, twice a second.
+
+    `map_id` is made of its map's content, `cpu` the cores that it uses, `wants` the payloads whose
+    pictures are looked at there.
+    """
+
+    time_ns: WallTime
+    version: Word
+    map: Word
+    map_id: Word
+    cpu: float = 0.0
+    recording: RecordingMessage | None = None
+    alarms: Annotated[list[Alarm], Meta(max_length=_ALARMS)] = field(default_factory=list)
+    wants: Annotated[list[Word], Meta(max_length=_WANTS)] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Other:
+    said: StationMessage
+    came_s: float
+    clock_s: float
+    """Its clock less ours, and what the message took."""
+
+
+_TOLD: dict[str, type[Message]] = {
+    bus_messages.PAYLOAD: PayloadMessage,
+    bus_messages.ESTIMATE: EstimateMessage,
+    bus_messages.EVENT: EventMessage,
+}
+_STATION, _PICTURE = "station", "picture"
+
+
+def map_id(folder: Path) -> str:
+    """Tells a map from another of the same name: its files' names and sizes, its `map.toml`."""
+    found = hashlib.sha256()
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.iterdir()):
+            if path.is_file() and path.suffix != ".mcap":
+                found.update(f"{path.name} {path.stat().st_size}\n".encode())
+        found.update((folder / "map.toml").read_bytes())
+    return found.hexdigest()[:16]
+
+
+def rules(held: credentials.Credentials) -> dict[str, Any]:
+    """Zenoh's `access_control` between stations: each speaks under its own name only."""
+    result = credentials.Rules()
+    ours, every = [f"{ROOT}/{held.member}/**"], [f"{ROOT}/*/**"]
+    for station in held.stations:
+        theirs = [f"{ROOT}/{station.partition('.')[2]}/**"]
+        result.allow(
+            station,
+            [
+                ("told", OUT, ["put", *SERVE], ours),
+                ("tells", IN, ["put", *SERVE], theirs),
+                ("heard", OUT + IN, ["declare_subscriber"], every),
+                ("asks", OUT, ["query"], theirs),
+                ("asked", IN, ["query"], ours),
+            ],
+        )
+    return result.document()
+
+
+class Fleet:
+    """A station's place among the others; what it hears of them it hands on as its own bus does.
+
+    Takes the bus's place for whoever shows payloads: `subscribe`, `publish` and `query` are meant
+    for those that fly elsewhere, too. Safe from any thread. Raises a `BlimpError` with one line
+    when its endpoints or certificates cannot be used.
+    """
+
+    def __init__(
+        self,
+        settings: StationSettings,
+        bus: Bus,
+        version: str,
+        on_picture: Callable[[str, bytes], None] = lambda *_: None,
+    ) -> None:
+        self.name = settings.name
+        self._bus, self._version, self._on_picture = bus, version, on_picture
+        self._map = Path(settings.map.folder)
+        self._map_id = map_id(self._map)
+        self._lock = threading.Lock()
+        self._takes: dict[str, list[Take]] = {kind: [] for kind in _TOLD}
+        self._here: dict[str, tuple[float, PayloadMessage]] = {}
+        self._away: dict[str, tuple[str, float]] = {}
+        self._twins: dict[str, tuple[str, float]] = {}
+        self._others: dict[str, _Other] = {}
+        self._recording: RecordingMessage | None = None
+        self._due_s: dict[str, float] = {}
+        self._wants: frozenset[str] = frozenset()
+        self._refused: dict[str, str] = {}
+        self._join = tuple(settings.fleet.join)
+        self._held = credentials.load(settings.telemetry.certificates)
+        self._session = open_session(
+            listen=settings.fleet.listen,
+            connect=settings.fleet.join,
+            certificates=settings.telemetry.certificates,
+            rules=rules(self._held),
+            more={
+                "scouting/gossip/enabled": True,  # who joins one finds the others through it
+                "transport/link/rx/max_message_size": _MESSAGE_BYTES,
+            },
+        )
+        self.listening = self._session.listening
+        self._hears = [self._hear(f"{ROOT}/*/{kind}/*") for kind in (_STATION, *_TOLD)]
+        self._serves = self._session.zenoh.declare_queryable(
+            f"{ROOT}/{self.name}/do/**", self._asked
+        )
+        self._watched: dict[str, Any] = {}
+        bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._own_payload)
+        bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._own_estimate)
+        bus.subscribe(bus_messages.EVENT, EventMessage, self._own_event)
+        bus.subscribe(bus_messages.RECORDING, RecordingMessage, self._own_recording)
+        self._closing = threading.Event()
+        self._looking = threading.Thread(target=self._look, name="fleet", daemon=True)
+        self._looking.start()
+
+    def close(self) -> None:
+        """Leaves the others."""
+        self._closing.set()
+        self._session.close()
+        self._looking.join(1.0)
+
+    # As the bus
+
+    def subscribe(self, kind: str, of: type[N], take: Callable[[str, N], None]) -> None:
+        """Calls `take` with each message of a kind, of payloads here and elsewhere."""
+        if kind == bus_messages.PAYLOAD:
+            self._bus.subscribe(
+                kind, of, lambda name, note: None if self._told_of(name) else take(name, note)
+            )
+        else:
+            self._bus.subscribe(kind, of, take)
+        if kind in self._takes:
+            self._takes[kind].append(take)
+
+    def publish(self, kind: str, payload_id: str, message: Message) -> None:
+        """Tells this station's processes."""
+        self._bus.publish(kind, payload_id, message)
+
+    def query(
+        self, name: str, request: Mapping[str, Any], timeout_s: float = _TIMEOUT_S
+    ) -> Mapping[str, Any]:
+        """Asks a process of this station, or of the one that the payload in question flies with."""
+        payload_id = _payload_of(name, request)
+        station = self._told_of(payload_id)
+        if not station:
+            answer = self._bus.query(name, request, timeout_s=timeout_s)
+            if payload_id:
+                self._say(payload_id, f"{_what(request)} was asked for at station '{self.name}'")
+            return answer
+        body = json.dumps({"by": self.name, "request": request}).encode()
+        key = f"{ROOT}/{station}/do/{name}"
+        with contextlib.suppress(Exception):
+            for reply in self._session.zenoh.get(key, payload=body, timeout=timeout_s):
+                if reply.ok is not None:
+                    answer = json.loads(reply.ok.payload.to_bytes())
+                    if isinstance(answer, dict):
+                        return {"done": False, "reason": "", **answer}
+        return {"done": False, "reason": f"station '{station}' did not answer"}
+
+    # What this station's page adds
+
+    def tell(self, alarms: list[Alarm], wants: frozenset[str], cpu: float) -> None:
+        """Tells the others how this station is; to be called at least twice a second."""
+        now_s = time.monotonic()
+        if now_s < self._due_s.get("", 0.0):
+            return
+        self._due_s[""] = now_s + _TELL_S
+        with self._lock:
+            away = {name: self._flown(name, now_s) for name in sorted(wants)[:_WANTS]}
+        self._watch({f"{ROOT}/{at}/{_PICTURE}/{name}" for name, at in away.items() if at})
+        said = StationMessage(
+            time_ns=time.time_ns(),
+            version=self._version,
+            map=self._map.name[:128],
+            map_id=self._map_id,
+            cpu=round(cpu, 2),
+            recording=self._recording,
+            alarms=alarms[:_ALARMS],
+            wants=[name for name, at in away.items() if at],
+        )
+        self._put(_STATION, bus_messages.STATION, bus_messages.encode(said))
+
+    def picture(self, payload_id: str, message: bytes) -> None:
+        """A picture of a payload that flies here; it goes to those who look at it elsewhere."""
+        if payload_id in self.wanted() and len(message) < _MESSAGE_BYTES:
+            self._put(_PICTURE, payload_id, message)
+
+    def wanted(self) -> frozenset[str]:
+        """The payloads here whose pictures are looked at elsewhere."""
+        now_s = time.monotonic()
+        with self._lock:
+            return frozenset(
+                name
+                for other in self._others.values()
+                if now_s - other.came_s < FRESH_S
+                for name in other.said.wants
+                if self._flies_here(name, now_s)
+            )
+
+    def document(self) -> dict[str, Any]:
+        """The other stations, and what is wrong between them, as plain values."""
+        now_s = time.monotonic()
+        with self._lock:
+            flown = {name: self._flown(name, now_s) for name in self._away}
+            return {
+                "stations": [
+                    {
+                        "name": name,
+                        "version": other.said.version,
+                        "map": other.said.map,
+                        "same_map": other.said.map_id == self._map_id,
+                        "cpu": other.said.cpu,
+                        "age_s": round(now_s - other.came_s, 1),
+                        "clock_s": round(other.clock_s, 2),
+                        "recording": bool(other.said.recording and other.said.recording.active),
+                        "payloads": sorted(one for one, where in flown.items() if where == name),
+                    }
+                    for name, other in sorted(self._others.items())
+                ],
+                "twins": {
+                    name: station
+                    for name, (station, at_s) in self._twins.items()
+                    if now_s - at_s < FRESH_S
+                },
+                "refused": sorted(self._refused.values()),
+            }
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """The alarms of the other stations and of the payloads that fly with them."""
+        now_s = time.monotonic()
+        with self._lock:
+            return [
+                {
+                    **dataclasses.asdict(alarm),
+                    "id": f"{name}/{alarm.id}",
+                    "text": f"{alarm.text} (station '{name}')",
+                }
+                for name, other in sorted(self._others.items())
+                if now_s - other.came_s < FRESH_S
+                for alarm in other.said.alarms
+                if alarm.payload == bus_messages.STATION
+                or self._flown(alarm.payload, now_s) == name
+            ]
+
+    # This station's bus
+
+    def _own_payload(self, payload_id: str, note: PayloadMessage) -> None:
+        with self._lock:
+            self._here[payload_id] = (time.monotonic(), note)
+        if note.alive and not note.station:
+            self._put(bus_messages.PAYLOAD, payload_id, bus_messages.encode(note))
+
+    def _own_estimate(self, payload_id: str, note: EstimateMessage) -> None:
+        watched = payload_id in self.wanted()
+        now_s = time.monotonic()
+        period_s = 1.0 / (_WATCHED_HZ if watched else _SEEN_HZ)
+        due_s = self._due_s.get(payload_id, 0.0)
+        if now_s < due_s - period_s / 4:
+            return
+        self._due_s[payload_id] = max(due_s, now_s - period_s) + period_s
+        if not watched:
+            note = dataclasses.replace(note, points_px=[])
+        self._put(bus_messages.ESTIMATE, payload_id, bus_messages.encode(note))
+
+    def _own_event(self, payload_id: str, note: EventMessage) -> None:
+        # What payloads say is heard everywhere, alarms are told as long as they stand.
+        if note.source != "payload" and not note.name.startswith("alarm-"):
+            self._put(bus_messages.EVENT, payload_id, bus_messages.encode(note))
+
+    def _own_recording(self, _: str, note: RecordingMessage) -> None:
+        self._recording = note
+
+    def _put(self, kind: str, payload_id: str, data: bytes) -> None:
+        with contextlib.suppress(Exception):  # of a session that is being closed
+            self._session.zenoh.put(f"{ROOT}/{self.name}/{kind}/{payload_id}", data)
+
+    def _flies_here(self, payload_id: str, now_s: float) -> bool:
+        """Call it with the lock held."""
+        came_s, note = self._here.get(payload_id, (float("-inf"), None))
+        return note is not None and now_s - came_s < FRESH_S and note.alive and not note.station
+
+    def _told_of(self, payload_id: str) -> str:
+        """The station that a payload flies with, as that one says; "" for here or nowhere."""
+        with self._lock:
+            return self._flown(payload_id, time.monotonic())
+
+    def _flown(self, payload_id: str, now_s: float) -> str:
+        station, at_s = self._away.get(payload_id, ("", float("-inf")))
+        here = self._flies_here(payload_id, now_s)
+        return station if now_s - at_s < FRESH_S and not here else ""
+
+    # The other stations
+
+    def _hear(self, key: str) -> Any:
+        import zenoh
+
+        return self._session.zenoh.declare_subscriber(
+            key, self._heard, allowed_origin=zenoh.Locality.REMOTE
+        )
+
+    def _watch(self, keys: set[str]) -> None:
+        """Hears the pictures of these keys, and of no others."""
+        with contextlib.suppress(Exception):  # of a session that is being closed
+            for key in self._watched.keys() - keys:
+                self._watched.pop(key).undeclare()
+            for key in keys - self._watched.keys():
+                self._watched[key] = self._hear(key)
+
+    def _heard(self, sample: Any) -> None:
+        _, station, kind, payload_id = str(sample.key_expr).split("/")
+        try:
+            if payload_id != bus_messages.STATION:
+                check_payload_id(payload_id)
+            self._take(station, kind, payload_id, sample.payload.to_bytes())
+        except BlimpError:
+            self._bus.dropped += 1
+
+    def _take(self, station: str, kind: str, payload_id: str, data: bytes) -> None:
+        now_s = time.monotonic()
+        if kind == _STATION:
+            said = bus_messages.decode(StationMessage, data)
+            clock_s = 1e-9 * (said.time_ns - time.time_ns())
+            with self._lock:
+                if station in self._others or len(self._others) < _STATIONS:
+                    self._others[station] = _Other(said, now_s, clock_s)
+        elif kind == _PICTURE:
+            if self._told_of(payload_id) == station:
+                self._on_picture(payload_id, data)
+        elif kind in _TOLD:
+            note: Any = bus_messages.decode(_TOLD[kind], data)
+            if kind == bus_messages.PAYLOAD:
+                if note.station or not self._takes_up(station, payload_id, note, now_s):
+                    return
+                note = dataclasses.replace(note, station=station, relayed=True)
+            elif kind == bus_messages.EVENT:
+                note = dataclasses.replace(note, text=f"{note.text} (station '{station}')")
+            elif self._told_of(payload_id) != station or not self._same_map(station):
+                return
+            for take in self._takes[kind]:
+                take(payload_id, note)
+
+    def _takes_up(self, station: str, payload_id: str, note: PayloadMessage, now_s: float) -> bool:
+        """Whether a payload is another station's; one that flies here, too, is two of one name."""
+        with self._lock:
+            if self._flies_here(payload_id, now_s):
+                own = self._here[payload_id][1]
+                if own.rate_hz > 0 and note.rate_hz > 0 and own.ssrc != note.ssrc:
+                    self._twins[payload_id] = (station, now_s)
+                return False
+            before, at_s = self._away.get(payload_id, (station, now_s))
+            if before != station and now_s - at_s < FRESH_S and note.rate_hz <= 0:
+                return False  # it has just gone from there
+            if payload_id not in self._away and len(self._away) >= _PAYLOADS:
+                self._away = {n: one for n, one in self._away.items() if self._flown(n, now_s)}
+                if len(self._away) >= _PAYLOADS:
+                    return False
+            self._away[payload_id] = (station, now_s)
+        return True
+
+    def _same_map(self, station: str) -> bool:
+        with self._lock:
+            other = self._others.get(station)
+        return other is not None and other.said.map_id == self._map_id
+
+    def _asked(self, query: Any) -> None:
+        """Another station's operator asks something of a payload that flies here."""
+        name = str(query.key_expr).split("/do/", 1)[-1]
+        answer: Mapping[str, Any] = {"done": False, "reason": "that can only be asked for there"}
+        with contextlib.suppress(Exception):  # what is no question gets that answer
+            body = json.loads(query.payload.to_bytes())
+            request, by = dict(body["request"]), check_payload_id(str(body["by"]))
+            payload_id = _payload_of(name, request)
+            if payload_id:
+                answer = self._bus.query(name, request, timeout_s=_TIMEOUT_S)
+                self._say(payload_id, f"{_what(request)} was asked for at station '{by}'")
+        with contextlib.suppress(Exception):  # whoever asked may be gone
+            query.reply(query.key_expr, json.dumps(answer).encode())
+
+    def _say(self, payload_id: str, text: str) -> None:
+        note = EventMessage(time.time_ns(), "web", bus_messages.INFO, _ASKED, text)
+        with contextlib.suppress(Exception):  # the bus may be what fails
+            self._bus.publish(bus_messages.EVENT, payload_id, note)
+
+    def _look(self) -> None:
+        """Finds out who is refused, here and there: Zenoh does not say."""
+        while not self._closing.wait(_LOOK_S):
+            refused = {}
+            try:
+                linked = {str(link.auth_identifier) for link in self._session.zenoh.info.links()}
+                for name in linked - set(self._held.stations) - {"None", ""}:
+                    refused[name] = (
+                        f"{name} wants to join and is not on this station's list: revoked, or newer"
+                        " than these keys"
+                    )
+                if not linked & set(self._held.stations):
+                    for endpoint in self._join:
+                        if why := refusal(endpoint, self._held, peers=self._held.stations):
+                            refused[endpoint] = why
+            except Exception:  # a session that is being closed
+                continue
+            with self._lock:
+                self._refused = refused
+                now_s = time.monotonic()
+                gone = [n for n, other in self._others.items() if now_s - other.came_s > _KEPT_S]
+                for name in gone:
+                    del self._others[name]
+
+
+def _payload_of(name: str, request: Mapping[str, Any]) -> str:
+    """The payload that a question is about; "" for one about the station itself."""
+    if name.startswith(_LOCALIZER):
+        return name.removeprefix(_LOCALIZER)
+    if name == _INTAKE and request.get("do") == _COMMAND:
+        return str(request.get("payload"))
+    return ""
+
+
+def _what(request: Mapping[str, Any]) -> str:
+    return str(request.get("name") if request.get("do") == _COMMAND else request.get("do"))[:40]

@@ -1,0 +1,272 @@
+"""Stations side by side: what each hears of the others, and who is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from intake_stand import eventually
+
+from ground_station.keys.authority import Authority
+from ground_station.service import bus_messages, settings
+from ground_station.service.bus import Bus, Router
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, PayloadMessage
+from ground_station.service.fleet import Fleet, map_id
+from ground_station.service.settings import SAMPLE
+
+BLIMP = "blimp-1"
+HERE = PayloadMessage(alive=True, seen_ns=1, ssrc=4, rate_hz=10.0)
+POSE = EstimateMessage(
+    sequence=1, time_ns=1, clock_ns=1, done_ns=1, state="TRACKING", map="atrium",
+    position_m=[1.0, 2.0, 3.0], points_px=[1.0, 2.0],
+)  # fmt: skip
+
+
+class Station:
+    """A station's bus with its place among the others, and what these were heard to say."""
+
+    def __init__(
+        self, folder: Path, authority: Authority, name: str, *join: str, more: tuple[str, ...] = ()
+    ) -> None:
+        self.stack = ExitStack()
+        (folder / name).mkdir()
+        router = Router(folder / name)
+        self.stack.callback(router.close)
+        web = self.stack.enter_context(Bus(folder / name, "web"))
+        self.bus = self.stack.enter_context(Bus(folder / name, "intake"))
+        self.heard: list[tuple[str, str, Any]] = []
+        self.pictures: list[tuple[str, bytes]] = []
+        chosen = settings.load(
+            None,
+            [
+                f"name={name}", f"map.folder={SAMPLE}",
+                f"telemetry.certificates={authority.of(f'ground.{name}')}",
+                'telemetry.listen=["tls/127.0.0.1:0"]', 'fleet.listen=["tls/127.0.0.1:0"]',
+                f"fleet.join={json.dumps(join)}", *more,
+            ],
+        )  # fmt: skip
+        self.web = web
+        self.fleet = Fleet(chosen, web, "1.2.3", lambda *seen: self.pictures.append(seen))
+        self.stack.callback(self.fleet.close)
+        for kind, of in (
+            (bus_messages.PAYLOAD, PayloadMessage),
+            (bus_messages.ESTIMATE, EstimateMessage),
+            (bus_messages.EVENT, EventMessage),
+        ):
+            self.fleet.subscribe(
+                kind, of, lambda name, note, kind=kind: self.heard.append((kind, name, note))
+            )
+        self.endpoint = self.fleet.listening[0]
+
+    def tell(self, *wants: str) -> None:
+        """As its page does four times a second."""
+        self.fleet.tell([], frozenset(wants), 0.5)
+
+    def others(self) -> list[str]:
+        return [other["name"] for other in self.fleet.document()["stations"]]
+
+    def last(self, kind: str) -> Any:
+        return next((note for one, _, note in reversed(self.heard) if one == kind), None)
+
+
+@pytest.fixture
+def stations(tmp_path: Path) -> Iterator[Any]:
+    """Makes stations of one authority, which live to the test's end."""
+    authority = Authority.create(tmp_path / "keys")
+    for name in ("hall", "attic", "yard"):
+        authority.add("ground", name)
+    with ExitStack() as stack:
+
+        def make(name: str, *join: str, **more: Any) -> Station:
+            station = Station(tmp_path, more.pop("authority", authority), name, *join, **more)
+            stack.enter_context(station.stack)
+            return station
+
+        make.authority = authority  # type: ignore[attr-defined]
+        yield make
+
+
+def acquainted(*stations: Station) -> bool:
+    for station in stations:
+        station.tell()
+    return all(len(station.others()) == len(stations) - 1 for station in stations)
+
+
+def test_a_payload_that_flies_elsewhere_is_seen_here(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, PayloadMessage(True, 1, station="hall"))
+
+    def told() -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.bus.publish(bus_messages.ESTIMATE, BLIMP, POSE)
+        note = attic.last(bus_messages.PAYLOAD)
+        return note is not None and note.relayed and attic.last(bus_messages.ESTIMATE) is not None
+
+    eventually(told, 10.0)
+    assert attic.last(bus_messages.PAYLOAD).station == "hall"
+    pose = attic.last(bus_messages.ESTIMATE)
+    assert pose.position_m == POSE.position_m and pose.points_px == []  # nobody looks at it there
+    assert not hall.last(bus_messages.PAYLOAD).relayed
+    (other,) = attic.fleet.document()["stations"]
+    assert other["payloads"] == [BLIMP] and other["same_map"] and abs(other["clock_s"]) < 5.0
+    hall.bus.publish(bus_messages.EVENT, "-", EventMessage(1, "intake", "info", "said", "a word"))
+    eventually(lambda: attic.last(bus_messages.EVENT) is not None, 10.0)
+    assert attic.last(bus_messages.EVENT).text == "a word (station 'hall')"
+    # What its own bus says of it, less, is not shown in between.
+    before = len(attic.heard)
+    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, PayloadMessage(True, 1, station="hall"))
+    hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    eventually(lambda: len(attic.heard) > before, 10.0)
+    assert all(note.relayed for kind, _, note in attic.heard[before:] if kind == "payload")
+
+
+def test_pictures_cross_only_while_somebody_looks(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+
+    def shown(*wants: str) -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        attic.tell(*wants)
+        hall.fleet.picture(BLIMP, b"JPEG")
+        return bool(attic.pictures)
+
+    for _ in range(20):
+        assert not shown()
+    assert hall.fleet.wanted() == frozenset()
+    eventually(lambda: shown(BLIMP), 10.0)
+    assert attic.pictures[0] == (BLIMP, b"JPEG") and hall.fleet.wanted() == {BLIMP}
+
+
+def test_commands_go_to_the_station_that_has_the_payload_and_all_are_told(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    asked = []
+    hall.bus.serve(f"localizer/{BLIMP}", lambda request: {"values": asked.append(request) or {}})
+    hall.bus.serve("intake", lambda request: {"values": asked.append(request) or {}})
+
+    def there() -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        return attic.last(bus_messages.PAYLOAD) is not None
+
+    eventually(there, 10.0)
+    answer = attic.fleet.query(f"localizer/{BLIMP}", {"do": "relocalize"})
+    assert answer["done"] and asked == [{"do": "relocalize"}]
+    command = {"do": "payload-command", "payload": BLIMP, "name": "idr", "arguments": {}}
+    assert attic.fleet.query("intake", command)["done"] and asked[-1] == command
+    eventually(lambda: "idr was asked" in str(attic.last(bus_messages.EVENT)), 10.0)
+    said = "idr was asked for at station 'attic'"
+    eventually(lambda: said in str(hall.last(bus_messages.EVENT)), 10.0)
+    # A station's own recording is its own.
+    key, body = (
+        "fleet/hall/do/intake",
+        json.dumps({"by": "attic", "request": {"do": "record-stop"}}),
+    )
+    (reply,) = attic.fleet._session.zenoh.get(key, payload=body.encode(), timeout=5.0)
+    assert json.loads(reply.ok.payload.to_bytes())["done"] is False and len(asked) == 2
+
+
+def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    twin = PayloadMessage(alive=True, seen_ns=1, ssrc=9, rate_hz=10.0)
+
+    def found() -> bool:
+        attic.bus.publish(bus_messages.PAYLOAD, BLIMP, twin)
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        return bool(attic.fleet.document()["twins"])
+
+    eventually(found, 10.0)
+    assert attic.fleet.document()["twins"] == {BLIMP: "hall"}
+    assert not any(note.relayed for kind, _, note in attic.heard if kind == "payload")
+
+
+def test_poses_in_another_map_are_not_taken(stations: Any, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "map.toml").write_bytes((SAMPLE / "map.toml").read_bytes() + b"\n")
+    assert map_id(other) != map_id(SAMPLE)
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint, more=(f"map.folder={other}",))
+    eventually(lambda: acquainted(hall, attic), 20.0)
+
+    def told() -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.bus.publish(bus_messages.ESTIMATE, BLIMP, POSE)
+        return len([1 for kind, _, _ in attic.heard if kind == "payload"]) > 3
+
+    eventually(told, 10.0)
+    assert attic.last(bus_messages.ESTIMATE) is None
+    assert attic.fleet.document()["stations"][0]["same_map"] is False
+
+
+def test_a_third_station_is_found_through_the_first_and_stays_when_that_goes(stations: Any) -> None:
+    hall = stations("hall")
+    attic, yard = (stations(name, hall.endpoint) for name in ("attic", "yard"))
+    eventually(lambda: acquainted(hall, attic, yard), 30.0)
+    hall.stack.close()
+    attic.heard.clear()
+
+    def told() -> bool:
+        yard.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        note = attic.last(bus_messages.PAYLOAD)
+        return note is not None and note.station == "yard"
+
+    eventually(told, 10.0)
+
+
+def test_whoever_is_revoked_or_foreign_is_refused_and_named(stations: Any, tmp_path: Path) -> None:
+    hall = stations("hall")
+    foreign = Authority.create(tmp_path / "foreign")
+    foreign.add("ground", "spy")
+    foreign.add("ground", "hall")
+    spy = stations("spy", hall.endpoint, authority=foreign)
+    eventually(lambda: spy.fleet.document()["refused"], 30.0)
+    assert "authority" in spy.fleet.document()["refused"][0]
+    yard = stations("yard", hall.endpoint)  # before the list of the first says that it is revoked
+    yard.stack.close()
+    stations.authority.revoke("ground.yard")
+    later = stations("attic")  # started after that
+    kept = tmp_path / "keys" / "revoked" / "ground.yard"
+    shutil.copytree(kept, tmp_path / "copied" / "ground" / "yard")
+
+    class Copied:
+        def of(self, name: str) -> Path:
+            return tmp_path / "copied" / "ground" / "yard"
+
+    (tmp_path / "yard").rename(tmp_path / "yard-before")
+    gone = stations("yard", later.endpoint, authority=Copied())
+
+    def said() -> bool:
+        gone.tell()
+        gone.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        return bool(later.fleet.document()["refused"])
+
+    eventually(said, 30.0)
+    assert "ground.yard" in later.fleet.document()["refused"][0]
+    assert later.others() == [] and later.heard == [] and gone.others() == []
+
+
+def test_what_is_no_message_is_counted_and_dropped(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    session = hall.fleet._session.zenoh
+    for k in range(100):
+        session.put(f"fleet/hall/payload/blimp-{k}", bus_messages.encode(HERE))
+    for kind, name in (("station", "-"), ("payload", BLIMP), ("estimate", BLIMP), ("event", "X!")):
+        session.put(f"fleet/hall/{kind}/{name}", b'{"alarms": 1')
+    session.put("fleet/attic/payload/blimp-1", bus_messages.encode(HERE))  # in another's name
+    eventually(lambda: attic.web.dropped >= 4, 10.0)
+    taken = {name for kind, name, _ in attic.heard if kind == "payload"}
+    assert 0 < len(taken) <= 64 and acquainted(hall, attic)
+    assert all(note.station == "hall" for kind, _, note in attic.heard if kind == "payload")
