@@ -13,19 +13,21 @@ import hashlib
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from msgspec import Meta
 
+from ground_station.errors import GroundStationError
 from ground_station.service import bus_messages
 from ground_station.service.alarms import Alarm
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import (
     EstimateMessage,
     EventMessage,
+    Level,
     Message,
     N,
     PayloadMessage,
@@ -54,6 +56,9 @@ _TIMEOUT_S = 6.0
 _INTAKE, _LOCALIZER = "intake", "localizer/"
 _COMMAND = "payload-command"
 _ASKED = "asked"
+_RECORDINGS, _LISTED, _PIECE_BYTES = "recordings", 500, 256 * 1024
+_MOVED_S = 30.0
+"""A payload that came from another station no longer ago than this goes on being recorded."""
 
 Word = Annotated[str, Meta(max_length=128)]
 Take = Callable[[str, Any], None]
@@ -123,6 +128,16 @@ def rules(held: credentials.Credentials) -> dict[str, Any]:
     return result.document()
 
 
+class Shelf(Protocol):
+    """A station's recordings."""
+
+    def list(self) -> list[dict[str, Any]]: ...
+
+    def size(self, name: str) -> int: ...
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]: ...
+
+
 class Fleet:
     """A station's place among the others; what it hears of them it hands on as its own bus does.
 
@@ -149,8 +164,9 @@ class Fleet:
         self._twins: dict[str, tuple[str, float]] = {}
         self._others: dict[str, _Other] = {}
         self._recording: RecordingMessage | None = None
+        self.shelf: Shelf | None = None
+        """This station's recordings, for the others."""
         self._due_s: dict[str, float] = {}
-        self._wants: frozenset[str] = frozenset()
         self._refused: dict[str, str] = {}
         self._join = tuple(settings.fleet.join)
         self._held = credentials.load(settings.telemetry.certificates)
@@ -212,15 +228,33 @@ class Fleet:
             if payload_id:
                 self._say(payload_id, f"{_what(request)} was asked for at station '{self.name}'")
             return answer
-        body = json.dumps({"by": self.name, "request": request}).encode()
-        key = f"{ROOT}/{station}/do/{name}"
-        with contextlib.suppress(Exception):
-            for reply in self._session.zenoh.get(key, payload=body, timeout=timeout_s):
-                if reply.ok is not None:
-                    answer = json.loads(reply.ok.payload.to_bytes())
-                    if isinstance(answer, dict):
-                        return {"done": False, "reason": "", **answer}
+        with contextlib.suppress(ValueError):
+            answer = json.loads(self._ask(station, name, request, timeout_s))
+            if isinstance(answer, dict):
+                return {"done": False, "reason": "", **answer}
         return {"done": False, "reason": f"station '{station}' did not answer"}
+
+    def _ask(
+        self, station: str, name: str, request: Mapping[str, Any], timeout_s: float = _TIMEOUT_S
+    ) -> bytes:
+        """What another station answers at a name; empty without an answer in time."""
+        body = json.dumps({"by": self.name, "request": request}).encode()
+        with contextlib.suppress(Exception):
+            for reply in self._session.zenoh.get(
+                f"{ROOT}/{station}/do/{name}", payload=body, timeout=timeout_s
+            ):
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+        return b""
+
+    def knows(self, station: str) -> bool:
+        """Whether a station flies beside this one."""
+        with self._lock:
+            return station in self._others
+
+    def shelf_of(self, station: str) -> Shelf:
+        """The recordings of another station, read from there."""
+        return _Elsewhere(lambda request: self._ask(station, _RECORDINGS, request), station)
 
     # What this station's page adds
 
@@ -312,8 +346,37 @@ class Fleet:
     def _own_payload(self, payload_id: str, note: PayloadMessage) -> None:
         with self._lock:
             self._here[payload_id] = (time.monotonic(), note)
+            if note.rate_hz > 0 and self._flies_here(payload_id, time.monotonic()):
+                before = self._recorded_before(payload_id)
+                self._away.pop(payload_id, None)
+            else:
+                before = ""
+        if before and not (self._recording and self._recording.active):
+            threading.Thread(target=self._record, args=(payload_id, before), daemon=True).start()
         if note.alive and not note.station:
             self._put(bus_messages.PAYLOAD, payload_id, bus_messages.encode(note))
+
+    def _recorded_before(self, payload_id: str) -> str:
+        """STATION/FILE that a payload was recorded in until it came here; "" for none.
+
+        Call it with the lock held.
+        """
+        station, at_s = self._away.get(payload_id, ("", 0.0))
+        other = self._others.get(station)
+        if other is None or time.monotonic() - at_s > _MOVED_S:
+            return ""
+        recording = other.said.recording
+        return f"{station}/{recording.file}" if recording and recording.active else ""
+
+    def _record(self, payload_id: str, before: str) -> None:
+        """A flight that was recorded where it was goes on being recorded."""
+        answer = self._bus.query(_INTAKE, {"do": "record-start", "after": before})
+        text = f"it was recorded as {before} and goes on as {answer.get('file')}"
+        level = bus_messages.INFO
+        if not answer.get("done"):
+            level = bus_messages.ALARM
+            text = f"it was recorded as {before}; here: {answer.get('reason')}"
+        self._say(payload_id, text, level, "recording-moved")
 
     def _own_estimate(self, payload_id: str, note: EstimateMessage) -> None:
         watched = payload_id in self.wanted()
@@ -435,14 +498,19 @@ class Fleet:
             body = json.loads(query.payload.to_bytes())
             request, by = dict(body["request"]), check_payload_id(str(body["by"]))
             payload_id = _payload_of(name, request)
+            if name == _RECORDINGS and self.shelf is not None:
+                query.reply(query.key_expr, _read(self.shelf, request))
+                return
             if payload_id:
                 answer = self._bus.query(name, request, timeout_s=_TIMEOUT_S)
                 self._say(payload_id, f"{_what(request)} was asked for at station '{by}'")
         with contextlib.suppress(Exception):  # whoever asked may be gone
             query.reply(query.key_expr, json.dumps(answer).encode())
 
-    def _say(self, payload_id: str, text: str) -> None:
-        note = EventMessage(time.time_ns(), "web", bus_messages.INFO, _ASKED, text)
+    def _say(
+        self, payload_id: str, text: str, level: Level = bus_messages.INFO, name: str = _ASKED
+    ) -> None:
+        note = EventMessage(time.time_ns(), "web", level, name, text)
         with contextlib.suppress(Exception):  # the bus may be what fails
             self._bus.publish(bus_messages.EVENT, payload_id, note)
 
@@ -469,6 +537,51 @@ class Fleet:
                 gone = [n for n, other in self._others.items() if now_s - other.came_s > _KEPT_S]
                 for name in gone:
                     del self._others[name]
+
+
+class _Elsewhere:
+    """Another station's recordings as a `Shelf`; raises a `BlimpError` where it does not answer."""
+
+    def __init__(self, ask: Callable[[Mapping[str, Any]], bytes], station: str) -> None:
+        self._ask, self._station = ask, station
+
+    def list(self) -> list[dict[str, Any]]:
+        found = self._json({"do": "list"})
+        return found if isinstance(found, list) else []
+
+    def size(self, name: str) -> int:
+        return int(self._json({"do": "size", "file": name}))
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]:
+        while begin < end:
+            piece = self._ask({"do": "read", "file": name, "begin": begin, "end": end})
+            if not piece:
+                raise GroundStationError(f"station '{self._station}' did not answer")
+            begin += len(piece)
+            yield piece
+
+    def _json(self, request: Mapping[str, Any]) -> Any:
+        try:
+            found = json.loads(self._ask(request))
+        except ValueError:
+            raise GroundStationError(f"station '{self._station}' did not answer") from None
+        if found is None:
+            raise GroundStationError(f"station '{self._station}' has no such recording")
+        return found
+
+
+def _read(shelf: Shelf, request: Mapping[str, Any]) -> bytes:
+    """What is asked of this station's recordings; JSON's null where there is no such one."""
+    do, file = request.get("do"), str(request.get("file"))
+    try:
+        if do == "list":
+            return json.dumps(shelf.list()[:_LISTED]).encode()
+        if do == "size":
+            return json.dumps(shelf.size(file)).encode()
+        begin, end = int(request["begin"]), int(request["end"])
+        return next(shelf.pieces(file, begin, min(end, begin + _PIECE_BYTES)), b"")
+    except (BlimpError, OSError):
+        return b"null" if do != "read" else b""
 
 
 def _payload_of(name: str, request: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,10 +13,16 @@ from typing import Any
 import pytest
 from intake_stand import eventually
 
+from ground_station.errors import GroundStationError, KeysError
 from ground_station.keys.authority import Authority
 from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
-from ground_station.service.bus_messages import EstimateMessage, EventMessage, PayloadMessage
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    PayloadMessage,
+    RecordingMessage,
+)
 from ground_station.service.fleet import Fleet, map_id
 from ground_station.service.settings import SAMPLE
 
@@ -172,6 +179,71 @@ def test_commands_go_to_the_station_that_has_the_payload_and_all_are_told(statio
     )
     (reply,) = attic.fleet._session.zenoh.get(key, payload=body.encode(), timeout=5.0)
     assert json.loads(reply.ok.payload.to_bytes())["done"] is False and len(asked) == 2
+
+
+class Shelf:
+    """Recordings of 300,000 bytes, by name."""
+
+    def list(self) -> list[dict[str, Any]]:
+        return [{"file": "one.mcap", "size_MB": 0.3}]
+
+    def size(self, name: str) -> int:
+        if name != "one.mcap":
+            raise KeysError("there is none")
+        return 300_000
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]:
+        yield (bytes(range(256)) * 1200)[begin:end]
+
+
+def test_recordings_are_read_where_they_lie(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    hall.fleet.shelf = Shelf()
+    shelf = attic.fleet.shelf_of("hall")
+    assert shelf.list() == Shelf().list() and attic.fleet.knows("hall")
+    size = shelf.size("one.mcap")
+    assert b"".join(shelf.pieces("one.mcap", 0, size)) == (bytes(range(256)) * 1200)[:size]
+    with pytest.raises(GroundStationError, match="has no such recording"):
+        shelf.size("another.mcap")
+    with pytest.raises(GroundStationError, match="station 'hall' did not answer"):
+        list(shelf.pieces("one.mcap", 10**6, 10**6 + 1))
+    hall.stack.close()
+    with pytest.raises(GroundStationError, match="station 'hall' did not answer"):
+        shelf.list()
+
+
+def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    asked = []
+
+    def intake(request: Any) -> dict[str, Any]:
+        asked.append(dict(request))
+        return {"file": "attic-1.mcap"}
+
+    attic.bus.serve("intake", intake)
+    written = RecordingMessage(active=True, file="hall-7.mcap")
+
+    def recorded() -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.bus.publish(bus_messages.RECORDING, "-", written)
+        hall.tell()
+        there = attic.last(bus_messages.PAYLOAD)
+        return there is not None and bool(attic.fleet.document()["stations"][0]["recording"])
+
+    eventually(recorded, 10.0)
+    assert asked == []
+    hall.stack.close()
+    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    eventually(lambda: bool(asked), 10.0)
+    assert asked == [{"do": "record-start", "after": "hall/hall-7.mcap"}]
+    eventually(lambda: "hall/hall-7.mcap" in str(attic.last(bus_messages.EVENT)), 10.0)
+    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    time.sleep(0.3)
+    assert len(asked) == 1
 
 
 def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: Any) -> None:

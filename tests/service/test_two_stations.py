@@ -22,6 +22,32 @@ def alarms(service: Service) -> dict[str, str]:
     return {alarm["id"]: alarm["text"] for alarm in service.state()["alarms"]}
 
 
+def joined(folder: Path) -> tuple[Service, Service]:
+    """Two stations of one authority, the second of which joins the first."""
+    for name in ("first", "second"):
+        (folder / name).mkdir()
+    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    first = Service(folder / "first", f"fleet.listen={json.dumps([fleet])}")
+    second = Service(
+        folder / "second",
+        f"fleet.join={json.dumps([fleet])}",
+        name="spare",
+        authority=first.authority,
+    )
+    return first, second
+
+
+def has(service: Service) -> bool:
+    """Whether the payload flies with it, and is localized there."""
+    return service.tracking(PAYLOAD) and service.payload(PAYLOAD)["payload"]["station"] == ""
+
+
+def listed(service: Service, station: str) -> list[dict[str, Any]]:
+    """The recordings that its page shows of another station."""
+    answer = service.client.get(f"/api/stations/{station}/recordings")
+    return list(answer.json()) if answer.status_code == 200 else []
+
+
 def picture_of(service: Service, payload_id: str) -> dict[str, Any]:
     """The header of the first picture that a viewer gets of a payload."""
     url = f"{service.url.replace('http', 'ws')}/api/live?payload={payload_id}"
@@ -34,16 +60,7 @@ def picture_of(service: Service, payload_id: str) -> dict[str, Any]:
 
 
 def test_stations_that_joined_show_each_others_payloads(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    first = Service(tmp_path / "first", f"fleet.listen={json.dumps([fleet])}")
-    second = Service(
-        tmp_path / "second",
-        f"fleet.join={json.dumps([fleet])}",
-        name="spare",
-        authority=first.authority,
-    )
+    first, second = joined(tmp_path)
     with (
         first,
         second,
@@ -79,10 +96,7 @@ def test_stations_that_joined_show_each_others_payloads(tmp_path: Path) -> None:
 
 
 def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-    first = Service(tmp_path / "first")
-    second = Service(tmp_path / "second", name="spare", authority=first.authority)
+    first, second = joined(tmp_path)
     endpoints = json.dumps([first.endpoint, second.endpoint])
     both = {"main": first, "spare": second}
     with (
@@ -95,16 +109,28 @@ def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) ->
     ):  # fmt: skip
 
         def flies_with() -> str:
-            return next((name for name, one in both.items() if one.tracking(PAYLOAD)), "")
+            return next((name for name, one in both.items() if has(one)), "")
 
         eventually(lambda: flies_with() != "", _LIMIT_S)
         name = flies_with()
         used, other = both.pop(name), *both.values()
-        assert other.payload(PAYLOAD)["payload"]["frames"]["received"] == 0
         eventually(lambda: other.payload(PAYLOAD)["payload"]["station"] == name, _LIMIT_S)
-        eventually(lambda: f"elsewhere/{PAYLOAD}" in alarms(other), _LIMIT_S)
-        assert f"station '{name}'" in alarms(other)[f"elsewhere/{PAYLOAD}"]
+        eventually(lambda: other.payload(PAYLOAD)["payload"]["relayed"], _LIMIT_S)
         eventually(lambda: f"no-frames/{PAYLOAD}" not in alarms(other), _LIMIT_S)
+        used.record(active=True)
+        station = {"main": "spare", "spare": "main"}[name]
+        eventually(lambda: other.state()["fleet"]["stations"][0]["recording"], _LIMIT_S)
+        assert not other.state()["recording"]["active"]
         used.kill()
-        eventually(lambda: other.tracking(PAYLOAD), _LIMIT_S)
-        eventually(lambda: f"elsewhere/{PAYLOAD}" not in alarms(other), _LIMIT_S)
+        eventually(lambda: has(other), _LIMIT_S)
+        eventually(lambda: other.state()["recording"]["active"], _LIMIT_S)
+        other.record(active=False)
+        (cut,) = [path.name for path in used.recordings.iterdir()]
+        (file,) = other.client.get("/api/recordings").json()
+        assert file["after"] == f"{name}/{cut}" and file["duration_s"] > 0.0
+        used.start()
+        eventually(lambda: len(listed(used, station)) == 1, _LIMIT_S)
+        assert listed(used, station)[0]["file"] == file["file"]
+        url = f"/api/stations/{station}/recordings/{file['file']}"
+        assert used.client.get(url).content == (other.recordings / file["file"]).read_bytes()
+        assert used.client.get("/api/stations/nobody/recordings").status_code == 404

@@ -34,6 +34,8 @@ STATION_TOPIC = "/station"
 """Before what the service says: /station/event, /station/blimp-1/payload."""
 MAP_TABLE = "map "
 """Behind this the names of metadata tables name the maps in which a recording was localized."""
+AFTER_TABLE = "after "
+"""Behind this, STATION/FILE: which recording of another station this one goes on from."""
 _OVERLAP_S = 2.0
 """How long a file waits for the last frames of a stream whose next IDR does not come."""
 _MOST_STREAMS = 64
@@ -84,6 +86,7 @@ class GroundRun(run.Run):
         camera: Camera | None,
         max_file_s: float,
         sizes: dict[str, tuple[int, int]],
+        after: str = "",
         **named: Any,
     ) -> None:
         super().__init__(*args, **named)
@@ -96,6 +99,8 @@ class GroundRun(run.Run):
         self._lacking: Counter[str] = Counter()
         if camera is not None:
             self._head[CAMERA_TABLE] = {"readout_s": repr(camera.readout_s)}
+        if after:
+            self._head[AFTER_TABLE + after] = {"recording": after}
 
     def _stamp(self) -> str:
         return datetime.now(UTC).strftime("-%Y%m%dT%H%M%SZ")

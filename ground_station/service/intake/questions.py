@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from pi_firmware.wire.telemetry import Session
 
 _ANSWER_S = 2.0
 """For the payload to be found, and again for its answer: who asks waits for 5 s."""
+_AFTER = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}/[A-Za-z0-9][A-Za-z0-9_.:+-]{0,127}\.mcap")
 
 
 def answer(
@@ -22,7 +24,10 @@ def answer(
     """Does what is asked; raises a `BlimpError` with one line when it cannot be done."""
     what = request.get("do")
     if what == "record-start":
-        return {"file": recorder.start()}
+        after = request.get("after", "")
+        if not isinstance(after, str) or (after and not _AFTER.fullmatch(after)):
+            raise InputError(f"'after' is {str(after)[:40]!r}; allowed: STATION/FILE.mcap")
+        return {"file": recorder.start(after)}
     if what == "record-stop":
         return {"file": recorder.stop()}
     if what == "payload-command":

@@ -46,9 +46,10 @@ class GroundRecorder(Recorder):
             settings, lambda name, text: announce(name, self._level(), text), force_idr=force_idr
         )
         self._sizes: dict[str, tuple[int, int]] = {}
-        self.run_type = functools.partial(
+        self._run_type = functools.partial(
             GroundRun, camera=camera, max_file_s=settings.max_file_s, sizes=self._sizes
         )
+        self.run_type = self._run_type
         self.resumed = ""
         """From which recording that was cut the one of now goes on, in words."""
         self._refused = ""
@@ -63,9 +64,10 @@ class GroundRecorder(Recorder):
         """Why there is no recording although there should be one, in words."""
         return "" if self.file else self._refused or super().problem
 
-    def start(self) -> str:
-        """As `Recorder.start`."""
+    def start(self, after: str = "") -> str:
+        """As `Recorder.start`; `after` is STATION/FILE, which a flight was recorded in before."""
         if not self.file:
+            self.run_type = functools.partial(self._run_type, after=after)
             self._started_s = time.monotonic()
             self.resumed = ""
         file = super().start()

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import mimetypes
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from ground_station import __version__
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
-from ground_station.service.fleet import Fleet
+from ground_station.service.fleet import Fleet, Shelf
 from ground_station.service.settings import Run
 from ground_station.service.web import (
     control,
@@ -37,6 +37,7 @@ from ground_station.service.web import (
 from ground_station.service.web.access import Access
 from ground_station.service.web.guard import Guard
 from ground_station.service.web.metrics import Metrics
+from ground_station.service.web.problems import NotFound
 from ground_station.service.web.snapshot import Snapshot
 from ground_station.service.web.video import Video
 
@@ -158,6 +159,9 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     app.include_router(maps.router(shelf))
     app.include_router(control.router(control.Control(hub, snapshot), shelf))
     app.include_router(recordings.router(recorded))
+    if fleet is not None:
+        fleet.shelf = recorded
+    app.include_router(recordings.elsewhere(_elsewhere(fleet)))
     app.include_router(jobs.router(guide.Guide(settings, shelf, recorded), job, snapshot))
     app.include_router(live.router(viewers, access.sessions.holds))
     app.include_router(playback.router(recorded, run, __version__, access.sessions.holds))
@@ -166,6 +170,15 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     _serve_dashboard(app, static)
     guarded = Guard(app, access, metrics.answers)
     return Web(app, guarded, viewers, snapshot, metrics, access, video, loops)
+
+
+def _elsewhere(fleet: Fleet | None) -> Callable[[str], Shelf]:
+    def shelf(station: str) -> Shelf:
+        if fleet is None or not fleet.knows(station):
+            raise NotFound(f"no station {station!r} flies beside this one")
+        return fleet.shelf_of(station)
+
+    return shelf
 
 
 def _active_file(snapshot: Snapshot) -> str:

@@ -17,6 +17,7 @@ MAP_PATTERN = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 FILE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.:+-]{0,127}\.mcap$"
 
 PayloadId = Annotated[str, Path(pattern=PAYLOAD_PATTERN, description="As blimp-1.")]
+StationName = Annotated[str, Path(pattern=PAYLOAD_PATTERN, description="As GET /api/state tells.")]
 MapName = Annotated[str, Path(pattern=MAP_PATTERN, description="As atrium.")]
 FileName = Annotated[str, Path(pattern=FILE_PATTERN, description="As GET /api/recordings tells.")]
 
@@ -276,7 +277,10 @@ class MapDetailsModel(BaseModel):
 
 
 class RecordingModel(BaseModel):
-    """A recording of the ground's; the one that is being written is `active`."""
+    """A recording of the ground's; the one that is being written is `active`.
+
+    A flight that came from another station goes on from the one `after`, STATION/FILE.
+    """
 
     file: str
     size_MB: float
@@ -285,4 +289,5 @@ class RecordingModel(BaseModel):
     duration_s: float | None
     maps: list[str]
     lacks: dict[str, int] | None = None
+    after: str = ""
     active: bool

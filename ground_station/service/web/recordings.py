@@ -19,8 +19,15 @@ from mcap.records import MetadataIndex
 from starlette.exceptions import HTTPException
 
 from ground_station.errors import GroundStationError
-from ground_station.service.intake.files import LACKS, MAP_TABLE
-from ground_station.service.web.models import FILE_PATTERN, AnswerModel, FileName, RecordingModel
+from ground_station.service.fleet import Shelf
+from ground_station.service.intake.files import AFTER_TABLE, LACKS, MAP_TABLE
+from ground_station.service.web.models import (
+    FILE_PATTERN,
+    AnswerModel,
+    FileName,
+    RecordingModel,
+    StationName,
+)
 from ground_station.service.web.problems import Busy, NotFound, problems
 from pi_firmware.wire.errors import BlimpError
 
@@ -41,6 +48,8 @@ class _Told(NamedTuple):
     maps: Sequence[str] = ()
     lacks: Mapping[str, int] | None = None
     """Frames that were sent and are not in it, by why; None where it does not say."""
+    after: str = ""
+    """STATION/FILE that a flight was recorded in before."""
 
 
 class Recordings:
@@ -170,7 +179,14 @@ def _summed_up(path: Path) -> _Told:
     tables = sorted({index.name for index in summary.metadata_indexes})
     maps = [name.removeprefix(MAP_TABLE)[:128] for name in tables if name.startswith(MAP_TABLE)]
     duration_s = round(1e-9 * (figures.message_end_time - started_ns), 3)
-    return _Told(started_ns, duration_s, maps[:_MAPS_SHOWN], _lacks(path, summary.metadata_indexes))
+    after = next((name for name in tables if name.startswith(AFTER_TABLE)), "")
+    return _Told(
+        started_ns,
+        duration_s,
+        maps[:_MAPS_SHOWN],
+        _lacks(path, summary.metadata_indexes),
+        after.removeprefix(AFTER_TABLE)[:256],
+    )
 
 
 def _lacks(path: Path, tables: Sequence[MetadataIndex]) -> dict[str, int] | None:
@@ -210,6 +226,45 @@ def _portion(header: str | None, size: int) -> tuple[int, int] | None:
     return begin, end
 
 
+def _disposed(file: str, size: int) -> dict[str, str]:
+    return {
+        "content-length": str(size),
+        "content-disposition": f'attachment; filename="{file}"',
+    }
+
+
+_BYTES: dict[str, Any] = {"content": {"application/octet-stream": {}}}
+
+
+def elsewhere(shelf: Callable[[str], Shelf]) -> APIRouter:
+    """Recordings of other stations; `shelf` is a station's, by its name."""
+    result = APIRouter(prefix="/api/stations", tags=["recordings"])
+
+    @result.get(
+        "/{station}/recordings", response_model=list[RecordingModel], responses=problems(404)
+    )
+    def all_recordings(station: StationName) -> Any:
+        """The newest recordings of another station, newest first."""
+        return shelf(station).list()
+
+    @result.get(
+        "/{station}/recordings/{file}",
+        response_class=Response,
+        responses={200: _BYTES, **problems(404)},
+    )
+    def download(station: StationName, file: FileName) -> Response:
+        """A recording of another station's, as it is now."""
+        theirs = shelf(station)
+        size = theirs.size(file)
+        return StreamingResponse(
+            theirs.pieces(file, 0, size),
+            headers=_disposed(file, size),
+            media_type="application/octet-stream",
+        )
+
+    return result
+
+
 def router(recordings: Recordings) -> APIRouter:
     """Recordings over HTTP."""
     result = APIRouter(prefix="/api/recordings", tags=["recordings"])
@@ -223,8 +278,8 @@ def router(recordings: Recordings) -> APIRouter:
         "/{file}",
         response_class=Response,
         responses={
-            200: {"content": {"application/octet-stream": {}}},
-            206: {"content": {"application/octet-stream": {}}, "description": "The range."},
+            200: _BYTES,
+            206: {**_BYTES, "description": "The range."},
             **problems(404, 416),
         },
     )
@@ -233,11 +288,7 @@ def router(recordings: Recordings) -> APIRouter:
         size = recordings.size(file)
         part = _portion(request.headers.get("range"), size)
         begin, end = part or (0, size)
-        headers = {
-            "content-length": str(end - begin),
-            "content-disposition": f'attachment; filename="{file}"',
-            "accept-ranges": "bytes",
-        }
+        headers = {**_disposed(file, end - begin), "accept-ranges": "bytes"}
         if part:
             headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
         return StreamingResponse(

@@ -82,6 +82,7 @@ export const relocalize = (/** @type {string} */ id) => post(`${payload(id)}/rel
 export const chooseMap = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/map`, { name });
 export const command = (/** @type {string} */ id, /** @type {string} */ name, /** @type {Record<string, number>} */ values = {}) =>
   post(`${payload(id)}/command`, { name, arguments: values });
-export const recordingPath = (/** @type {string} */ file) => `/api/recordings/${encodeURIComponent(file)}`;
+export const recordingPath = (/** @type {string} */ file, station = "") =>
+  `/api/${station ? `stations/${station}/` : ""}recordings/${encodeURIComponent(file)}`;
 export const deleteRecording = (/** @type {string} */ file) => post(recordingPath(file), {}, "DELETE");
 export const mapPath = (/** @type {string} */ name) => `/api/maps/${encodeURIComponent(name)}`;

@@ -64,7 +64,10 @@ const playback = new Playback(store, send, () => {
   video.clear();
   connection.reopen();
 });
-const recordings = new RecordingsDialog((file) => playback.open(file));
+const recordings = new RecordingsDialog(
+  (file) => playback.open(file),
+  () => store.otherStations(),
+);
 const steps = new Steps(store, loop);
 const actions = new Actions(store, loop, { map: () => mapDialog.open(), power: () => powerDialog.open() });
 new Layout(() => {

@@ -8,9 +8,10 @@ import { dateTime, size, stopwatch } from "./format.js";
 const SURE_MS = 4000; // a second press within deletes
 
 export class RecordingsDialog {
-  /** @param {(file: string) => void} play */
-  constructor(play) {
+  /** @param {(file: string) => void} play @param {() => string[]} stations the others that are there */
+  constructor(play, stations) {
     this.play = play;
+    this.stations = stations;
     this.dialog = dialog("recordings-dialog");
     this.f = fields(this.dialog);
     byId("recordings-open").addEventListener("click", () => this.open());
@@ -28,11 +29,22 @@ export class RecordingsDialog {
   async load(said) {
     try {
       /** @type {import("./types.js").RecordingFile[]} */
-      const files = await api.get("/api/recordings");
+      const files = (await Promise.all([api.get("/api/recordings"), ...this.stations().map((name) => this.elsewhere(name))])).flat();
+      files.sort((a, b) => b.modified_ns - a.modified_ns);
       setText(this.f.note, said || (files.length ? "Newest first." : "There are none yet: Record makes one."));
       this.f.list.replaceChildren(...files.map((file) => this.row(file)));
     } catch (error) {
       setText(this.f.note, error instanceof Error ? error.message : String(error));
+    }
+  }
+
+  /** A station that does not answer has none to show. @param {string} station */
+  async elsewhere(station) {
+    try {
+      const files = await api.get(`/api/stations/${station}/recordings`);
+      return files.map((/** @type {import("./types.js").RecordingFile} */ file) => ({ ...file, station }));
+    } catch {
+      return [];
     }
   }
 
@@ -43,10 +55,16 @@ export class RecordingsDialog {
     const where = file.maps.join(", ") || (file.duration_s == null ? "" : "no map");
     const lacks = Object.entries(file.lacks ?? {}).filter(([, count]) => count);
     const without = lacks.length ? `without ${lacks.map(([why, count]) => `${count} ${why}`).join(", ")}` : "";
-    const facts = [where, length, size(file.size_MB), without].filter(Boolean).join(" · ");
-    const [path, name] = [api.recordingPath(file.file), make("b", "", dateTime(began_ms))];
+    const at = file.station ? `at station ${file.station}` : "";
+    const after = file.after ? `goes on from ${file.after}` : "";
+    const facts = [at, where, length, size(file.size_MB), without, after].filter(Boolean).join(" · ");
+    const [path, name] = [api.recordingPath(file.file, file.station), make("b", "", dateTime(began_ms))];
     name.title = file.file;
     const row = make("li", "", make("div", "", name, make("small", "", facts), make("small", "", file.file)));
+    if (file.station) {
+      row.append(link("Download", path, file.file));
+      return row;
+    }
     const player = make("button", "", "Play");
     player.setAttribute("type", "button");
     player.addEventListener("click", () => {

@@ -4,7 +4,6 @@ import { byId, fields, icon, make, setAttribute, setIcon, setText, show } from "
 import { clockTime, duration } from "./format.js";
 import { lookOf } from "./states.js";
 
-const OTHER_STALE_S = 3;
 const PATIENCE_MS = 1200; // a connection that is back sooner is not worth a banner
 
 export class Status {
@@ -26,9 +25,8 @@ export class Status {
   }
 
   drawStation() {
-    const { station, fleet } = this.store;
-    const others = (fleet?.stations ?? []).filter((other) => other.age_s < OTHER_STALE_S).map((other) => other.name);
-    setText(byId("station-name"), [station.name || "Ground station", ...others].join(" + "));
+    const { station } = this.store;
+    setText(byId("station-name"), [station.name || "Ground station", ...this.store.otherStations()].join(" + "));
     show(byId("demo"), Boolean(station.demo));
     setText(byId("version"), station.version ? `Ground station ${station.version}` : "");
   }

@@ -2,6 +2,7 @@
 /** What the page knows, in one place. Views read it; messages change it and name what changed. */
 import { Trail } from "./trail.js";
 
+const OTHER_STALE_S = 3;
 const EVENTS_KEPT = 500;
 const POINTS_KEPT = 90;
 const CLOCK_SET_BACK_NS = 5e9;
@@ -99,6 +100,11 @@ export class Store {
     this.select("");
     [this.events, this.alarms, this.recording, this.job, this.playback] = [[], [], null, null, null];
     for (const topic of ["payloads", "payload", "estimate", "trail", "events", "alarms", "recording", "job"]) this.changed(topic);
+  }
+
+  /** The names of the other stations that are there now. */
+  otherStations() {
+    return (this.fleet?.stations ?? []).filter((other) => other.age_s < OTHER_STALE_S).map((other) => other.name);
   }
 
   /** @returns {Payload|null} */

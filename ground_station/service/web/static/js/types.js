@@ -117,6 +117,8 @@
  * @property {number|null} started_ns null where it was cut
  * @property {number|null} duration_s
  * @property {string[]} maps in which it was localized
+ * @property {string} [station] the other one where it lies
+ * @property {string} [after] STATION/FILE that it goes on from
  * @property {Record<string, number>|null} lacks frames that were sent and are not in it, by why
  * @property {boolean} active
  *
