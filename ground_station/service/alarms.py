@@ -8,6 +8,8 @@ the alarm lies apart from the one that begins it.
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +27,7 @@ SILENT_S, RESTARTED_S = 5.0, 30.0
 RESUMED_S = 120.0
 GONE_FOR_S = 600.0
 CLOCKS_APART_S = 1.0
+NEAR_OVER = 1.2
 DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
 HOT_C, NO_MORE_HOT_C = 80.0, 76.0
 
@@ -103,6 +106,7 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
     yield from _of_stations(_table(state, "fleet"))
+    yield from _of_neighbours(state, standing)
     for payload_id, view in _table(state, "payloads").items():
         if not isinstance(view, dict):
             continue
@@ -261,18 +265,32 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     yield from refused.values()
 
 
+def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
+    """Two blimps that are too near each other, whichever stations they fly with."""
+    limit_m = _number(_table(state, "station").get("apart_m")) or 0.0
+    where: dict[str, Any] = {}
+    for payload_id, view in _table(state, "payloads").items():
+        estimate, age_s = _table(view, "estimate"), _number(_table(view, "age_s").get("estimate"))
+        position_m = [_number(value) for value in estimate.get("position_m") or ()]
+        known = estimate.get("state") in ("TRACKING", "DEGRADED") and len(position_m) == 3
+        if known and None not in position_m and age_s is not None and age_s <= NO_FRAMES_S:
+            where[payload_id] = position_m
+    for one, other in itertools.combinations(sorted(where), 2):
+        name, distance_m = f"near/{one}/{other}", math.dist(where[one], where[other])
+        if distance_m < limit_m * (NEAR_OVER if name in standing else 1.0):
+            yield Alarm(name, ALARM, one, f"{distance_m:.1f} m from {other}")
+
+
 def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
     for other in fleet.get("stations") or ():
-        name, age_s = other["name"], other["age_s"]
+        name, age_s, clock_s = other["name"], other["age_s"], other["clock_s"]
         if age_s > SILENT_S:
             text = f"nothing is heard of station '{name}'"
             yield Alarm(f"station/{name}", WARNING, STATION, text)
             continue
-        if abs(other["clock_s"]) > CLOCKS_APART_S:
-            ahead = "ahead of" if other["clock_s"] > 0 else "behind"
-            text = (
-                f"the clock of station '{name}' is {abs(other['clock_s']):.1f} s {ahead} this one's"
-            )
+        if abs(clock_s) > CLOCKS_APART_S:
+            ahead = "ahead of" if clock_s > 0 else "behind"
+            text = f"the clock of station '{name}' is {abs(clock_s):.1f} s {ahead} this one's"
             yield Alarm(f"station-clock/{name}", WARNING, STATION, f"{text}: timedatectl there?")
         if not other["same_map"] and other["payloads"]:
             text = (

@@ -44,6 +44,7 @@ class PayloadSettings:
 
     ids: list[str] = key([])
     most: int = key(4, low=1, high=16)
+    apart_m: float = key(1.5, unit="m", low=0, high=100)
 
 
 @dataclass(frozen=True)

@@ -152,6 +152,64 @@ def test_a_payload_that_flies_with_another_station_is_told_and_no_alarm(told):
     assert not ids(snapshot)
 
 
+def test_what_another_station_sees_is_its_own_to_judge(told):
+    snapshot, clock = told
+    note = station.payload(station="attic", relayed=True, battery={"time_ns": 1, "alarm": "low"})
+    snapshot.payload(P, note)
+    clock.ns += 3 * S
+    assert f"battery/{P}" not in ids(snapshot) and f"no-frames/{P}" not in ids(snapshot)
+
+
+@pytest.mark.parametrize(
+    ("other", "name", "text"),
+    [
+        ({}, None, ""),
+        ({"age_s": 6.0}, "station/attic", "nothing is heard of station 'attic'"),
+        ({"clock_s": -2.54}, "station-clock/attic", "'attic' is 2.5 s behind this one's"),
+        ({"same_map": False, "payloads": ["b"]}, "station-map/attic", "another map, 'hall'"),
+        ({"same_map": False}, None, ""),
+    ],
+)
+def test_another_station_has_its_words(told, other, name, text):
+    seen = {
+        "name": "attic", "map": "hall", "same_map": True, "age_s": 0.2, "clock_s": 0.1,
+        "payloads": [], **other,
+    }  # fmt: skip
+    fleet = {"stations": [seen], "twins": {}, "refused": []}
+    found = alarms.judge({**told[0].document(), "fleet": fleet}, 0, {})
+    assert set(found) == ({name} if name else set())
+    assert all(text in item.alarm.text for item in found.values())
+
+
+def test_twins_and_whoever_was_refused_are_named(told):
+    fleet = {"stations": [], "twins": {P: "attic"}, "refused": ["ground.yard wants to join"]}
+    found = alarms.judge({**told[0].document(), "fleet": fleet}, 0, {})
+    assert [item.alarm.text for item in found.values()] == [
+        "two payloads have this name: one flies here, one with station 'attic'",
+        "not joined: ground.yard wants to join",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "standing", "found"),
+    [(1.4, False, True), (1.6, False, False), (1.6, True, True), (1.9, True, False)],
+)
+def test_two_blimps_that_are_near_each_other(told, apart_m, standing, found):
+    snapshot = told[0]
+    snapshot.estimate(P, station.estimate(state="TRACKING", position_m=[1.0, 2.0, 3.0]))
+    snapshot.payload("z", station.payload())
+    snapshot.frame("z", station.frame())
+    there = station.estimate(state="DEGRADED", position_m=[1.0, 2.0, 3.0 + apart_m])
+    snapshot.estimate("z", there)
+    name, now_ns = f"near/{P}/z", 100 * S
+    alarm = alarms.Alarm(name, "alarm", P, "near", 0)
+    before = {name: alarms.Standing(alarm, 0)} if standing else {}
+    judged = alarms.judge(snapshot.document(), now_ns, before)
+    assert (name in judged) == found
+    if found:
+        assert judged[name].alarm.text == f"{apart_m:.1f} m from z"
+
+
 def test_telemetry_without_any_video_names_the_firewall(told):
     snapshot, clock = told
     for _ in range(6):  # P was seen, the other one never

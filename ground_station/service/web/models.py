@@ -129,6 +129,7 @@ class StationModel(BaseModel):
     demo: bool
     loopback: bool
     min_free_MB: int
+    apart_m: float
 
 
 class ProcessModel(BaseModel):

@@ -281,6 +281,7 @@ class Snapshot:
                     "demo": self.run.demo,
                     "loopback": is_loopback(station.video.host),
                     "min_free_MB": station.recording.min_free_MB,
+                    "apart_m": station.payloads.apart_m,
                 },
                 "processes": [
                     {

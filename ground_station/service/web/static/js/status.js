@@ -64,7 +64,8 @@ export class Status {
       setAttribute(choice.node, "aria-label", `${payload.id}, ${words}`);
       setAttribute(choice.node, "title", `${payload.id}: ${words}`);
       setIcon(choice.icon, look.icon);
-      setText(choice.word, at ? `${look.word} · ${at}` : look.word);
+      setText(choice.name, at ? `${payload.id} · ${at}` : payload.id);
+      setText(choice.word, look.word);
     }
     for (const [id, choice] of this.choices) {
       if (store.payloads.has(id)) continue;
