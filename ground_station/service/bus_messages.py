@@ -18,7 +18,7 @@ from ground_station.errors import GroundStationError
 from pi_firmware.wire import messages
 
 FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
-EVENT, RECORDING, PROCESS = "event", "recording", "process"
+EVENT, RECORDING, PROCESS, LEAVE = "event", "recording", "process", "leave"
 KINDS = (FRAME, ESTIMATE, PAYLOAD, EVENT, RECORDING, PROCESS)
 STATION = "-"
 """Stands for a payload's id where a message is of none."""
@@ -172,6 +172,13 @@ class RecordingMessage(Message):
     free_MB: float | None = None
     problem: str = ""
     resumed: str = ""  # where it goes on from one that was cut: both files, and what is lost
+
+
+@dataclass(frozen=True, slots=True)
+class LeaveMessage(Message):
+    """The payloads that are left to other stations for now; told again as long as that holds."""
+
+    payloads: list[str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,10 +24,12 @@ from msgspec import Meta
 from ground_station.errors import GroundStationError
 from ground_station.service import bus_messages
 from ground_station.service.alarms import Alarm
+from ground_station.service.allocation import Allocation, Peer, Pin
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import (
     EstimateMessage,
     EventMessage,
+    LeaveMessage,
     Level,
     Message,
     N,
@@ -50,6 +53,7 @@ _TELL_S = 0.5
 _SEEN_HZ, _WATCHED_HZ = 5.0, 15.0
 """Poses of a payload that somebody elsewhere looks at go there more often, with its points."""
 _LOOK_S = 5.0
+_OVERLOADED_S = 2.0
 _MESSAGE_BYTES = 512 * 1024
 _STATIONS, _PAYLOADS, _ALARMS, _WANTS = 32, 64, 64, 16
 _TIMEOUT_S = 6.0
@@ -68,18 +72,22 @@ Take = Callable[[str, Any], None]
 class StationMessage(Message):
     """How a station is, twice a second.
 
-    `map_id` is made of its map's content, `cpu` the cores that it uses, `wants` the payloads whose
-    pictures are looked at there.
+    `map_id` is made of its map's content, `load` is the share of its processors that it uses,
+    `overloaded` that they are too slow for its payloads. `wants` are those that are looked at,
+    `hears` all that are heard, `pins` where a person wants some to fly.
     """
 
     time_ns: WallTime
     version: Word
     map: Word
     map_id: Word
-    cpu: float = 0.0
+    load: float = 0.0
+    overloaded: bool = False
     recording: RecordingMessage | None = None
     alarms: Annotated[list[Alarm], Meta(max_length=_ALARMS)] = field(default_factory=list)
     wants: Annotated[list[Word], Meta(max_length=_WANTS)] = field(default_factory=list)
+    hears: Annotated[list[Word], Meta(max_length=_PAYLOADS)] = field(default_factory=list)
+    pins: Annotated[dict[Word, Pin], Meta(max_length=_PAYLOADS)] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -167,6 +175,9 @@ class Fleet:
         self.shelf: Shelf | None = None
         """This station's recordings, for the others."""
         self._due_s: dict[str, float] = {}
+        self._allocation = Allocation(self.name)
+        self._left: Mapping[str, str] = {}
+        self._overloaded_s = float("-inf")
         self._refused: dict[str, str] = {}
         self._join = tuple(settings.fleet.join)
         self._held = credentials.load(settings.telemetry.certificates)
@@ -259,25 +270,58 @@ class Fleet:
     # What this station's page adds
 
     def tell(self, alarms: list[Alarm], wants: frozenset[str], cpu: float) -> None:
-        """Tells the others how this station is; to be called at least twice a second."""
+        """Tells the others how this station is; to be called at least twice a second.
+
+        `cpu` are the cores that its processes use.
+        """
         now_s = time.monotonic()
         if now_s < self._due_s.get("", 0.0):
             return
         self._due_s[""] = now_s + _TELL_S
         with self._lock:
             away = {name: self._flown(name, now_s) for name in sorted(wants)[:_WANTS]}
+            fresh = {n: o.said for n, o in self._others.items() if now_s - o.came_s < FRESH_S}
+            heard = {
+                n for n, (at_s, note) in self._here.items() if now_s - at_s < FRESH_S and note.alive
+            }
+            here = {n for n in heard if self._flies_here(n, now_s)}
+            alone = {n for n in here if self._here[n][1].rate_hz <= 0}
+            overloaded = now_s - self._overloaded_s < _OVERLOADED_S
+            load = cpu / (os.cpu_count() or 1)
+            peers = {n: Peer(o.load, o.overloaded, frozenset(o.hears)) for n, o in fresh.items()}
+            leaves = self._allocation.leaves(here - alone, alone, load, overloaded, peers)
+            pins = dict(self._allocation.pins)
+        self._leave(leaves)
         self._watch({f"{ROOT}/{at}/{_PICTURE}/{name}" for name, at in away.items() if at})
         said = StationMessage(
             time_ns=time.time_ns(),
             version=self._version,
             map=self._map.name[:128],
             map_id=self._map_id,
-            cpu=round(cpu, 2),
+            load=round(load, 2),
+            overloaded=overloaded,
+            hears=sorted(heard)[:_PAYLOADS],
+            pins=pins,
             recording=self._recording,
             alarms=alarms[:_ALARMS],
             wants=[name for name, at in away.items() if at],
         )
         self._put(_STATION, bus_messages.STATION, bus_messages.encode(said))
+
+    def pin(self, payload_id: str, station: str) -> None:
+        """A person wants a payload to fly with a station; "": whichever has room."""
+        with self._lock:
+            self._allocation.pin(payload_id, Pin(station, time.time_ns()))
+        where = f"to fly with station '{station}'" if station else "to fly where there is room"
+        self._say(payload_id, f"it was asked {where}, at station '{self.name}'")
+
+    def _leave(self, leaves: Mapping[str, str]) -> None:
+        for name in leaves.keys() - self._left.keys():
+            self._say(name, f"left to another station: {leaves[name]}", name="left")
+        if leaves or self._left:
+            note = LeaveMessage(sorted(leaves))
+            self._bus.publish(bus_messages.LEAVE, bus_messages.STATION, note)
+        self._left = leaves
 
     def picture(self, payload_id: str, message: bytes) -> None:
         """A picture of a payload that flies here; it goes to those who look at it elsewhere."""
@@ -308,7 +352,7 @@ class Fleet:
                         "version": other.said.version,
                         "map": other.said.map,
                         "same_map": other.said.map_id == self._map_id,
-                        "cpu": other.said.cpu,
+                        "load": other.said.load,
                         "age_s": round(now_s - other.came_s, 1),
                         "clock_s": round(other.clock_s, 2),
                         "recording": bool(other.said.recording and other.said.recording.active),
@@ -316,6 +360,9 @@ class Fleet:
                     }
                     for name, other in sorted(self._others.items())
                 ],
+                "pins": {
+                    name: pin.station for name, pin in self._allocation.pins.items() if pin.station
+                },
                 "twins": {
                     name: station
                     for name, (station, at_s) in self._twins.items()
@@ -379,6 +426,8 @@ class Fleet:
         self._say(payload_id, text, level, "recording-moved")
 
     def _own_estimate(self, payload_id: str, note: EstimateMessage) -> None:
+        if note.overload:
+            self._overloaded_s = time.monotonic()
         watched = payload_id in self.wanted()
         now_s = time.monotonic()
         period_s = 1.0 / (_WATCHED_HZ if watched else _SEEN_HZ)
@@ -451,6 +500,8 @@ class Fleet:
             with self._lock:
                 if station in self._others or len(self._others) < _STATIONS:
                     self._others[station] = _Other(said, now_s, clock_s)
+                    for name, pin in said.pins.items():
+                        self._allocation.pin(name, pin)
         elif kind == _PICTURE:
             if self._told_of(payload_id) == station:
                 self._on_picture(payload_id, data)

@@ -71,6 +71,19 @@ def test_there_is_place_for_so_many_and_the_gone_make_room() -> None:
     assert [payload.id for payload in roster.all()] == ["one", "three"]
 
 
+def test_who_flies_with_another_station_takes_no_place_from_who_does_not() -> None:
+    roster = made(Announced(), most=2)
+    first, second = roster.take_up("blimp-1"), roster.take_up("blimp-2", elsewhere=True)
+    assert first is not None and second is not None
+    first.alive = second.alive = True
+    second.station = "attic"
+    assert roster.take_up("blimp-3", elsewhere=True) is None and roster.refused == set()
+    assert roster.take_up("blimp-4") is not None  # it flies here, or with nobody yet
+    assert [payload.id for payload in roster.all()] == ["blimp-1", "blimp-4"]
+    roster.get("blimp-4").alive = True  # type: ignore[union-attr]
+    assert roster.take_up("blimp-5") is None and roster.refused == {"blimp-5"}
+
+
 def test_who_found_no_place_and_went_is_forgotten() -> None:
     roster = made(Announced(), clock := Clock(), most=1)
     one = roster.take_up("one")

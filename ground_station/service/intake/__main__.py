@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first i
 
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
-from ground_station.service.bus_messages import EstimateMessage, EventMessage
+from ground_station.service.bus_messages import EstimateMessage, EventMessage, LeaveMessage
 from ground_station.service.cameras import camera_of
 from ground_station.service.ending import ending
 from ground_station.service.intake import resuming
@@ -34,6 +34,7 @@ def serve(folder: Path, stop: threading.Event) -> None:
         bus.serve("intake", intake.ask)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, intake.estimated)
         bus.subscribe(bus_messages.EVENT, EventMessage, intake.heard_event)
+        bus.subscribe(bus_messages.LEAVE, LeaveMessage, intake.leave)
         # A disk that hangs, or is full, does not hold up the video.
         about = (intake.recorder, settings.recording, intake.say)
         threading.Thread(target=resuming.begin, args=about, daemon=True).start()

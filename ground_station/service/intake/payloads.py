@@ -42,6 +42,8 @@ class Payload:
         self.id = payload_id
         self.alive = False
         self.seen_ns = 0
+        self.station = ""
+        """Another one, to which it says that it sends its video."""
         self.stream: Stream | None = None
         """The newest; it may have ended."""
         self.clock: Callable[[], Offset | None] = lambda: None
@@ -158,6 +160,7 @@ class Payload:
         offset = listener.clock(self.id)
         health = state.health if state is not None else None
         followed = health.ground if health is not None else ""
+        self.station = followed if followed != listener.name else ""
         return PayloadMessage(
             alive=self.alive,
             seen_ns=self.seen_ns,
@@ -176,7 +179,7 @@ class Payload:
             recording=health.recording if health is not None else "",
             refused=state.refused if state is not None else 0,
             ended=state is not None and state.ended,
-            station=followed if followed != listener.name else "",
+            station=self.station,
         )
 
     def close(self) -> None:

@@ -14,7 +14,13 @@ from typing import Any
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
-from ground_station.service.bus_messages import EstimateMessage, EventMessage, Level, Message
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    LeaveMessage,
+    Level,
+    Message,
+)
 from ground_station.service.intake import poses, questions
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
@@ -51,6 +57,7 @@ sent is lost."""
 _NAME_LENGTH, _TEXT_LENGTH = 64, 500
 _TOLD = 256
 _EARLY, _EARLY_S = 64, 3.0
+_LEFT_S = 2.0
 
 _LEVELS: dict[str, Level] = {
     messages.EVENT_FAILED: bus_messages.ALARM,
@@ -99,6 +106,8 @@ class Intake:
         self._announced = Announced()
         self._roster = Roster(settings.payloads, self._announced, self._make)
         self._told: dict[str, str] = {}
+        self._left: frozenset[str] = frozenset()
+        self._left_s = 0.0
         self._stands: dict[str, tuple[float, int]] = {}
         self._early: deque[tuple[float, str, messages.Event]] = deque(maxlen=_EARLY)
         self._due_s = {"payloads": 0.0, "recording": 0.0}
@@ -194,6 +203,10 @@ class Intake:
         self._event("intake", level, name, text, bus_messages.STATION)
         self._due_s["recording"] = 0.0
 
+    def leave(self, _: str, note: LeaveMessage) -> None:
+        """Says nothing to some payloads, which go on with another station that does."""
+        self._left, self._left_s = frozenset(note.payloads), time.monotonic()
+
     def heard_event(self, payload_id: str, note: EventMessage) -> None:
         """Takes another process's event, for the recording."""
         if note.source not in ("intake", "payload"):
@@ -205,7 +218,12 @@ class Intake:
         return payload
 
     def _video_of(self, payload_id: str) -> Video | None:
-        """A payload's stream, or none yet: one that looks for its station sends when it is told."""
+        """A payload's stream, or none yet: one that looks for its station sends when it is told.
+
+        None for one that is left to another station, to which nothing is said.
+        """
+        if payload_id in self._left and time.monotonic() - self._left_s < _LEFT_S:
+            return None
         awaited = Awaited(self.video.port) if self._roster.get(payload_id) is not None else None
         return self.video.stream_of(payload_id) or awaited
 
@@ -279,7 +297,7 @@ class Intake:
         """Looks after each payload, and says how it is."""
         living = set(self._listener.living())
         for payload_id in living:
-            self._roster.take_up(payload_id)
+            self._roster.take_up(payload_id, elsewhere=bool(self._elsewhere(payload_id)))
         self._pass_on_early()
         for payload in self._roster.all():
             was_alive, payload.alive = payload.alive, payload.id in living or payload.streaming
@@ -306,6 +324,12 @@ class Intake:
         refused = ", ".join(sorted(self._roster.refused))
         text = f"no place for {refused[:100]}: payloads.most" if refused else ""
         self._tell(bus_messages.STATION, "payloads-too-many", text)
+
+    def _elsewhere(self, payload_id: str) -> str:
+        """Another station that a payload says it sends its video to; "" for none."""
+        state = self._listener.state(payload_id)
+        health = state.health if state is not None else None
+        return health.ground if health is not None and health.ground != self._listener.name else ""
 
     def _tell(self, payload_id: str, name: str, problem: str) -> None:
         """Says a problem once, and once that it is over."""

@@ -54,8 +54,12 @@ class Roster:
         """One of them."""
         return self._payloads.get(payload_id)
 
-    def take_up(self, payload_id: str) -> Payload | None:
-        """A payload, taken up if it was not yet; None: it is not wanted, or has no place."""
+    def take_up(self, payload_id: str, *, elsewhere: bool = False) -> Payload | None:
+        """A payload, taken up if it was not yet; None: it is not wanted, or has no place.
+
+        One that flies with another station (`elsewhere`) takes nobody's place, and gives its own to
+        one that does not.
+        """
         known = self._payloads.get(payload_id)
         if known is not None:
             return known
@@ -65,7 +69,10 @@ class Roster:
         with self._lock:
             if payload_id not in self._payloads:
                 if len(self._payloads) >= self._settings.most:
-                    gone = [p for p in self._payloads.values() if not p.alive and not p.streaming]
+                    silent = [p for p in self._payloads.values() if not p.streaming]
+                    gone = [p for p in silent if not p.alive] or [p for p in silent if p.station]
+                    if elsewhere:
+                        return None
                     if not gone:
                         if len(self._refused_s) < _REFUSED or payload_id in self._refused_s:
                             self._refused_s[payload_id] = self._clock()

@@ -157,7 +157,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     )
     app.include_router(state.router(snapshot, metrics))
     app.include_router(maps.router(shelf))
-    app.include_router(control.router(control.Control(hub, snapshot), shelf))
+    app.include_router(control.router(control.Control(hub, snapshot), shelf, fleet))
     app.include_router(recordings.router(recorded))
     if fleet is not None:
         fleet.shelf = recorded

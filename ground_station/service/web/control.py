@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from fastapi import APIRouter
 
+from ground_station.service.fleet import Fleet
 from ground_station.service.web.maps import Maps
 from ground_station.service.web.models import (
     AnswerModel,
@@ -15,6 +16,7 @@ from ground_station.service.web.models import (
     MapRequest,
     PayloadId,
     RecordingRequest,
+    StationRequest,
 )
 from ground_station.service.web.problems import Busy, NotFound, problems
 from ground_station.service.web.snapshot import Snapshot
@@ -62,7 +64,7 @@ class Control:
             raise NotFound(f"there is no payload {payload_id!r}")
 
 
-def router(control: Control, maps: Maps) -> APIRouter:
+def router(control: Control, maps: Maps, fleet: Fleet | None = None) -> APIRouter:
     """Control over HTTP."""
     result = APIRouter(prefix="/api", tags=["control"])
 
@@ -99,6 +101,20 @@ def router(control: Control, maps: Maps) -> APIRouter:
         if request.name not in maps.names():
             raise NotFound(f"there is no map {request.name!r}")
         return control.ask(f"localizer/{payload_id}", {"do": "map", "name": request.name})
+
+    @result.post(
+        "/payloads/{payload_id}/station", response_model=AnswerModel, responses=problems(404, 413)
+    )
+    def choose_station(payload_id: PayloadId, request: StationRequest) -> Any:
+        """Has a payload fly with a station, and stay there."""
+        control.check_payload(payload_id)
+        known = fleet is not None and (
+            request.name in ("", fleet.name) or fleet.knows(request.name)
+        )
+        if fleet is None or not known:
+            raise NotFound(f"no station {request.name!r} flies beside this one")
+        fleet.pin(payload_id, request.name)
+        return {"done": True, "reason": "", "values": {}}
 
     @result.post("/recording", response_model=AnswerModel, responses=problems(413))
     def recording(request: RecordingRequest) -> Any:

@@ -98,6 +98,12 @@ class MapRequest(_Model):
     name: Annotated[str, StringConstraints(pattern=MAP_PATTERN)]
 
 
+class StationRequest(_Model):
+    """The station that a payload is to fly with; "": whichever has room."""
+
+    name: Annotated[str, StringConstraints(pattern=f"{PAYLOAD_PATTERN}|^$")]
+
+
 class RecordingRequest(_Model):
     """Whether the station records."""
 
@@ -190,7 +196,7 @@ class OtherStationModel(BaseModel):
     version: str
     map: str
     same_map: bool
-    cpu: float
+    load: float
     age_s: float
     clock_s: float
     recording: bool
@@ -198,9 +204,13 @@ class OtherStationModel(BaseModel):
 
 
 class FleetModel(BaseModel):
-    """The other stations; payloads of one name, and who was refused and why."""
+    """The other stations, and where persons want payloads to fly (`pins`).
+
+    `twins` are payloads of one name, `refused` says who was and why.
+    """
 
     stations: list[OtherStationModel]
+    pins: dict[str, str]
     twins: dict[str, str]
     refused: list[str]
 

@@ -79,6 +79,7 @@ const payload = (/** @type {string} */ id) => `/api/payloads/${encodeURIComponen
 
 export const record = (/** @type {boolean} */ active) => post("/api/recording", { active });
 export const relocalize = (/** @type {string} */ id) => post(`${payload(id)}/relocalize`, {});
+export const chooseStation = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/station`, { name });
 export const chooseMap = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/map`, { name });
 export const command = (/** @type {string} */ id, /** @type {string} */ name, /** @type {Record<string, number>} */ values = {}) =>
   post(`${payload(id)}/command`, { name, arguments: values });

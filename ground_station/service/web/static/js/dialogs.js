@@ -20,6 +20,8 @@ export class MapDialog {
     this.f = fields(this.dialog);
     /** @type {(name: string) => void} */
     this.chosen = () => {};
+    /** @type {(station: string) => void} */
+    this.sent = () => {};
   }
 
   async open() {
@@ -34,10 +36,28 @@ export class MapDialog {
       const maps = await api.get("/api/maps");
       const now = this.store.current?.estimate?.map || this.store.station.map;
       setText(this.f.note, maps.length ? "The localizer restarts in the map that is chosen." : "There are no maps. `blimp map build` makes one.");
-      this.f.choices.replaceChildren(...maps.map((map) => this.choice(map, map.name === now)));
+      this.f.choices.replaceChildren(...maps.map((map) => this.choice(map, map.name === now)), ...this.stations(id));
     } catch (error) {
       setText(this.f.note, error instanceof Error ? error.message : String(error));
     }
+  }
+
+  /** Where it may fly, if there is more than one station. @param {string} id */
+  stations(id) {
+    const others = this.store.otherStations();
+    if (!others.length) return [];
+    const pinned = this.store.fleet?.pins?.[id] ?? "";
+    const own = this.store.station.name ?? "";
+    return ["", own, ...others].map((name) => {
+      const button = make("button", "choice", make("span", "", name ? `Station ${name}` : "Whichever station has room"), make("small", "", name === pinned ? "chosen" : ""));
+      button.setAttribute("type", "button");
+      setAttribute(button, "aria-current", name === pinned ? "true" : null);
+      button.addEventListener("click", () => {
+        this.dialog.close();
+        this.sent(name);
+      });
+      return button;
+    });
   }
 
   /** @param {import("./types.js").MapSummary} map @param {boolean} is_current */

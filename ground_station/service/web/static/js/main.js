@@ -79,6 +79,7 @@ new Events(store, loop);
 new Status(store, loop, choose);
 
 mapDialog.chosen = (name) => actions.ofPayload("map", `Map ${name}`, (id) => api.chooseMap(id, name));
+mapDialog.sent = (name) => actions.ofPayload("map", name ? `Station ${name}` : "Whichever station", (id) => api.chooseStation(id, name));
 powerDialog.confirmed = (id, command) =>
   actions.run("power", `${command === "reboot" ? "Restart" : "Shut down"} ${id}`, () => api.command(id, command));
 

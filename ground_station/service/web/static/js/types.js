@@ -80,6 +80,7 @@
  *
  * @typedef {object} Fleet
  * @property {{name: string, age_s: number, payloads: string[]}[]} stations the others
+ * @property {Record<string, string>} pins where persons want payloads to fly
  *
  * @typedef {object} PayloadEntry
  * @property {PayloadNote|null} [payload]
