@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from intake_stand import eventually
+from scenarios.tcp_wire import TcpWire
 
 from ground_station.errors import GroundStationError, KeysError
 from ground_station.keys.authority import Authority
@@ -23,7 +24,7 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
-from ground_station.service.fleet import Fleet, map_id
+from ground_station.service.fleet import FRESH_S, Fleet, map_id
 from ground_station.service.settings import SAMPLE
 
 BLIMP = "blimp-1"
@@ -68,7 +69,7 @@ class Station:
             self.fleet.subscribe(
                 kind, of, lambda name, note, kind=kind: self.heard.append((kind, name, note))
             )
-        self.endpoint = self.fleet.listening[0]
+        self.endpoint = next(iter(self.fleet.listening), "")
 
     def tell(self, *wants: str) -> None:
         """As its page does four times a second."""
@@ -294,6 +295,33 @@ def test_a_third_station_is_found_through_the_first_and_stays_when_that_goes(sta
         return note is not None and note.station == "yard"
 
     eventually(told, 10.0)
+
+
+def test_a_network_that_is_cut_costs_nothing_once_it_is_back(stations: Any) -> None:
+    hall = stations("hall")
+    with TcpWire(int(hall.endpoint.rpartition(":")[2])) as wire:
+        attic = stations("attic", f"tls/127.0.0.1:{wire.port}", more=("fleet.listen=[]",))
+
+        def seen(at: Station, station: str) -> bool:
+            hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+            attic.bus.publish(bus_messages.PAYLOAD, "blimp-2", HERE)
+            for one in (hall, attic):
+                one.tell()
+            last = [note for kind, _, note in at.heard if kind == "payload" and note.relayed]
+            (other,) = at.fleet.document()["stations"] or [{"age_s": 99.0}]
+            return bool(last) and last[-1].station == station and other["age_s"] < FRESH_S
+
+        eventually(lambda: seen(attic, "hall") and seen(hall, "attic"), 20.0)
+        wire.block()
+        eventually(lambda: not seen(attic, "hall") and not seen(hall, "attic"), 30.0)
+        assert attic.fleet.query(f"localizer/{BLIMP}", {})["done"] is False
+        note = EventMessage(7, "intake", "info", "said", "meanwhile")
+        attic.bus.publish(bus_messages.EVENT, "-", note)
+        eventually(lambda: attic.last(bus_messages.EVENT) == note, 10.0)
+        wire.fix()
+        eventually(lambda: seen(attic, "hall") and seen(hall, "attic"), 60.0)
+        told = [one for kind, _, one in hall.heard if kind == "event" and one.time_ns == 7]
+        assert len(told) <= 1  # what was said meanwhile may be lost to the other, never doubled
 
 
 def test_whoever_is_revoked_or_foreign_is_refused_and_named(stations: Any, tmp_path: Path) -> None:
