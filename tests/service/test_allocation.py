@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from ground_station.service.allocation import (
+from ground_station.service.fleet.allocation import (
     ARRIVAL_S,
     MOVE_S,
     OVERLOADED_S,

@@ -24,7 +24,8 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
-from ground_station.service.fleet import FRESH_S, Fleet, map_id
+from ground_station.service.fleet.fleet import FRESH_S, Fleet
+from ground_station.service.fleet.messages import map_id
 from ground_station.service.settings import SAMPLE
 
 BLIMP = "blimp-1"

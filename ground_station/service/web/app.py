@@ -20,7 +20,8 @@ from ground_station import __version__
 from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
-from ground_station.service.fleet import Fleet, Shelf
+from ground_station.service.fleet.fleet import Fleet
+from ground_station.service.fleet.shelf import Shelf
 from ground_station.service.settings import Run
 from ground_station.service.web import (
     control,

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from fastapi import APIRouter
 
-from ground_station.service.fleet import Fleet
+from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.web.maps import Maps
 from ground_station.service.web.models import (
     AnswerModel,

@@ -20,7 +20,7 @@ from ground_station.service.bus_messages import (
     FrameMessage,
     RecordingMessage,
 )
-from ground_station.service.fleet import Fleet
+from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.metrics import Metrics
 from ground_station.service.web.snapshot import PAYLOADS, TEXT, Snapshot

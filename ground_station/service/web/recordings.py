@@ -19,7 +19,7 @@ from mcap.records import MetadataIndex
 from starlette.exceptions import HTTPException
 
 from ground_station.errors import GroundStationError
-from ground_station.service.fleet import Shelf
+from ground_station.service.fleet.shelf import Shelf
 from ground_station.service.intake.files import AFTER_TABLE, LACKS, MAP_TABLE
 from ground_station.service.web.models import (
     FILE_PATTERN,

@@ -27,7 +27,7 @@ from ground_station.service.bus_messages import (
     ProcessMessage,
     RecordingMessage,
 )
-from ground_station.service.fleet import Fleet
+from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.settings import Run
 from ground_station.service.web.access import is_loopback
 from ground_station.service.web.trail import Trail

@@ -9,22 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Any
 
-from msgspec import Meta
-
-from ground_station.errors import GroundStationError
 from ground_station.service import bus_messages
 from ground_station.service.alarms import Alarm
-from ground_station.service.allocation import Allocation, Peer, Pin
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import (
     EstimateMessage,
@@ -35,17 +30,25 @@ from ground_station.service.bus_messages import (
     N,
     PayloadMessage,
     RecordingMessage,
-    WallTime,
 )
+from ground_station.service.fleet.allocation import Allocation, Peer, Pin
+from ground_station.service.fleet.messages import (
+    ALARMS,
+    PAYLOADS,
+    ROOT,
+    WANTS,
+    StationMessage,
+    map_id,
+    rules,
+)
+from ground_station.service.fleet.shelf import Elsewhere, Shelf, read
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire import credentials
-from pi_firmware.wire.credentials import IN, OUT, SERVE
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.refusal import refusal
 from pi_firmware.wire.telemetry import open_session
 
-ROOT = "fleet"
 FRESH_S = 3.0
 """Older than this a station's word says nothing of now."""
 _KEPT_S = 600.0
@@ -55,39 +58,16 @@ _SEEN_HZ, _WATCHED_HZ = 5.0, 15.0
 _LOOK_S = 5.0
 _OVERLOADED_S = 2.0
 _MESSAGE_BYTES = 512 * 1024
-_STATIONS, _PAYLOADS, _ALARMS, _WANTS = 32, 64, 64, 16
+_STATIONS = 32
 _TIMEOUT_S = 6.0
 _INTAKE, _LOCALIZER = "intake", "localizer/"
 _COMMAND = "payload-command"
 _ASKED = "asked"
-_RECORDINGS, _LISTED, _PIECE_BYTES = "recordings", 500, 256 * 1024
+_RECORDINGS = "recordings"
 _MOVED_S = 30.0
 """A payload that came from another station no longer ago than this goes on being recorded."""
 
-Word = Annotated[str, Meta(max_length=128)]
 Take = Callable[[str, Any], None]
-
-
-@dataclass(frozen=True, slots=True)
-class StationMessage(Message):
-    """How a station is, twice a second.
-
-    `map_id` is made of its map's content, `load` is the share of its processors that it uses,
-    `overloaded` that they are too slow for its payloads. `wants` are those that are looked at,
-    `hears` all that are heard, `pins` where a person wants some to fly.
-    """
-
-    time_ns: WallTime
-    version: Word
-    map: Word
-    map_id: Word
-    load: float = 0.0
-    overloaded: bool = False
-    recording: RecordingMessage | None = None
-    alarms: Annotated[list[Alarm], Meta(max_length=_ALARMS)] = field(default_factory=list)
-    wants: Annotated[list[Word], Meta(max_length=_WANTS)] = field(default_factory=list)
-    hears: Annotated[list[Word], Meta(max_length=_PAYLOADS)] = field(default_factory=list)
-    pins: Annotated[dict[Word, Pin], Meta(max_length=_PAYLOADS)] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -104,46 +84,6 @@ _TOLD: dict[str, type[Message]] = {
     bus_messages.EVENT: EventMessage,
 }
 _STATION, _PICTURE = "station", "picture"
-
-
-def map_id(folder: Path) -> str:
-    """Tells a map from another of the same name: its files' names and sizes, its `map.toml`."""
-    found = hashlib.sha256()
-    with contextlib.suppress(OSError):
-        for path in sorted(folder.iterdir()):
-            if path.is_file() and path.suffix != ".mcap":
-                found.update(f"{path.name} {path.stat().st_size}\n".encode())
-        found.update((folder / "map.toml").read_bytes())
-    return found.hexdigest()[:16]
-
-
-def rules(held: credentials.Credentials) -> dict[str, Any]:
-    """Zenoh's `access_control` between stations: each speaks under its own name only."""
-    result = credentials.Rules()
-    ours, every = [f"{ROOT}/{held.member}/**"], [f"{ROOT}/*/**"]
-    for station in held.stations:
-        theirs = [f"{ROOT}/{station.partition('.')[2]}/**"]
-        result.allow(
-            station,
-            [
-                ("told", OUT, ["put", *SERVE], ours),
-                ("tells", IN, ["put", *SERVE], theirs),
-                ("heard", OUT + IN, ["declare_subscriber"], every),
-                ("asks", OUT, ["query"], theirs),
-                ("asked", IN, ["query"], ours),
-            ],
-        )
-    return result.document()
-
-
-class Shelf(Protocol):
-    """A station's recordings."""
-
-    def list(self) -> list[dict[str, Any]]: ...
-
-    def size(self, name: str) -> int: ...
-
-    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]: ...
 
 
 class Fleet:
@@ -265,7 +205,7 @@ class Fleet:
 
     def shelf_of(self, station: str) -> Shelf:
         """The recordings of another station, read from there."""
-        return _Elsewhere(lambda request: self._ask(station, _RECORDINGS, request), station)
+        return Elsewhere(lambda request: self._ask(station, _RECORDINGS, request), station)
 
     # What this station's page adds
 
@@ -279,7 +219,7 @@ class Fleet:
             return
         self._due_s[""] = now_s + _TELL_S
         with self._lock:
-            away = {name: self._flown(name, now_s) for name in sorted(wants)[:_WANTS]}
+            away = {name: self._flown(name, now_s) for name in sorted(wants)[:WANTS]}
             fresh = {n: o.said for n, o in self._others.items() if now_s - o.came_s < FRESH_S}
             heard = {
                 n for n, (at_s, note) in self._here.items() if now_s - at_s < FRESH_S and note.alive
@@ -300,10 +240,10 @@ class Fleet:
             map_id=self._map_id,
             load=round(load, 2),
             overloaded=overloaded,
-            hears=sorted(heard)[:_PAYLOADS],
+            hears=sorted(heard)[:PAYLOADS],
             pins=pins,
             recording=self._recording,
-            alarms=alarms[:_ALARMS],
+            alarms=alarms[:ALARMS],
             wants=[name for name, at in away.items() if at],
         )
         self._put(_STATION, bus_messages.STATION, bus_messages.encode(said))
@@ -529,9 +469,9 @@ class Fleet:
             before, at_s = self._away.get(payload_id, (station, now_s))
             if before != station and now_s - at_s < FRESH_S and note.rate_hz <= 0:
                 return False  # it has just gone from there
-            if payload_id not in self._away and len(self._away) >= _PAYLOADS:
+            if payload_id not in self._away and len(self._away) >= PAYLOADS:
                 self._away = {n: one for n, one in self._away.items() if self._flown(n, now_s)}
-                if len(self._away) >= _PAYLOADS:
+                if len(self._away) >= PAYLOADS:
                     return False
             self._away[payload_id] = (station, now_s)
         return True
@@ -550,7 +490,7 @@ class Fleet:
             request, by = dict(body["request"]), check_payload_id(str(body["by"]))
             payload_id = _payload_of(name, request)
             if name == _RECORDINGS and self.shelf is not None:
-                query.reply(query.key_expr, _read(self.shelf, request))
+                query.reply(query.key_expr, read(self.shelf, request))
                 return
             if payload_id:
                 answer = self._bus.query(name, request, timeout_s=_TIMEOUT_S)
@@ -588,51 +528,6 @@ class Fleet:
                 gone = [n for n, other in self._others.items() if now_s - other.came_s > _KEPT_S]
                 for name in gone:
                     del self._others[name]
-
-
-class _Elsewhere:
-    """Another station's recordings as a `Shelf`; raises a `BlimpError` where it does not answer."""
-
-    def __init__(self, ask: Callable[[Mapping[str, Any]], bytes], station: str) -> None:
-        self._ask, self._station = ask, station
-
-    def list(self) -> list[dict[str, Any]]:
-        found = self._json({"do": "list"})
-        return found if isinstance(found, list) else []
-
-    def size(self, name: str) -> int:
-        return int(self._json({"do": "size", "file": name}))
-
-    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]:
-        while begin < end:
-            piece = self._ask({"do": "read", "file": name, "begin": begin, "end": end})
-            if not piece:
-                raise GroundStationError(f"station '{self._station}' did not answer")
-            begin += len(piece)
-            yield piece
-
-    def _json(self, request: Mapping[str, Any]) -> Any:
-        try:
-            found = json.loads(self._ask(request))
-        except ValueError:
-            raise GroundStationError(f"station '{self._station}' did not answer") from None
-        if found is None:
-            raise GroundStationError(f"station '{self._station}' has no such recording")
-        return found
-
-
-def _read(shelf: Shelf, request: Mapping[str, Any]) -> bytes:
-    """What is asked of this station's recordings; JSON's null where there is no such one."""
-    do, file = request.get("do"), str(request.get("file"))
-    try:
-        if do == "list":
-            return json.dumps(shelf.list()[:_LISTED]).encode()
-        if do == "size":
-            return json.dumps(shelf.size(file)).encode()
-        begin, end = int(request["begin"]), int(request["end"])
-        return next(shelf.pieces(file, begin, min(end, begin + _PIECE_BYTES)), b"")
-    except (BlimpError, OSError):
-        return b"null" if do != "read" else b""
 
 
 def _payload_of(name: str, request: Mapping[str, Any]) -> str:

@@ -1,0 +1,67 @@
+"""Recordings of other stations: listed and read where they lie, piece by piece."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+from ground_station.errors import GroundStationError
+from pi_firmware.wire.errors import BlimpError
+
+_LISTED, _PIECE_BYTES = 500, 256 * 1024
+
+
+class Shelf(Protocol):
+    """A station's recordings."""
+
+    def list(self) -> list[dict[str, Any]]: ...
+
+    def size(self, name: str) -> int: ...
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]: ...
+
+
+class Elsewhere:
+    """Another station's recordings as a `Shelf`; raises a `BlimpError` where it does not answer."""
+
+    def __init__(self, ask: Callable[[Mapping[str, Any]], bytes], station: str) -> None:
+        self._ask, self._station = ask, station
+
+    def list(self) -> list[dict[str, Any]]:
+        found = self._json({"do": "list"})
+        return found if isinstance(found, list) else []
+
+    def size(self, name: str) -> int:
+        return int(self._json({"do": "size", "file": name}))
+
+    def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]:
+        while begin < end:
+            piece = self._ask({"do": "read", "file": name, "begin": begin, "end": end})
+            if not piece:
+                raise GroundStationError(f"station '{self._station}' did not answer")
+            begin += len(piece)
+            yield piece
+
+    def _json(self, request: Mapping[str, Any]) -> Any:
+        try:
+            found = json.loads(self._ask(request))
+        except ValueError:
+            raise GroundStationError(f"station '{self._station}' did not answer") from None
+        if found is None:
+            raise GroundStationError(f"station '{self._station}' has no such recording")
+        return found
+
+
+def read(shelf: Shelf, request: Mapping[str, Any]) -> bytes:
+    """What is asked of this station's recordings; JSON's null where there is no such one."""
+    do, file = request.get("do"), str(request.get("file"))
+    try:
+        if do == "list":
+            return json.dumps(shelf.list()[:_LISTED]).encode()
+        if do == "size":
+            return json.dumps(shelf.size(file)).encode()
+        begin, end = int(request["begin"]), int(request["end"])
+        return next(shelf.pieces(file, begin, min(end, begin + _PIECE_BYTES)), b"")
+    except (BlimpError, OSError):
+        return b"null" if do != "read" else b""
