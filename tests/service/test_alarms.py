@@ -204,7 +204,10 @@ def test_two_blimps_that_are_near_each_other(told, apart_m, standing, found):
     name, now_ns = f"near/{P}/z", 100 * S
     alarm = alarms.Alarm(name, "alarm", P, "near", 0)
     before = {name: alarms.Standing(alarm, 0)} if standing else {}
-    judged = alarms.judge(snapshot.document(), now_ns, before)
+    state = snapshot.document()
+    state["station"]["apart_m"] = 1.5
+    judged = alarms.judge(state, now_ns, before)
+    assert name not in alarms.judge(snapshot.document(), now_ns, {})  # 0: none does
     assert (name in judged) == found
     if found:
         assert judged[name].alarm.text == f"{apart_m:.1f} m from z"

@@ -31,6 +31,7 @@ from ground_station.service.pictures import PictureWriter
 from ground_station.service.settings import (
     HttpSettings,
     MapSettings,
+    PayloadSettings,
     RecordingSettings,
     Run,
     StationSettings,
@@ -85,6 +86,7 @@ def run_of(folder: Path, *, shelf: Path = ATRIUM.parent, **http: Any) -> Run:
     (folder / "recordings").mkdir(exist_ok=True)
     station = StationSettings(
         map=MapSettings(folder=str(shelf / "atrium"), shelf=str(shelf)),
+        payloads=PayloadSettings(apart_m=0.0),  # two that fly one recording are near
         recording=RecordingSettings(folder=str(folder / "recordings")),
         http=HttpSettings(**{"port": 0, **http}),
     )
