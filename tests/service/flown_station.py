@@ -70,6 +70,7 @@ class Payload:
     state: str = "TRACKING"
     reason: str = ""
     map: str = "atrium"
+    station: str = ""
     health: dict[str, Any] = field(
         default_factory=lambda: {"version": "0.0.0+git0123456789ab", "release": "update"}
     )
@@ -148,7 +149,10 @@ class FlownStation:
                     one.sequence += one.flies
                     self._frame(one)
                 if tick % 15 == 0:
-                    note = web_station.payload(alive=one.alive, health=dict(one.health))
+                    note = web_station.payload(
+                        alive=one.alive, health=dict(one.health), station=one.station,
+                        relayed=bool(one.station),
+                    )  # fmt: skip
                     self.bus.put(bus_messages.PAYLOAD, one.id, note)
             if tick % 8 == 0:
                 note = web_station.recording(active=self.recording, file="now.mcap")

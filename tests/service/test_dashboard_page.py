@@ -436,6 +436,30 @@ def test_a_map_is_chosen_and_one_without_a_plan_has_a_grid(
     shutil.rmtree(station.folder / "maps" / name)
 
 
+def test_another_station_s_payload_says_with_whom_it_flies_and_is_sent_elsewhere(
+    shown: Watched, station: FlownStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = {
+        "name": "attic", "version": "1", "map": "atrium", "same_map": True, "load": 0.2,
+        "age_s": 0.2, "clock_s": 0.0, "recording": False, "payloads": ["blimp-2"],
+    }  # fmt: skip
+    fleet = {"stations": [other], "pins": {"blimp-1": "attic"}, "twins": {}, "refused": []}
+    monkeypatch.setattr(station.web.snapshot, "fleet", lambda: fleet)
+    monkeypatch.setitem(station.payloads["blimp-2"].__dict__, "station", "attic")
+    shown.until("document.querySelector('#station-name').textContent.endsWith(' + attic')")
+    shown.until("document.querySelector('#payloads').textContent.includes('blimp-2 · attic')")
+    shown.page.click("#act-map")
+    shown.page.wait_for_selector("#map-dialog [aria-current='true'] >> text=Station attic")
+    with shown.page.expect_response("**/api/payloads/blimp-1/station") as asked:
+        shown.page.click("#map-dialog >> text=Whichever station has room")
+    assert asked.value.request.post_data_json == {"name": ""} and asked.value.status == 404
+    shown.page.wait_for_selector("#outcome[data-phase=refused]")
+    eventually(lambda: len(shown.problems) == 1)
+    assert "404 (Not Found)" in shown.problems.pop()
+    other["age_s"] = 9.0
+    shown.until("!document.querySelector('#station-name').textContent.includes('attic')")
+
+
 def test_events_are_newest_first_bounded_filtered_and_never_markup(
     shown: Watched, station: FlownStation
 ) -> None:
