@@ -107,6 +107,14 @@ def test_a_person_s_choice_holds_over_load_and_the_newest_one_everywhere() -> No
     assert station.leaves(here=[A, B], load=0.9, overloaded=True, attic=idle) == {B}
 
 
+def test_one_that_cannot_go_is_left_for_a_moment_only() -> None:
+    station, attic = Station(), Peer(0.2, False, HEARS)
+    station.policy.pin(A, Pin("attic", 10))
+    assert station.leaves(alone=[A], attic=attic) == {A}
+    station.now_s += ARRIVAL_S + 0.1
+    assert station.leaves(alone=[A], attic=attic) == set()
+
+
 def test_what_others_say_is_bounded() -> None:
     station = Station()
     for k in range(1000):

@@ -71,10 +71,12 @@ class Allocation:
         self._alone_s = {name: self._alone_s.get(name, now_s) for name in alone}
         result = {}
         for name in (*here, *alone):
+            if name in alone and now_s - self._alone_s[name] >= ARRIVAL_S:
+                continue  # nobody took it, or its address for video is fixed
             wanted = self.pins[name].station if name in self.pins else ""
             if wanted and wanted in others and name in others[wanted].hears:
                 result[name] = f"station '{wanted}' was chosen for it"
-            elif not wanted and name in alone and now_s - self._alone_s[name] < ARRIVAL_S:
+            elif not wanted and name in alone:
                 better = _best(name, load - ARRIVAL_APART, others)
                 if better:
                     result[name] = f"station '{better}' has less to do"

@@ -225,7 +225,7 @@ class Fleet:
                 n for n, (at_s, note) in self._here.items() if now_s - at_s < FRESH_S and note.alive
             }
             here = {n for n in heard if self._flies_here(n, now_s)}
-            alone = {n for n in here if self._here[n][1].rate_hz <= 0}
+            alone = {n for n in here if not _follows(self._here[n][1])}
             overloaded = now_s - self._overloaded_s < _OVERLOADED_S
             load = cpu / (os.cpu_count() or 1)
             peers = {n: Peer(o.load, o.overloaded, frozenset(o.hears)) for n, o in fresh.items()}
@@ -537,6 +537,11 @@ def _payload_of(name: str, request: Mapping[str, Any]) -> str:
     if name == _INTAKE and request.get("do") == _COMMAND:
         return str(request.get("payload"))
     return ""
+
+
+def _follows(note: PayloadMessage) -> bool:
+    """Whether a payload says that it found a station; one with a fixed address never does."""
+    return note.health is not None and bool(note.health.ground)
 
 
 def _what(request: Mapping[str, Any]) -> str:
