@@ -12,6 +12,8 @@ from pi_firmware.wire import video
 from pi_firmware.wire.annexb import NAL_AUD, NAL_IDR, NAL_SLICE, NAL_SPS, START_CODE
 
 HEADER_BYTES = 12
+CLOCK_HZ = 90_000
+"""Of timestamps of H.264 (RFC 6184, section 8.2.1)."""
 _STAP_A, _FU_A = 24, 28
 _FU_START, _FU_END = 0x80, 0x40
 MAX_JUMP = 3000

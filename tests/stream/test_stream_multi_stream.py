@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 import pytest
-from numbered_flight import encoded, number_in, packets, stamped
+from numbered_flight import GOP, encoded, number_in, packets, stamped
 from srtp_sender import SrtpSender
 
 from ground_station.stream import multi_stream
@@ -137,6 +137,27 @@ def test_a_stream_is_held_until_somebody_vouches_for_it() -> None:
         port.names[9] = "late"
         port.send(packets(units(), ssrc=9)[len(packets(units()[:20], ssrc=9)) :])
         assert until(lambda: port.shown("late") == [*range(FRAMES)])
+
+
+def test_what_was_sent_before_the_receiver_was_there_is_not_shown_once_more() -> None:
+    key = random.Random(6).randbytes(30)
+    sent = [stamped(unit, index) for index, unit in enumerate(encoded(5 * GOP))]
+    with SrtpSender(key) as sender:
+        made = sender.protect(packets(sent, ssrc=9))
+    began = len(packets(sent[: 4 * GOP], ssrc=9))
+    recorded = made[: len(packets(sent[:GOP], ssrc=9))]  # from the air, 1.5 s ago and more
+    with Port({}, srtp_keys={"one": key}) as port:
+        port.send(
+            [*recorded, *(d for two in zip(made[began:], recorded * 9, strict=False) for d in two)]
+        )
+        time.sleep(0.3)
+        port.names[9] = "one"
+        port.send([*recorded, *made[began:]])
+        assert until(lambda: port.shown("one") == [*range(4 * GOP, 5 * GOP)])
+        port.send(recorded)
+        time.sleep(0.3)
+        assert port.shown("one") == [*range(4 * GOP, 5 * GOP)]
+        assert port.receiver.counters.replayed >= len(recorded)
 
 
 def test_a_stream_taken_for_nobodys_goes_on_as_whose_it_is() -> None:
