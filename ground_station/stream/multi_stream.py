@@ -205,7 +205,6 @@ class _Candidate:
         return any((a + 1) & 0xFFFF == b for a, b in itertools.pairwise(numbers))
 
 
-
 def _of_now(packets: Iterable[rtp.Packet]) -> Iterator[rtp.Packet]:
     """The packets of a stream that begins, without what came before this receiver was there.
 
