@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from ground_station.stream import rtp
@@ -47,8 +47,8 @@ _ASK_NS = 100_000_000
 _CANDIDATES = 8
 _HELD_PACKETS = 512
 """Of a stream whose owner is not known yet: about a second, from its first packet on."""
-_GAP_S = 1.2
-"""Of a payload that sends there is a frame each second, its gate's heartbeat."""
+_LEAP_S = 0.5
+"""Packets of one stream come so much sooner or later than their times say, at most."""
 _CANDIDATE_NS = 10_000_000_000
 """A candidate silent for so long is forgotten."""
 _GIVE_WAY_NS = 500_000_000
@@ -205,23 +205,26 @@ class _Candidate:
         return any((a + 1) & 0xFFFF == b for a, b in itertools.pairwise(numbers))
 
 
-def _of_now(packets: Iterable[rtp.Packet]) -> Iterator[rtp.Packet]:
+def _of_now(packets: Iterable[rtp.Packet]) -> list[rtp.Packet]:
     """The packets of a stream that begins, without what came before this receiver was there.
 
-    Recorded from the air and sent again, it is authentic and none of it came here yet, but a gap of
-    `_GAP_S` in the stream's own time lies between it and what is sent now.
+    Recorded from the air and sent again, it is authentic, and none of it came here yet. But the
+    stream's own time leaps where it ends and what is sent now begins, and falls back from there.
     """
-    first: int | None = None
-    aged = []
+    kept: list[rtp.Packet] = []
+    newest: rtp.Packet | None = None
     for packet in packets:
-        first = packet.timestamp if first is None else first
-        aged.append(((packet.timestamp - first + (1 << 31)) % (1 << 32), packet))
-    since = max((at for at, _ in aged), default=0)
-    for at in sorted({at for at, _ in aged}, reverse=True):
-        if since - at > _GAP_S * rtp.CLOCK_HZ:
-            break
-        since = at
-    return (packet for at, packet in aged if at >= since)
+        if newest is not None:
+            ticks = (packet.timestamp - newest.timestamp + (1 << 31)) % (1 << 32) - (1 << 31)
+            ahead_s = ticks / rtp.CLOCK_HZ - 1e-9 * (packet.came_ns - newest.came_ns)
+            if ahead_s < -_LEAP_S:
+                continue
+            if ahead_s > _LEAP_S and ticks > _LEAP_S * rtp.CLOCK_HZ:
+                kept.clear()
+        kept.append(packet)
+        if newest is None or ticks > 0:
+            newest = packet
+    return kept
 
 
 class MultiStreamReceiver:
@@ -410,7 +413,7 @@ class MultiStreamReceiver:
         stream = Stream(source, owner, self.port, counters, self._on_frame, self._send)
         with self._changed:
             self._streams[source] = stream
-        packets = list(_of_now(candidate.packets))
+        packets = _of_now(candidate.packets)
         self._counters.replayed += len(candidate.packets) - len(packets)
         for packet in packets:
             stream.put(packet, candidate.address)

@@ -139,24 +139,31 @@ def test_a_stream_is_held_until_somebody_vouches_for_it() -> None:
         assert until(lambda: port.shown("late") == [*range(FRAMES)])
 
 
-def test_what_was_sent_before_the_receiver_was_there_is_not_shown_once_more() -> None:
+@pytest.mark.parametrize("age", [3, 1])
+def test_what_was_sent_before_the_receiver_was_there_is_not_shown_once_more(age: int) -> None:
+    """Recorded from the air: `age` groups of half a second lie between it and what is sent now."""
     key = random.Random(6).randbytes(30)
     sent = [stamped(unit, index) for index, unit in enumerate(encoded(5 * GOP))]
     with SrtpSender(key) as sender:
         made = sender.protect(packets(sent, ssrc=9))
-    began = len(packets(sent[: 4 * GOP], ssrc=9))
-    recorded = made[: len(packets(sent[:GOP], ssrc=9))]  # from the air, 1.5 s ago and more
+
+    def of(first: int, end: int) -> list[bytes]:
+        return made[len(packets(sent[:first], ssrc=9)) : len(packets(sent[:end], ssrc=9))]
+
+    began = 4 * GOP
+    recorded = of((3 - age) * GOP, began - age * GOP - GOP // 3)
+    now = of(began, 5 * GOP)
     with Port({}, srtp_keys={"one": key}) as port:
-        port.send(
-            [*recorded, *(d for two in zip(made[began:], recorded * 9, strict=False) for d in two)]
-        )
-        time.sleep(0.3)
-        port.names[9] = "one"
-        port.send([*recorded, *made[began:]])
-        assert until(lambda: port.shown("one") == [*range(4 * GOP, 5 * GOP)])
+        port.send(recorded)
+        port.send(now[: len(now) // 2])
         port.send(recorded)
         time.sleep(0.3)
-        assert port.shown("one") == [*range(4 * GOP, 5 * GOP)]
+        port.names[9] = "one"
+        port.send([*recorded, *now[len(now) // 2 :]])
+        assert until(lambda: port.shown("one") == [*range(began, 5 * GOP)])
+        port.send(recorded)
+        time.sleep(0.3)
+        assert port.shown("one") == [*range(began, 5 * GOP)]
         assert port.receiver.counters.replayed >= len(recorded)
 
 
