@@ -27,6 +27,8 @@ SILENT_S, RESTARTED_S = 5.0, 30.0
 RESUMED_S = 120.0
 GONE_FOR_S = 600.0
 CLOCKS_APART_S = 1.0
+EVERYWHERE = ("near/", "station/", "station-clock/", "station-map/")
+"""How the alarms begin that each of several stations finds by itself."""
 NEAR_OVER = 1.2
 DISK_WARNING_MB, DISK_OVER = 500.0, 1.2
 HOT_C, NO_MORE_HOT_C = 80.0, 76.0
@@ -266,7 +268,7 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
 
 
 def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    """Two blimps that are too near each other, whichever stations they fly with."""
+    """Two blimps in one map that are too near each other, whichever stations they fly with."""
     limit_m = _number(_table(state, "station").get("apart_m")) or 0.0
     where: dict[str, Any] = {}
     for payload_id, view in _table(state, "payloads").items():
@@ -274,10 +276,11 @@ def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterat
         position_m = [_number(value) for value in estimate.get("position_m") or ()]
         known = estimate.get("state") in ("TRACKING", "DEGRADED") and len(position_m) == 3
         if known and None not in position_m and age_s is not None and age_s <= NO_FRAMES_S:
-            where[payload_id] = position_m
+            where[payload_id] = estimate.get("map"), position_m
     for one, other in itertools.combinations(sorted(where), 2):
-        name, distance_m = f"near/{one}/{other}", math.dist(where[one], where[other])
-        if distance_m < limit_m * (NEAR_OVER if name in standing else 1.0):
+        (one_map, here), (other_map, there) = where[one], where[other]
+        name, distance_m = f"near/{one}/{other}", math.dist(here, there)
+        if one_map == other_map and distance_m < limit_m * (NEAR_OVER if name in standing else 1.0):
             yield Alarm(name, ALARM, one, f"{distance_m:.1f} m from {other}")
 
 

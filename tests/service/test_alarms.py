@@ -211,6 +211,11 @@ def test_two_blimps_that_are_near_each_other(told, apart_m, standing, found):
     assert (name in judged) == found
     if found:
         assert judged[name].alarm.text == f"{apart_m:.1f} m from z"
+    elsewhere = station.estimate(state="TRACKING", position_m=[1.0, 2.0, 3.1], map="another")
+    snapshot.estimate("z", elsewhere)
+    state = snapshot.document()
+    state["station"]["apart_m"] = 1.5
+    assert name not in alarms.judge(state, now_ns, {})  # not in one map: no distance
 
 
 def test_telemetry_without_any_video_names_the_firewall(told):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from scenarios.tcp_wire import TcpWire
 from ground_station.errors import GroundStationError, KeysError
 from ground_station.keys.authority import Authority
 from ground_station.service import bus_messages, settings
+from ground_station.service.alarms import Alarm
 from ground_station.service.bus import Bus, Router
 from ground_station.service.bus_messages import (
     EstimateMessage,
@@ -72,9 +73,9 @@ class Station:
             )
         self.endpoint = next(iter(self.fleet.listening), "")
 
-    def tell(self, *wants: str) -> None:
+    def tell(self, *wants: str, alarms: Sequence[Alarm] = ()) -> None:
         """As its page does four times a second."""
-        self.fleet.tell([], frozenset(wants), 0.5)
+        self.fleet.tell(list(alarms), frozenset(wants), 0.5)
 
     def others(self) -> list[str]:
         return [other["name"] for other in self.fleet.document()["stations"]]
@@ -246,6 +247,30 @@ def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations
     attic.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
     time.sleep(0.3)
     assert len(asked) == 1
+
+
+def test_alarms_are_told_once_with_their_station(stations: Any) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    found = [
+        Alarm("disk", "warning", "-", "little left"),
+        Alarm(f"battery/{BLIMP}", "alarm", BLIMP, "battery low"),
+        Alarm("battery/blimp-9", "alarm", "blimp-9", "of one that flies with nobody there"),
+        Alarm(f"near/{BLIMP}/blimp-2", "alarm", BLIMP, "1.0 m from blimp-2"),
+        Alarm("station/yard", "warning", "-", "nothing is heard of station 'yard'"),
+    ]
+
+    def told() -> bool:
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.tell(alarms=found)
+        return len(attic.fleet.alarms()) > 1
+
+    eventually(told, 10.0)
+    assert [(alarm["id"], alarm["text"]) for alarm in attic.fleet.alarms()] == [
+        ("hall/disk", "little left (station 'hall')"),
+        (f"hall/battery/{BLIMP}", "battery low (station 'hall')"),
+    ]
 
 
 def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: Any) -> None:

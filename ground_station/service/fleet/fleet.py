@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.service import bus_messages
-from ground_station.service.alarms import Alarm
+from ground_station.service.alarms import EVERYWHERE, Alarm
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import (
     EstimateMessage,
@@ -312,7 +312,10 @@ class Fleet:
             }
 
     def alarms(self) -> list[dict[str, Any]]:
-        """The alarms of the other stations and of the payloads that fly with them."""
+        """The alarms of the other stations and of the payloads that fly with them.
+
+        Those that this station finds by itself as well are left out.
+        """
         now_s = time.monotonic()
         with self._lock:
             return [
@@ -324,6 +327,7 @@ class Fleet:
                 for name, other in sorted(self._others.items())
                 if now_s - other.came_s < FRESH_S
                 for alarm in other.said.alarms
+                if not alarm.id.startswith(EVERYWHERE)
                 if alarm.payload == bus_messages.STATION
                 or self._flown(alarm.payload, now_s) == name
             ]
