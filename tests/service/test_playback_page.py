@@ -15,8 +15,12 @@ SHOWN_X = "Number(document.querySelector('[data-f=x]').textContent)"
 
 
 @pytest.fixture(scope="module")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    folder = tmp_path_factory.mktemp("station")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("station")
+
+
+@pytest.fixture(scope="module")
+def port(folder: Path) -> Iterator[int]:
     with serving(folder, write(folder / "flown.mcap")) as port:
         yield port
 
@@ -110,12 +114,11 @@ def test_the_way_back_to_live_is_always_there_and_leaves_nothing(page: Any) -> N
 
 
 def test_one_that_cannot_be_played_is_said_and_the_live_page_is_back(
-    page: Any, tmp_path_factory: pytest.TempPathFactory, port: int
+    page: Any, folder: Path
 ) -> None:
-    folder = next(iter(tmp_path_factory.getbasetemp().glob("station*")))
     (folder / "recordings" / "broken.mcap").write_bytes(b"no recording")
     play(page, "broken.mcap")
     until(page, "document.querySelector('#outcome').textContent.includes('no MCAP')")
     until(page, "document.querySelector('#link').dataset.phase === 'open'")
     assert page.locator("#tape").is_hidden()
-    Path(folder / "recordings" / "broken.mcap").unlink()
+    (folder / "recordings" / "broken.mcap").unlink()
