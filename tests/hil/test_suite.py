@@ -58,7 +58,8 @@ def test_cases_are_flown_judged_and_shown(tmp_path: Path) -> None:
     assert "MISSED position_max_m" in done.stdout
     assert "injected: proxy, seed 9: duplicate=0.1" in done.stdout
     told = json.loads((out / "suite.json").read_text())
-    assert [case["passed"] for case in told["cases"]] == [True, False] and not told["passed"]
+    assert [case["passed"] for case in told["cases"]] == [True, False], done.stdout
+    assert not told["passed"]
     run = told["cases"][0]["outcome"]
     counts, accounts = run["link_counts"], run["accounts"]
     assert accounts["captured"] == 20
