@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 import sys
 import threading
@@ -20,6 +22,17 @@ from ground_station.service.settings import load_run
 from pi_firmware.wire.errors import BlimpError
 
 _STEP_S = 0.1
+_M_ARENA_MAX = -8  # glibc's malloc.h
+
+
+def few_heaps() -> None:
+    """At most two heaps for all threads (glibc's mallopt(3); elsewhere nothing).
+
+    Each payload brings threads of its own, glibc gives them up to eight heaps a core, and what one
+    leaves in each of them adds up: 29 flights in an hour grew the intake by 8 MB.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
 def serve(folder: Path, stop: threading.Event) -> None:
@@ -48,6 +61,7 @@ def main() -> int:
     if len(sys.argv) != 2:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2
+    few_heaps()
     stop = ending(None)  # a recording ends in its own time
     import cv2
 
