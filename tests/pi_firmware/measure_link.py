@@ -1,18 +1,22 @@
-"""Instructions a frame of the payload's link: what README says of it, measured anew.
+"""What a frame of the payload's link costs: what README says of it, measured anew.
 
-    python tests/pi_firmware/measure_link.py [--only srtp,corrections]
+    python tests/pi_firmware/measure_link.py [--only srtp,corrections] [--time]
 
-Valgrind's callgrind counts a program that sends 60 frames and one that sends 180, of 4,200 bytes at
-30 Hz, and their difference is told: of Python, GStreamer and libsrtp, of this machine's kind of
-processor. Takes a minute or two for each kind of link.
+Valgrind's callgrind counts the instructions of a program that sends 60 frames and of one that sends
+180, of 4,200 bytes at 30 Hz, and their difference is told: of Python, GStreamer and libsrtp, of
+this machine's kind of processor. Takes a minute or two for each kind of link. `--time` tells
+processor time and memory in its place, on a board that has no valgrind: `whole_card.py` runs it on
+the emulated one.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import re
+import resource
 import shutil
 import socket
 import subprocess
@@ -92,55 +96,81 @@ class Receiver(threading.Thread):
                     self.socket.sendto(rtcp.nack(1, SSRC, [sequence]), whence)
 
 
-def instructions(name: str, frames: int) -> tuple[int, dict[int, int]]:
-    """Of one program, and how many packets it sent by payload type."""
-    receiver = Receiver(KINDS[name].asks)
-    receiver.start()
-    port = receiver.socket.getsockname()[1]
-    done = subprocess.run(
-        ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", sys.executable,
-         __file__, "--send", f"{name},{port},{frames}"],
-        capture_output=True, text=True, timeout=_LIMIT_S, check=False,
-        env={**os.environ, "PYTHONHASHSEED": "0"},
-    )  # fmt: skip
-    receiver.socket.sendto(b"", ("127.0.0.1", port))
-    receiver.join()
-    receiver.socket.close()
-    found = re.search(r"Collected : (\d+)", done.stderr)
-    if done.returncode or not found:
-        raise SystemExit(f"{name}: status {done.returncode}: {done.stderr[-800:]}")
-    return int(found[1]), receiver.counts
+class Sender:
+    """Programs that send, and what one frame more of each kind costs."""
 
+    def __init__(self, *, time_it: bool) -> None:
+        self._time_it = time_it
+        self.memory_mb: dict[str, float] = {}
+        """The most that the longer program held, by the kind of link."""
 
-def a_frame(name: str) -> float:
-    """Instructions for one frame more; tells what was sent."""
-    (few, _), (many, counts) = instructions(name, FEW), instructions(name, MANY)
-    print(f"{name}: packets of {MANY} frames by payload type: {counts}", file=sys.stderr)
-    return (many - few) / (MANY - FEW)
+    def frame(self, name: str) -> float:
+        """Instructions or processor seconds of one frame more; tells what was sent."""
+        (few, _), (many, counts) = self._run(name, FEW), self._run(name, MANY)
+        print(f"{name}: packets of {MANY} frames by payload type: {counts}", file=sys.stderr)
+        return (many - few) / (MANY - FEW)
+
+    def _run(self, name: str, frames: int) -> tuple[float, dict[int, int]]:
+        """Of one program, and how many packets it sent by payload type."""
+        receiver = Receiver(KINDS[name].asks)
+        receiver.start()
+        port = receiver.socket.getsockname()[1]
+        count = ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null"]
+        done = subprocess.run(
+            [*([] if self._time_it else count), sys.executable, __file__,
+             "--send", f"{name},{port},{frames}"],
+            capture_output=True, text=True, timeout=_LIMIT_S, check=False,
+            env={**os.environ, "PYTHONHASHSEED": "0"},
+        )  # fmt: skip
+        receiver.socket.sendto(b"", ("127.0.0.1", port))
+        receiver.join()
+        receiver.socket.close()
+        found = re.search(r"Collected : (\d+)", done.stderr)
+        if done.returncode or not (found or self._time_it):
+            raise SystemExit(f"{name}: status {done.returncode}: {done.stderr[-800:]}")
+        if found:
+            return int(found[1]), receiver.counts
+        seconds, self.memory_mb[name] = map(float, done.stdout.split())
+        return seconds, receiver.counts
 
 
 def main() -> int:
     """Tells a line for each kind of link that is asked for."""
-    parser = argparse.ArgumentParser(description="Instructions a frame of the payload's link.")
+    parser = argparse.ArgumentParser(description="What a frame of the payload's link costs.")
     parser.add_argument("--only", default=",".join(KINDS), help=f"of {', '.join(KINDS)}")
+    parser.add_argument("--time", action="store_true", help="processor time, not instructions")
+    parser.add_argument("--json", action="store_true", help="the figures of each kind, as JSON")
     parser.add_argument("--send", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.send:
         name, port, frames = options.send.split(",")
         send(name, int(port), int(frames))
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
         return 0
     names = options.only.split(",")
     if unknown := set(names) - KINDS.keys():
         parser.error(f"--only {', '.join(sorted(unknown))}: not one of {', '.join(KINDS)}")
-    if shutil.which("valgrind") is None:
-        parser.error("valgrind is not installed")
+    if not options.time and shutil.which("valgrind") is None:
+        parser.error("valgrind is not installed: --time tells processor time in its place")
+    sender = Sender(time_it=options.time)
     measured: dict[str, float] = {}
     for name in names:
         for one in filter(None, (name, KINDS[name].beside)):
             if one not in measured:
-                measured[one] = a_frame(one)
+                measured[one] = sender.frame(one)
+    if options.json:
+        print(json.dumps({"frame": measured, "memory_MB": sender.memory_mb}))
+        return 0
+    for name in names:
         more = measured[name] - measured.get(KINDS[name].beside, 0.0)
-        print(f"{KINDS[name].title}: {more:,.0f} a frame, {RATE_HZ * more / 1e6:.1f} M a second")
+        told = (
+            f"{1e3 * more:.2f} ms a frame, {100 * RATE_HZ * more:.1f} % of a core; "
+            f"{sender.memory_mb[name]:.1f} MB in all"
+            if options.time
+            else f"{more:,.0f} a frame, {RATE_HZ * more / 1e6:.1f} M a second"
+        )
+        print(f"{KINDS[name].title}: {told}")
     return 0
 
 

@@ -6,6 +6,8 @@ BLIMP_IMAGE. Figures go to out/hil-image.json. Seeds: BLIMP_SEED (default 1) dra
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import random
 import socket
@@ -42,8 +44,17 @@ for process in /proc/[0-9]*; do
   esac
 done
 """
-IMPORTS = """\
-PYTHONPATH=/usr/lib/blimp/release:/usr/lib/blimp/release/site python3 -c '
+PROCESSOR_OF_FIRMWARE = """
+for process in /proc/[0-9]*; do
+  case $(tr '\\0' ' ' 2>/dev/null <$process/cmdline) in
+    "/usr/bin/python3 -m pi_firmware "*) cut -d' ' -f14,15 $process/stat ;;
+  esac
+done
+getconf CLK_TCK
+"""
+RELEASE = "PYTHONPATH=/usr/lib/blimp/release:/usr/lib/blimp/release/site"
+IMPORTS = f"""\
+{RELEASE} python3 -c '
 import time
 begun = time.monotonic()
 import pi_firmware.__main__, pi_firmware.payload, zenoh
@@ -172,6 +183,40 @@ def test_how_long_the_firmware_takes_to_start(rig: Rig, figures: Figures) -> Non
     figures.add("imports_s", [round(s, 2) for s in imports_s])
     figures.add("loop_of_a_million_s", [round(s, 2) for s in loop_s])
     assert min(starts_s) < START_LIMIT_S
+
+
+def test_what_a_frame_costs_its_processor(rig: Rig, figures: Figures) -> None:
+    """The whole firmware's, as it flies, and the link's parts one by one.
+
+    In processor seconds of this emulation. A loop of a million beside says what these are worth:
+    it can be timed on any board.
+    """
+    ensure_up(rig)
+
+    def used() -> tuple[float, int]:
+        *ticks, a_second = map(int, rig.ssh(PROCESSOR_OF_FIRMWARE).split())
+        state = rig.ground.state()
+        assert state is not None and state.gate is not None
+        return sum(ticks) / a_second, state.gate.sequence
+
+    begun_s, first = used()
+    rig.run_until(rig.machine.age_s + STEADY_S)
+    ended_s, last = used()
+    figures.add("processor_s_a_frame", round((ended_s - begun_s) / (last - first), 4))
+    assert last > first
+    rig.ssh("sudo systemctl stop blimp-payload", limit_s=240)
+    try:
+        program = base64.b64encode((CHECKOUT / "tests/pi_firmware/measure_link.py").read_bytes())
+        rig.ssh(f"echo {program.decode()} | base64 -d >/tmp/measure_link.py")
+        told = rig.ssh(f"{RELEASE} python3 /tmp/measure_link.py --time --json", limit_s=600)
+        figures.add("loop_beside_s", round(float(rig.ssh(LOOP)), 2))
+    finally:
+        rig.ssh("sudo systemctl start blimp-payload", limit_s=240)
+    link = json.loads(told)
+    figures.add("link_processor_s_a_frame", {k: round(v, 5) for k, v in link["frame"].items()})
+    figures.add("link_memory_MB", {k: round(v, 1) for k, v in link["memory_MB"].items()})
+    # A second and a half of history at 1 Mbit/s are 0.2 MB.
+    assert link["memory_MB"]["history"] - link["memory_MB"]["bare"] < 10
 
 
 def test_no_unit_has_failed(rig: Rig) -> None:
