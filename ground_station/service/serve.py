@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,7 +67,8 @@ class _Parent:
     ) -> None:
         self._folder, self._settings, self._bus = folder, settings, bus
         self._lock = threading.Lock()
-        self._alive_s: dict[str, float] = {}
+        self._here_s: dict[str, float] = {}
+        self._elsewhere_s: dict[str, float] = {}
         specs = processes.table(folder, foxglove=settings.foxglove.enabled, demo=demo)
         self.children = Children(specs, self._report)
         bus.subscribe(
@@ -92,21 +94,33 @@ class _Parent:
     def _hear_payload(self, payload_id: str, note: PayloadMessage) -> None:
         if note.alive:
             with self._lock:
-                self._alive_s[payload_id] = time.monotonic()
+                seen_s = self._elsewhere_s if note.station else self._here_s
+                seen_s[payload_id] = time.monotonic()
 
     def _follow_payloads(self) -> None:
-        """A localizer for each payload that lives; one that is gone keeps its own for a minute."""
+        """A localizer for each payload that flies here, and for a minute after it has gone.
+
+        Some stand by for payloads of other stations, one for every two processors: a payload whose
+        station falls silent is found sooner by them.
+        """
         now_s = time.monotonic()
         with self._lock:
-            heard = dict(self._alive_s)
-        wanted = sorted(heard, key=lambda name: -heard[name])[: self._settings.payloads.most]
-        for payload_id, seen_s in heard.items():
+            here, elsewhere = dict(self._here_s), dict(self._elsewhere_s)
+        most = self._settings.payloads.most
+        wanted = _lately(here, now_s)[:most]
+        others = sorted(
+            set(_lately(elsewhere, now_s)) - set(wanted),
+            # Each station begins with another one of them.
+            key=lambda name: zlib.crc32(f"{self._settings.name}/{name}".encode()),
+        )
+        standing_by = max(1, (os.cpu_count() or 1) // 2)
+        wanted += others[: min(most - len(wanted), standing_by)]
+        for payload_id in {*here, *elsewhere}:
             spec = processes.localizer(self._folder, payload_id)
-            gone = now_s - seen_s > _GONE_S or payload_id not in wanted
-            if gone and spec.name in self.children:
-                self.children.remove(spec.name)
-            elif not gone:
+            if payload_id in wanted:
                 self.children.add(spec)
+            elif spec.name in self.children:
+                self.children.remove(spec.name)
 
     def _report(self, text: str) -> None:
         print(f"blimp serve: {text}", file=sys.stderr, flush=True)
@@ -115,6 +129,12 @@ class _Parent:
         )
         with contextlib.suppress(Exception):  # the bus may be what fails
             self._bus.publish(bus_messages.EVENT, bus_messages.STATION, note)
+
+
+def _lately(seen_s: dict[str, float], now_s: float) -> list[str]:
+    """Those seen within a minute, the newest first."""
+    names = [name for name, at_s in seen_s.items() if now_s - at_s <= _GONE_S]
+    return sorted(names, key=lambda name: -seen_s[name])
 
 
 @contextlib.contextmanager
