@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_lan_argument(parser)
     parser.add_argument(
         "--join", action="append", default=[], metavar="STATION",
-        help="address of another station of the same authority; each one's page shows the payloads"
-        " of both",
+        help="address of another station of the same authority, whose map is taken where none is"
+        " named; each one's page shows the payloads of both",
     )  # fmt: skip
     parser.add_argument(
         "--check", action="store_true", help="check the configuration and what it names, and exit"
@@ -57,6 +57,12 @@ def run(args: argparse.Namespace) -> int:
         loaded = lan.announced(loaded, args.lan)
     if args.join:
         loaded = lan.joined(loaded, args.join)
+    unnamed = args.map is None and loaded.map.folder == settings.MapSettings().folder
+    if loaded.fleet.join and unnamed:
+        from ground_station.service.fleet.maps import fetched
+
+        folder = dataclasses.replace(loaded.map, folder=str(fetched(loaded)))
+        loaded = dataclasses.replace(loaded, map=folder)
     if args.demo and args.map is None and args.config is None:
         shelf = dataclasses.replace(
             loaded.map, folder=str(settings.SAMPLE), shelf=str(settings.SAMPLE.parent)

@@ -112,8 +112,8 @@ class Service:
     """`blimp serve` on ports and in folders of its own; a context manager that checks its end.
 
     It flies as it is installed: with an authority of its own, so that telemetry is mutual TLS and
-    video SRTP; only the demo is without. A second station is given the first one's `authority`.
-    `place` is the private folder in memory in which a run's
+    video SRTP; only the demo is without. A second station is given the first one's `authority`, and
+    may take its map (not `map_named`). `place` is the private folder in memory in which a run's
     folder lies. What the service writes is kept over all its starts.
     """
 
@@ -125,6 +125,7 @@ class Service:
         demo: bool = False,
         name: str = "main",
         authority: Authority | None = None,
+        map_named: bool = True,
     ) -> None:
         self.folder = folder
         self.recordings = folder / "recordings"
@@ -136,7 +137,9 @@ class Service:
         self._tcp = (self.http, self.foxglove, telemetry)
         self.url = f"http://127.0.0.1:{self.http}"
         blimp = str(Path(sys.executable).with_name("blimp"))
-        self.command = [blimp, "serve", "--demo" if demo else f"--map={ATRIUM}"]
+        self.command = [blimp, "serve"]
+        if demo or map_named:
+            self.command += ["--demo" if demo else f"--map={ATRIUM}"]
         for setting in (
             f"http.port={self.http}",
             f"foxglove.port={self.foxglove}",

@@ -14,7 +14,7 @@ import pytest
 from intake_stand import eventually
 from scenarios.tcp_wire import TcpWire
 
-from ground_station.errors import GroundStationError, KeysError
+from ground_station.errors import GroundStationError, InputError, KeysError
 from ground_station.keys.authority import Authority
 from ground_station.service import bus_messages, settings
 from ground_station.service.alarms import Alarm
@@ -25,8 +25,10 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
+from ground_station.service.fleet import maps
 from ground_station.service.fleet.fleet import FRESH_S, Fleet
 from ground_station.service.fleet.messages import map_id
+from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.settings import SAMPLE
 
 BLIMP = "blimp-1"
@@ -396,3 +398,59 @@ def test_what_is_no_message_is_counted_and_dropped(stations: Any) -> None:
     taken = {name for kind, name, _ in attic.heard if kind == "payload"}
     assert 0 < len(taken) <= 64 and acquainted(hall, attic)
     assert all(note.station == "hall" for kind, _, note in attic.heard if kind == "payload")
+
+
+def test_a_map_is_fetched_once_by_its_content(
+    stations: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hall = stations("hall")
+    shelf = tmp_path / "shelf"
+
+    def fetch() -> Path:
+        folder = stations.authority.of("ground.attic")
+        chosen = [f"telemetry.certificates={folder}", f"map.shelf={shelf}"]
+        joined = [
+            f"fleet.join={json.dumps([hall.endpoint])}",
+            'telemetry.listen=["tls/127.0.0.1:0"]',
+        ]
+        return maps.fetched(settings.load(None, [*chosen, *joined]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(maps, "_LOOK_S", 0.5)
+        nobody, hall.endpoint = hall.endpoint, "tls/127.0.0.1:9"
+        with pytest.raises(InputError, match=r"no station answered within .* --map"):
+            fetch()
+        hall.endpoint = nobody
+    folder = fetch()
+    assert folder.parent == shelf and folder.name.startswith("atrium-")
+    assert "was fetched" in capsys.readouterr().out
+    assert map_id(folder) == map_id(SAMPLE)  # so that poses are shown here and there
+    for name in ("landmarks.safetensors", "keyframes.safetensors", "floorplan.png"):
+        assert (folder / name).read_bytes() == (SAMPLE / name).read_bytes()
+    assert not (folder / "flight.mcap").exists()
+    assert fetch() == folder and "is here already" in capsys.readouterr().out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(maps, "_LOOK_S", 0.0)
+        assert fetch() == folder and "fetched last" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc/passwd", ".hidden", "a/b", "", "x\n", "n" * 70])
+def test_a_file_of_a_map_cannot_lie_elsewhere(name: str, tmp_path: Path) -> None:
+    entry = {"map": "hall", "file": name, "size": 1, "sha256": "0"}
+    other = {**entry, "file": "map.toml", "map": name}
+    for listed in ([entry], [other], [], "text", [1], [{**entry, "file": "a", "size": -1}]):
+        theirs = Elsewhere(lambda _: b"x", "hall")
+        with pytest.raises(InputError, match="no map that can be fetched"):
+            maps._fetch(theirs, "hall", listed, tmp_path / "shelf")
+    assert not (tmp_path / "shelf").exists()
+
+
+def test_a_map_that_changed_meanwhile_leaves_nothing(tmp_path: Path) -> None:
+    theirs = Elsewhere(lambda _: b"x", "hall")
+    listed = [{"map": "hall", "file": "map.toml", "size": 1, "sha256": "another"}]
+    with pytest.raises(InputError, match="changed there meanwhile"):
+        maps._fetch(theirs, "hall", listed, tmp_path)
+    gone = Elsewhere(lambda _: b"", "hall")
+    with pytest.raises(GroundStationError, match="did not answer"):
+        maps._fetch(gone, "hall", listed, tmp_path)
+    assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,7 @@ def alarms(service: Service) -> dict[str, str]:
 
 
 def joined(folder: Path) -> tuple[Service, Service]:
-    """Two stations of one authority, the second of which joins the first."""
+    """Two stations of one authority, the second of which joins the first and takes its map."""
     for name in ("first", "second"):
         (folder / name).mkdir()
     fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
@@ -33,8 +33,10 @@ def joined(folder: Path) -> tuple[Service, Service]:
     second = Service(
         folder / "second",
         f"fleet.join={json.dumps([fleet])}",
+        f"map.shelf={folder / 'maps'}",
         name="spare",
         authority=first.authority,
+        map_named=False,
     )
     return first, second
 

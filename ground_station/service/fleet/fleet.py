@@ -32,16 +32,19 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.fleet.allocation import Allocation, Peer, Pin
+from ground_station.service.fleet.maps import MAP, MapFiles
 from ground_station.service.fleet.messages import (
     ALARMS,
+    MESSAGE_BYTES,
     PAYLOADS,
     ROOT,
+    SESSION,
     WANTS,
     StationMessage,
     map_id,
     rules,
 )
-from ground_station.service.fleet.shelf import Elsewhere, Shelf, read
+from ground_station.service.fleet.shelf import TIMEOUT_S, Elsewhere, Shelf, ask, read
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
@@ -57,9 +60,7 @@ _SEEN_HZ, _WATCHED_HZ = 5.0, 15.0
 """Poses of a payload that somebody elsewhere looks at go there more often, with its points."""
 _LOOK_S = 5.0
 _OVERLOADED_S = 2.0
-_MESSAGE_BYTES = 512 * 1024
 _STATIONS = 32
-_TIMEOUT_S = 6.0
 _INTAKE, _LOCALIZER = "intake", "localizer/"
 _COMMAND = "payload-command"
 _ASKED = "asked"
@@ -126,10 +127,7 @@ class Fleet:
             connect=settings.fleet.join,
             certificates=settings.telemetry.certificates,
             rules=rules(self._held),
-            more={
-                "scouting/gossip/enabled": True,  # who joins one finds the others through it
-                "transport/link/rx/max_message_size": _MESSAGE_BYTES,
-            },
+            more=SESSION,
         )
         self.listening = self._session.listening
         self._hears = [self._hear(f"{ROOT}/*/{kind}/*") for kind in (_STATION, *_TOLD)]
@@ -169,7 +167,7 @@ class Fleet:
         self._bus.publish(kind, payload_id, message)
 
     def query(
-        self, name: str, request: Mapping[str, Any], timeout_s: float = _TIMEOUT_S
+        self, name: str, request: Mapping[str, Any], timeout_s: float = TIMEOUT_S
     ) -> Mapping[str, Any]:
         """Asks a process of this station, or of the one that the payload in question flies with."""
         payload_id = _payload_of(name, request)
@@ -186,17 +184,10 @@ class Fleet:
         return {"done": False, "reason": f"station '{station}' did not answer"}
 
     def _ask(
-        self, station: str, name: str, request: Mapping[str, Any], timeout_s: float = _TIMEOUT_S
+        self, station: str, name: str, request: Mapping[str, Any], timeout_s: float = TIMEOUT_S
     ) -> bytes:
         """What another station answers at a name; empty without an answer in time."""
-        body = json.dumps({"by": self.name, "request": request}).encode()
-        with contextlib.suppress(Exception):
-            for reply in self._session.zenoh.get(
-                f"{ROOT}/{station}/do/{name}", payload=body, timeout=timeout_s
-            ):
-                if reply.ok is not None:
-                    return bytes(reply.ok.payload.to_bytes())
-        return b""
+        return ask(self._session, self.name, station, name, request, timeout_s)
 
     def knows(self, station: str) -> bool:
         """Whether a station flies beside this one."""
@@ -265,7 +256,7 @@ class Fleet:
 
     def picture(self, payload_id: str, message: bytes) -> None:
         """A picture of a payload that flies here; it goes to those who look at it elsewhere."""
-        if payload_id in self.wanted() and len(message) < _MESSAGE_BYTES:
+        if payload_id in self.wanted() and len(message) < MESSAGE_BYTES:
             self._put(_PICTURE, payload_id, message)
 
     def wanted(self) -> frozenset[str]:
@@ -496,8 +487,11 @@ class Fleet:
             if name == _RECORDINGS and self.shelf is not None:
                 query.reply(query.key_expr, read(self.shelf, request))
                 return
+            if name == MAP:
+                query.reply(query.key_expr, read(MapFiles(self._map), request))
+                return
             if payload_id:
-                answer = self._bus.query(name, request, timeout_s=_TIMEOUT_S)
+                answer = self._bus.query(name, request, timeout_s=TIMEOUT_S)
                 self._say(payload_id, f"{_what(request)} was asked for at station '{by}'")
         with contextlib.suppress(Exception):  # whoever asked may be gone
             query.reply(query.key_expr, json.dumps(answer).encode())

@@ -19,6 +19,12 @@ from pi_firmware.wire.credentials import IN, OUT, SERVE
 ROOT = "fleet"
 PAYLOADS, ALARMS, WANTS = 64, 64, 16
 """Of one station's message, at most."""
+MESSAGE_BYTES = 512 * 1024
+SESSION = {
+    "scouting/gossip/enabled": True,  # who joins one finds the others through it
+    "transport/link/rx/max_message_size": MESSAGE_BYTES,
+}
+"""Of Zenoh's settings, those between stations."""
 
 Word = Annotated[str, Meta(max_length=128)]
 

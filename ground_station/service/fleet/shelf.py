@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from ground_station.errors import GroundStationError
+from ground_station.service.fleet.messages import ROOT
 from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.telemetry import Session
 
-_LISTED, _PIECE_BYTES = 500, 256 * 1024
+PIECE_BYTES = 256 * 1024
+_LISTED = 500
+TIMEOUT_S = 6.0
 
 
 class Shelf(Protocol):
@@ -20,6 +25,25 @@ class Shelf(Protocol):
     def size(self, name: str) -> int: ...
 
     def pieces(self, name: str, begin: int, end: int) -> Iterator[bytes]: ...
+
+
+def ask(
+    session: Session,
+    own: str,
+    station: str,
+    name: str,
+    request: Mapping[str, Any],
+    timeout_s: float = TIMEOUT_S,
+) -> bytes:
+    """What a station answers at a name to the station `own`; empty without an answer in time."""
+    body = json.dumps({"by": own, "request": request}).encode()
+    with contextlib.suppress(Exception):  # Zenoh's, of a session that is being closed
+        for reply in session.zenoh.get(
+            f"{ROOT}/{station}/do/{name}", payload=body, timeout=timeout_s
+        ):
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+    return b""
 
 
 class Elsewhere:
@@ -62,6 +86,6 @@ def read(shelf: Shelf, request: Mapping[str, Any]) -> bytes:
         if do == "size":
             return json.dumps(shelf.size(file)).encode()
         begin, end = int(request["begin"]), int(request["end"])
-        return next(shelf.pieces(file, begin, min(end, begin + _PIECE_BYTES)), b"")
+        return next(shelf.pieces(file, begin, min(end, begin + PIECE_BYTES)), b"")
     except (BlimpError, OSError):
         return b"null" if do != "read" else b""
