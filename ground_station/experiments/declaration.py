@@ -13,10 +13,11 @@ from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
 SHIPPED = Path(__file__).with_name("experiments.toml")
-PRESETS = ("thesis", "default")
-"""Both localize the same frames, in this order of columns."""
+PRESETS = ("thesis", "alone", "default")
+"""They localize the same frames, in this order of columns; `alone` is each frame by itself."""
 
-FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "gap_s", "inside_95")
+FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "first_s", "gap_s",
+           "inside_95")  # fmt: skip
 """Of a run, one number each, that are averaged over the seeds."""
 
 T = TypeVar("T")
@@ -124,7 +125,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Case:
-    """One row: a map, a flight and settings; both presets localize it, once for each seed."""
+    """One row: a map, a flight and settings; each preset localizes it, once for each seed."""
 
     experiment: str
     name: str

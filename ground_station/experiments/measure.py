@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.evaluation import ate
+from ground_station.experiments.alone import FEATURES, Alone
 from ground_station.experiments.alter import altered, arrivals, scaled_camera
 from ground_station.experiments.declaration import Alteration
 from ground_station.experiments.material import Flown
@@ -28,46 +29,69 @@ _SAME_S = 0.005
 """A frame is judged by a true pose within this time of its own."""
 _NEAR_M = 0.5
 """A place is found again when the pose is so near the true one."""
+_WRONG_M, _WRONG_DEG = 0.25, 3.0
 _STAGES = ("features", "projection", "association", "pose", "total")
 
 
 def measure(
-    map_: Map, flight: Flown, alteration: Alteration, settings: LocalizerSettings, seed: int
+    map_: Map,
+    flight: Flown,
+    alteration: Alteration,
+    preset: str,
+    settings: LocalizerSettings,
+    seed: int,
 ) -> dict[str, Any]:
-    """Localizes a flight from its true first pose; plain values for the report.
+    """Localizes a flight; plain values for the report.
 
-    `series` has for each localized frame: time since the flight's first frame (s), position in the
-    world (m), both errors. Errors are of the unaligned poses; None where no frame was localized.
+    Only the preset thesis is told its true first pose: its method has no other way to begin.
+    `first_s` is the time to the first right pose of one that is not, `wrong` counts the frames that
+    are TRACKING and further off than 0.25 m or 3°. `series` has for each localized frame: time
+    since the flight's first frame (s), position in the world (m), both errors. Errors are of the
+    unaligned poses; None where no frame was localized.
     """
     features = replace(settings.features, extractor=OF_THE_MAP)
     settings = replace(settings, features=features)
     camera = scaled_camera(flight.camera, alteration.scale)
-    extractor = extractor_for(map_.info, features)
-    localizer = Localizer(map_, camera, extractor, settings, smoothing=True)
+    process: Callable[..., PoseEstimate]
+    if preset == "alone":
+        plain = replace(features, max_features=FEATURES)
+        process = Alone(map_, camera, extractor_for(map_.info, plain)).process
+    else:
+        extractor = extractor_for(map_.info, features)
+        localizer = Localizer(map_, camera, extractor, settings, smoothing=True)
+        process = localizer.process
     lossy = alteration.packet_loss > 0 and flight.recording is not None
     arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
     start_ns = next(iter(flight.frames)).time_ns
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     for frame in altered(flight.frames, alteration, arrived):
-        if not estimates:
+        if preset == "thesis" and not estimates:
             nearest = flight.truth.nearest(frame.time_ns)
             localizer.set_initial_pose(flight.truth.wTc[nearest], frame.time_ns)
-        estimates.append(
-            localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
-        )
-        smoothed += localizer.smoothed()
-    smoothed += localizer.finish()
+        estimates.append(process(frame.time_ns, frame.image, frame.index, frame.exposure_s))
+        if preset != "alone":
+            smoothed += localizer.smoothed()
+    if preset != "alone":
+        smoothed += localizer.finish()
+    tracking = [e for e in estimates if e.state is State.TRACKING and e.wTc is not None]
+    off = [(e, error) for e in tracking if (error := _off(e, flight.truth)) is not None]
+    right = [e.time_ns for e, error in off if _right(error)]
     captured = flight.frames.count() or len(estimates)
     return {
         "frames": -(-captured // alteration.every),
         "seen": len(estimates),
         "localized": sum(e.localized for e in estimates),
-        "tracking": sum(e.state is State.TRACKING for e in estimates),
+        "tracking": len(tracking),
+        "wrong": sum(not _right(error) for _, error in off),
+        "first_s": (right[0] - start_ns) / 1e9 if right and preset != "thesis" else None,
         "landmarks": len(map_.landmarks),
         "keyframes": len(map_.keyframes),
         "stage_s": _stages(estimates),
         "recovery_s": _recovery_s(estimates, flight.truth, alteration),
+        "consistency": _consistency(
+            [(c, error) for e, error in off if (c := e.covariance) is not None]
+        ),
         **_errors(estimates, flight.truth, start_ns),
         **_smoothed(smoothed, flight.truth),
     }
@@ -77,14 +101,13 @@ def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory, start_ns: int)
     found = _pairs(results.trajectory(estimates), truth)
     nothing = ("position_m", "rotation_deg", "position_zhang_m", "aligned_m", "p95_m")
     if found is None:
-        return dict.fromkeys(nothing) | {"series": {}, "consistency": None}
+        return dict.fromkeys(nothing) | {"series": {}}
     estimate, true = found
     errors = ate.errors(estimate, true)
     return {
         **errors.rmse(),
         "aligned_m": _aligned_m(estimate, true),
         "p95_m": float(np.percentile(errors.position_m, 95)),
-        "consistency": _consistency(estimates, truth),
         "series": {
             "time_s": _rounded((estimate.time_ns - start_ns) / 1e9),
             "x_m": _rounded(estimate.position_m[:, 0]),
@@ -116,20 +139,28 @@ def _aligned_m(estimate: Trajectory, truth: Trajectory) -> float | None:
         return None
 
 
-def _consistency(estimates: Sequence[PoseEstimate], truth: Trajectory) -> dict[str, float] | None:
+def _off(e: PoseEstimate, truth: Trajectory) -> F64 | None:
+    """A pose's error (6,) in the camera's axes, rad and m; None without a truth of its time."""
+    nearest = truth.nearest(e.time_ns)
+    if e.wTc is None or abs(int(truth.time_ns[nearest]) - e.time_ns) > _SAME_S * 1e9:
+        return None
+    return poses.log(poses.inverse(e.wTc) @ truth.wTc[nearest])
+
+
+def _right(error: F64) -> bool:
+    turn_deg, step_m = np.degrees(np.linalg.norm(error[:3])), np.linalg.norm(error[3:])
+    return bool(step_m <= _WRONG_M and turn_deg <= _WRONG_DEG)
+
+
+def _consistency(found: Sequence[tuple[F64, F64]]) -> dict[str, float] | None:
     """How well errors fit their covariances: the mean NEES (6 where they fit; Bar-Shalom et al.,
 
     Estimation with Applications to Tracking and Navigation, 2001, 5.4) and the share of frames
     inside the 95 % ellipsoid. None where no covariance was published.
     """
-    values = []
-    for e in estimates:
-        if e.wTc is None or e.covariance is None or e.state is not State.TRACKING:
-            continue
-        error = poses.log(poses.inverse(e.wTc) @ truth.at(e.time_ns))
-        values.append(float(error @ np.linalg.solve(e.covariance, error)))
-    if not values:
+    if not found:
         return None
+    values = [float(error @ np.linalg.solve(covariance, error)) for covariance, error in found]
     inside = np.asarray(values) <= _CHI2_95_6
     return {"nees": float(np.mean(values)), "inside_95": float(np.mean(inside))}
 

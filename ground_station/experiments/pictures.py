@@ -13,6 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 
 from ground_station.arrays import F64
 from ground_station.evaluation.plots import show_floorplan
+from ground_station.experiments.tables import NAMES
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import Theme, sheet, themed
 
@@ -25,7 +26,7 @@ _LABELS_IN, _BAR_IN = 0.75, 0.7
 """Room for a panel's numbers and title, and for the bar of colours below all."""
 _COLOURS = "cividis"
 """Even in lightness, and the same to every colour vision (Nuñez, Anderton, Renslow, 2018)."""
-_STYLES = {"thesis": "--", "default": "-"}
+_STYLES = {"thesis": "--", "alone": ":", "default": "-"}
 _HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's, readable on both papers."""
 
@@ -67,7 +68,7 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, theme: Theme)
 
 
 def over_time(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
-    """Position error of each case's first seed over time, the preset thesis dashed."""
+    """Position error of each case's first seed over time: thesis dashed, alone dotted."""
     figure, (axes,) = _figure(1, 1, (8.0, 3.2), theme)
     for hue, case in zip(_hues(len(cases)), cases, strict=True):
         for preset, style in _STYLES.items():
@@ -85,7 +86,7 @@ def over_time(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
 
 
 def distribution(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
-    """The share of a flight's frames within an error, over all seeds; the thesis's way dashed.
+    """The share of a flight's frames within an error, over all seeds: thesis dashed, alone dotted.
 
     Frames that were not localized count: a line that ends below 1 has lost the rest.
     """
@@ -114,14 +115,15 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, theme: Theme) -> Figure:
     """Position error and share localized over what the cases vary, mean and spread."""
     figure, (upper, lower) = _figure(2, 1, (8.0, 4.6), theme)
     places = np.arange(len(cases))
-    for (preset, style), hue in zip(_STYLES.items(), (theme.second, theme.estimate), strict=True):
+    for (preset, style), hue in zip(
+        _STYLES.items(), (theme.second, theme.limit, theme.estimate), strict=True
+    ):
         found = [case["presets"].get(preset, {}) for case in cases]
         mean = [_value(row.get("position_m"), "mean") for row in found]
         std = [_value(row.get("position_m"), "std") for row in found]
-        name = "default" if preset == "default" else "preset thesis"
         upper.errorbar(
             places, 100 * np.asarray(mean), 100 * np.asarray(std), fmt="o" + style, color=hue,
-            capsize=3, linewidth=1.2, markersize=4, label=name,
+            capsize=3, linewidth=1.2, markersize=4, label=NAMES[preset],
         )  # fmt: skip
         share = [np.nan if row.get("localized") is None else row["localized"] for row in found]
         lower.plot(places, 100 * np.asarray(share), "o" + style, color=hue, markersize=4, lw=1.2)

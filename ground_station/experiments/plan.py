@@ -57,6 +57,7 @@ class RunJob:
     recording: str | None
     seed: int
     alter: Alteration
+    preset: str
     settings: LocalizerSettings
 
 
@@ -96,7 +97,9 @@ def _runs(
     data: Path,
 ) -> list[str]:
     where = f"experiment '{case.experiment}', case '{case.name}', preset '{preset}'"
-    settings = changed(load_preset(preset), case.localizer, where)
+    settings = load_preset("default")  # of `alone` its features' only
+    if preset != "alone":
+        settings = changed(load_preset(preset), case.localizer, where)
     spec, flight = case.map, case.flight
     map_job = _map(plan, spec, mapping, data)
     seeds = declaration.seeds if flight.simulated else declaration.seeds[:1]
@@ -113,13 +116,14 @@ def _runs(
             "flight": needs[1] if flight.simulated else _real(flight, data),
             "seed": seed,
             "alter": asdict(case.alter),
+            "preset": preset,
             "settings": asdict(settings),
             "code": code_sha256("run"),
         }
         key = _key("run", depends)
         name = f"{case.experiment}: {case.title}, {preset}, seed {seed}"
-        _add(plan, RunJob(key, name, map_job.key, flight, recording, seed, case.alter, settings),
-             tuple(needs))  # fmt: skip
+        job = RunJob(key, name, map_job.key, flight, recording, seed, case.alter, preset, settings)
+        _add(plan, job, tuple(needs))
         keys.append(key)
     return keys
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ground_station.errors import GroundStationError, InputError
 from ground_station.experiments import tables
-from ground_station.experiments.report import PRINTED, conditions
+from ground_station.experiments.report import PRINTED
 from ground_station.files import finite, write_text
 from ground_station.presentation.readme import Block
 from ground_station.presentation.text import markdown
@@ -34,17 +34,20 @@ _OF_PRESET = {
 
 def render(document: dict[str, Any]) -> str:
     """The verdict, a table of all rows that are no levels, and one with a line for each series."""
-    rows = [["experiment", "thesis's own*", *tables.NAMES.values(), "inside 95 %"]]
-    series = [["position error, over the frames localized", *tables.NAMES.values()]]
+    presets = tables.seen(document)
+    names = [tables.NAMES[preset] for preset in presets]
+    rows = [["experiment", "thesis's own*", *names, "inside 95 %"]]
+    series = [["position error, over the frames localized", *names]]
     for e in document["experiments"]:
         if e["level"]:
-            series.append([f"{e['title']} ({e['level']})", *(_levels(e, p) for p in tables.NAMES)])
+            series.append([f"{e['title']} ({e['level']})", *(_levels(e, p) for p in presets)])
             continue
         for case in e["cases"]:
             title, printed = f"{e['title']}: {case['title']}", tables.printed(case)
-            rows.append([title, printed, *_presets(case), tables.inside(case)])
+            shown = [tables.figures(case, preset) for preset in presets]
+            rows.append([title, printed, *shown, tables.inside(case)])
     parts = [markdown(table).rstrip() for table in (rows, series) if len(table) > 1]
-    said = f"{conditions(document)} {PRINTED}"
+    said = f"{document['conditions']} {PRINTED}"
     return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 
 
@@ -73,7 +76,9 @@ def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
 
 def shown(document: dict[str, Any]) -> dict[str, Any]:
     """What README's table and its check need of a run."""
-    kept: dict[str, Any] = {key: document[key] for key in ("quick", "seeds", "worse", "claims")}
+    kept: dict[str, Any] = {
+        key: document[key] for key in ("quick", "seeds", "conditions", "worse", "claims")
+    }
     kept["experiments"] = [_part(e, _OF_EXPERIMENT) for e in document["experiments"]]
     for experiment, e in zip(kept["experiments"], document["experiments"], strict=True):
         experiment["cases"] = [
@@ -110,7 +115,3 @@ def _levels(experiment: dict[str, Any], preset: str) -> str:
     return "; ".join(
         f"{case['title']}: {tables.in_short(case, preset)}" for case in experiment["cases"]
     )
-
-
-def _presets(case: dict[str, Any]) -> list[str]:
-    return [tables.figures(case, preset) for preset in tables.NAMES]

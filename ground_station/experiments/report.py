@@ -63,7 +63,8 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
 
 def markdown(document: dict[str, Any]) -> str:
     """All tables, after the verdict."""
-    parts = [tables.verdict(document), conditions(document), PRINTED]
+    quick = f" {QUICK}" if document["quick"] else ""
+    parts = [tables.verdict(document), document["conditions"] + quick, PRINTED]
     parts += ["\n".join(f"- {claims.line(claim)}" for claim in document["claims"])]
     for experiment in document["experiments"]:
         title = f"### {experiment['title']}"
@@ -76,17 +77,6 @@ def markdown(document: dict[str, Any]) -> str:
 def good(document: dict[str, Any]) -> bool:
     """Whether the default is the better one in all rows and no claim is broken."""
     return not document["worse"] and all(c["kept"] is not False for c in document["claims"])
-
-
-def conditions(document: dict[str, Any]) -> str:
-    """How it was measured, in a sentence or two."""
-    seeds = document["seeds"]
-    quick = f" {QUICK}" if document["quick"] else ""
-    return (
-        f"Simulated flights, seeds {', '.join(map(str, seeds))}, unless real video is named; both "
-        "presets localize the same frames from the true first pose; errors are unaligned RMSE "
-        f"over the frames that were localized, mean ± standard deviation over the seeds.{quick}"
-    )
 
 
 def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Shown]:
@@ -109,11 +99,12 @@ def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Show
                   lambda theme: pictures.paths(cases, plan, theme))
         )  # fmt: skip
     found.append(
-        shown("Error over time, the preset thesis dashed", f"{name}: position error over time",
+        shown("Error over time: preset thesis dashed, each frame alone dotted",
+              f"{name}: position error over time",
               lambda theme: pictures.over_time(cases, theme))
     )  # fmt: skip
     found.append(
-        shown("Share of frames within an error, the preset thesis dashed",
+        shown("Share of frames within an error: preset thesis dashed, each frame alone dotted",
               f"{name}: distribution of the position error",
               lambda theme: pictures.distribution(cases, theme))
     )  # fmt: skip

@@ -14,7 +14,14 @@ from ground_station.experiments.declaration import FIGURES, Case, Declaration
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
 
-_COVERAGE = 0.005
+CONDITIONS = (
+    "Simulated flights, seeds {}, unless real video is named; all localize the same frames, and "
+    "only the preset thesis is told where it starts; errors are unaligned RMSE over the frames "
+    "that were localized, mean ± standard deviation over the seeds."
+)
+RIVALS = {"thesis": "the thesis's method", "alone": "each frame alone"}
+"""What the default is held against, and how it is called in a sentence."""
+_SHARE = 0.005
 """A smaller share localized by more than this is worse."""
 
 
@@ -44,6 +51,7 @@ def summarise(
     ]
     return about | {
         "seeds": list(declaration.seeds),
+        "conditions": CONDITIONS.format(", ".join(map(str, declaration.seeds))),
         "worse": worse,
         "claims": claims.judge(declaration.claims, experiments),
         "experiments": experiments,
@@ -56,7 +64,7 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         for preset, keys in plan.runs[case.experiment, case.name].items()
     }
     presets = {preset: aggregate(runs) for preset, runs in found.items()}
-    _common(found, presets)
+    common = _common(found)
     return {
         "name": case.name,
         "title": case.title,
@@ -66,7 +74,8 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         "alter": asdict(case.alter),
         "localizer": dict(case.localizer),
         "presets": presets,
-        "worse": worse(presets),
+        "common": common,
+        "worse": worse(presets, common),
     }
 
 
@@ -104,6 +113,7 @@ def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "failed": [str(run["failed"]) for run in runs if "failed" in run],
         "accidents": [str(run["failed"]) for run in runs if run.get("accident")],
         "localized": sum(run["localized"] for run in good) / frames if frames else None,
+        "wrong": sum(run["wrong"] for run in good),
         "landmarks": good[0]["landmarks"] if good else None,
         "keyframes": good[0]["keyframes"] if good else None,
         "stage_s": _median_of(good, "stage_s"),
@@ -128,55 +138,56 @@ def statistics(values: Sequence[float | None]) -> dict[str, float | int] | None:
     }
 
 
-def _common(found: dict[str, list[dict[str, Any]]], presets: dict[str, Any]) -> None:
-    """Adds `common_m` and `common_deg`: errors over the frames that both presets localized.
+def _common(found: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """By rival: statistics `ours` and `theirs` of errors over the frames that both localized.
 
     A localizer that gives up when it gets hard has the smaller error over its own frames.
     """
-    if set(found) != {"thesis", "default"}:
-        return
-    for key, name in (("common_m", "position_m"), ("common_deg", "rotation_deg")):
-        values: dict[str, list[float | None]] = {preset: [] for preset in found}
-        for pair in zip(*found.values(), strict=True):
-            series = [run.get("series") or {"time_s": [], name: []} for run in pair]
-            both = set(series[0]["time_s"]) & set(series[1]["time_s"])
-            for preset, one in zip(found, series, strict=True):
-                errors = [e for t, e in zip(one["time_s"], one[name], strict=True) if t in both]
-                rmse = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
-                values[preset].append(rmse)
-        for preset in found:
-            presets[preset][key] = statistics(values[preset])
+    result: dict[str, Any] = {}
+    for rival in RIVALS.keys() & found.keys() if "default" in found else ():
+        result[rival] = {}
+        for name in ("position_m", "rotation_deg"):
+            values: dict[str, list[float | None]] = {"ours": [], "theirs": []}
+            for pair in zip(found["default"], found[rival], strict=True):
+                series = [run.get("series") or {"time_s": [], name: []} for run in pair]
+                both = set(series[0]["time_s"]) & set(series[1]["time_s"])
+                for whose, one in zip(values, series, strict=True):
+                    errors = [e for t, e in zip(one["time_s"], one[name], strict=True) if t in both]
+                    rmse = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
+                    values[whose].append(rmse)
+            result[rival][name] = {whose: statistics(v) for whose, v in values.items()}
+    return result
 
 
-def worse(presets: dict[str, Any]) -> list[str]:
-    """In what the default is not better than the thesis's method, in words; empty: in nothing."""
-    if set(presets) != {"thesis", "default"}:
+def worse(presets: dict[str, Any], common: dict[str, Any]) -> list[str]:
+    """In what the default is not better than each rival, in words; empty: in nothing."""
+    rivals = {name: presets[name] for name in RIVALS if name in presets}
+    ours = presets.get("default")
+    if ours is None or not rivals:
         return []
-    theirs, ours = presets["thesis"], presets["default"]
     reasons = []
-    if not (ours["localized"] or theirs["localized"] or ours["failed"] or theirs["failed"]):
-        reasons.append("neither localizes a frame")
     if ours["failed"]:
-        which = "both" if theirs["failed"] else "it"
+        which = "all" if all(theirs["failed"] for theirs in rivals.values()) else "it"
         reasons.append(f"{which} failed: {ours['failed'][0]}")
-    if not theirs["failed"] and (theirs["localized"] or 0) > (ours["localized"] or 0) + _COVERAGE:
-        reasons.append(
-            f"{100 * (ours['localized'] or 0):.1f} % of the frames are localized, by the thesis's "
-            f"method {100 * theirs['localized']:.1f} %"
-        )
-    for name, common, unit, factor in (
-        ("position_m", "common_m", " cm", 100.0),
-        ("rotation_deg", "common_deg", "°", 1.0),
-    ):
-        # Over the frames of both, where that can be said: over its own, who gives up looks good.
-        key = common if ours.get(common) and theirs.get(common) else name
-        a, b = ours.get(key), theirs.get(key)
-        if b is not None and (a is None or not a["mean"] < b["mean"]):
-            told = "none" if a is None else f"{factor * a['mean']:.3f}{unit}"
-            what = name.split("_")[0]
+    elif not ours["localized"]:
+        reasons.append("no frame is localized")
+    for name, theirs in rivals.items():
+        said = RIVALS[name]
+        if not theirs["failed"] and (theirs["localized"] or 0) > (ours["localized"] or 0) + _SHARE:
             reasons.append(
-                f"{what} error {told}, the thesis's method {factor * b['mean']:.3f}{unit}"
+                f"{100 * (ours['localized'] or 0):.1f} % of the frames are localized, {said} "
+                f"{100 * theirs['localized']:.1f} %"
             )
+        for key, unit, factor in (("position_m", " cm", 100.0), ("rotation_deg", "°", 1.0)):
+            # Over the frames of both, where that can be said: who gives up looks good over its own.
+            pair = common[name][key]
+            a, b = pair["ours"], pair["theirs"]
+            if a is None or b is None:
+                a, b = ours.get(key), theirs.get(key)
+            if b is not None and (a is None or not a["mean"] < b["mean"]):
+                told = "none" if a is None else f"{factor * a['mean']:.3f}{unit}"
+                what = key.split("_")[0]
+                reasons.append(f"{what} error {told}, {said} {factor * b['mean']:.3f}{unit}")
     return reasons
 
 

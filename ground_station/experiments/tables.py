@@ -9,7 +9,7 @@ from ground_station.experiments import claims
 from ground_station.presentation.text import columns
 
 NONE = "–"
-NAMES = {"thesis": "preset thesis", "default": "default"}
+NAMES = {"thesis": "preset thesis", "alone": "each frame alone", "default": "default"}
 
 _ALL = 0.995
 """A share localized that is shown as 100 %."""
@@ -24,7 +24,7 @@ def every(experiment: dict[str, Any]) -> list[list[list[str]]]:
 
 
 def _errors(experiment: dict[str, Any]) -> list[list[str]]:
-    """Both presets beside what the thesis printed."""
+    """All that localize beside what the thesis printed."""
     head: list[tuple[str, Cell]] = [("thesis's own*", printed)]
     for preset, name in NAMES.items():
         head += [
@@ -40,9 +40,12 @@ def _further(experiment: dict[str, Any]) -> list[list[str]]:
     return _of_cases(
         experiment,
         [
-            ("on frames of both", _both),
+            ("on frames of thesis and default", _both("thesis")),
+            ("alone and default", _both("alone")),
             ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
             ("inside 95 %", inside),
+            ("wrong TRACKING, frames", wrong),
+            ("found at first after", _spread("default", "first_s", 1.0, " s")),
             ("found again after", _spread("default", "recovery_s", 1.0, " s")),
             ("ms a frame", _time),
             ("landmarks", _landmarks),
@@ -68,9 +71,10 @@ def _times(experiment: dict[str, Any]) -> list[list[str]]:
     if not any(printed.values()):
         return []
     runs = [
-        (f"{case['title']}, {name}", case["presets"].get(preset, {}).get("stage_s", {}))
+        (f"{case['title']}, {name}", case["presets"][preset]["stage_s"])
         for case in experiment["cases"]
         for preset, name in NAMES.items()
+        if preset in case["presets"]
     ]
     head = ["median of a frame, s", "thesis's own*", *(title for title, _ in runs)]
     rows = [
@@ -78,6 +82,12 @@ def _times(experiment: dict[str, Any]) -> list[list[str]]:
         for stage, text in printed.items()
     ]
     return [head, *rows]
+
+
+def seen(document: dict[str, Any]) -> list[str]:
+    """Which presets some row has, in their order."""
+    cases = [case for e in document["experiments"] for case in e["cases"]]
+    return [preset for preset in NAMES if any(preset in case["presets"] for case in cases)]
 
 
 def text(experiment: dict[str, Any]) -> str:
@@ -92,20 +102,22 @@ def verdict(document: dict[str, Any]) -> str:
     Rows that were not compared are counted, so that silence says nothing.
     """
     cases = [case for e in document["experiments"] for case in e["cases"]]
-    compared = [case for case in cases if set(case["presets"]) == set(NAMES)]
+    compared = [c for c in cases if "default" in c["presets"] and len(c["presets"]) > 1]
+    names = [NAMES[preset] for preset in seen(document) if preset != "default"]
+    rivals = " and ".join(f"the {name}" if name.startswith("preset") else name for name in names)
     not_better = [case for case in compared if case["worse"]]
     others = len(cases) - len(compared)
     if not compared:
         said = "Nothing was compared."
     elif not not_better:
         said = (
-            f"In all {len(compared)} rows the default is better than the preset thesis in position "
+            f"In all {len(compared)} rows the default is better than {rivals} in position "
             "and rotation, and localizes no smaller share of the frames."
         )
     else:
         said = (
-            f"In {len(not_better)} of {len(compared)} rows the default is not better than the "
-            f"preset thesis: {'; '.join(document['worse'])}."
+            f"In {len(not_better)} of {len(compared)} rows the default is not better than "
+            f"{rivals}: {'; '.join(document['worse'])}."
         )
     alone = [f"{others} more rows have one preset only."] if others else []
     broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
@@ -169,12 +181,22 @@ def _localized(preset: str) -> Cell:
     return cell
 
 
-def _both(case: dict[str, Any]) -> str:
-    found = [case["presets"].get(preset, {}).get("common_m") for preset in NAMES]
-    if None in found:
-        return NONE
-    theirs, ours = (100 * one["mean"] for one in found)
-    return f"{theirs:.2f} → {ours:.2f} cm"
+def _both(rival: str) -> Cell:
+    def cell(case: dict[str, Any]) -> str:
+        pair = case["common"].get(rival, {}).get("position_m", {})
+        found = [pair.get(whose) for whose in ("theirs", "ours")]
+        if None in found:
+            return NONE
+        theirs, ours = (100 * one["mean"] for one in found)
+        return f"{theirs:.2f} → {ours:.2f} cm"
+
+    return cell
+
+
+def wrong(case: dict[str, Any]) -> str:
+    """The default's frames that are TRACKING and far off, over all runs."""
+    found = case["presets"].get("default", {})
+    return str(found["wrong"]) if found.get("landmarks") else NONE
 
 
 def inside(case: dict[str, Any]) -> str:

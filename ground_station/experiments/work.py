@@ -73,4 +73,4 @@ def _run(job: RunJob, store: Store, data: Path) -> None:
         from ground_station.experiments.thinning import drawn
 
         map_ = drawn(map_, job.alter.landmarks, job.seed)
-    store.write(job.key, measure(map_, flight, job.alter, job.settings, job.seed))
+    store.write(job.key, measure(map_, flight, job.alter, job.preset, job.settings, job.seed))

@@ -16,6 +16,8 @@ def run(errors_m: list[float | None], *, seed: int = 0) -> dict[str, Any]:
         "seen": len(errors_m),
         "localized": len(errors),
         "tracking": len(errors),
+        "wrong": sum(error > 0.25 for error in errors),
+        "first_s": found[0][0] if found else None,
         "landmarks": 1234,
         "keyframes": 20,
         "stage_s": {"features": 0.02, "total": 0.05},

@@ -43,7 +43,7 @@ def test_what_is_the_same_is_made_once(declared):
     # Two lights with two seeds, and the map's; the second experiment adds nothing.
     assert len(of(planned, FlightJob)) == 5
     assert len(of(planned, MapJob)) == 1
-    assert len(of(planned, RunJob)) == 2 * 2 * 2
+    assert len(of(planned, RunJob)) == 2 * 2 * 3
     assert planned.runs["light", "noon"] == planned.runs["again", "noon"]
     assert {len(keys) for case in planned.runs.values() for keys in case.values()} == {2}
     assert len({job.name for job in of(planned, FlightJob)}) == 5

@@ -27,9 +27,8 @@ def a_plan(runs=3):
     needs = {"f": (), "m": ("f",)}
     for k in range(runs):
         key = f"r{k}"
-        jobs[key] = RunJob(
-            key, key, "m", FlightDeclaration(), "f.mcap", k, Alteration(), LocalizerSettings()
-        )
+        flight, settings = FlightDeclaration(), LocalizerSettings()
+        jobs[key] = RunJob(key, key, "m", flight, "f.mcap", k, Alteration(), "default", settings)
         needs[key] = ("m", "f")
     return Plan(jobs, needs, {})
 

@@ -54,11 +54,12 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
         case["presets"]["thesis"]["position_m"]["mean"]
         < case["presets"]["default"]["position_m"]["mean"]
     )
-    assert case["presets"]["thesis"]["common_m"]["mean"] == pytest.approx(0.02)
-    assert case["presets"]["default"]["common_m"]["mean"] == pytest.approx(0.01)
+    position, rotation = (case["common"]["thesis"][k] for k in ("position_m", "rotation_deg"))
+    assert position["theirs"]["mean"] == pytest.approx(0.02)
+    assert position["ours"]["mean"] == pytest.approx(0.01)
     assert case["presets"]["thesis"]["localized"] == 0.5
-    assert case["presets"]["thesis"]["common_deg"]["mean"] == pytest.approx(0.2)
-    assert case["presets"]["default"]["common_deg"]["mean"] == pytest.approx(0.1)
+    assert rotation["theirs"]["mean"] == pytest.approx(0.2)
+    assert rotation["ours"]["mean"] == pytest.approx(0.1)
     assert case["worse"] == []
 
 
@@ -69,7 +70,7 @@ def test_the_error_over_the_frames_of_both_does_not_reward_giving_up(tmp_path):
         ([0.02] * 4, [0.02] * 4, "position error 2.000 cm, the thesis's method 2.000 cm"),
         ([0.05] * 4, [0.02, 0.02, None, None], "50.0 % of the frames are localized"),
         ([0.05] * 4, [None] * 4, "position error none"),
-        ([None] * 4, [None] * 4, "neither localizes a frame"),
+        ([None] * 4, [None] * 4, "no frame is localized"),
     ],
 )
 def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, ours, words):
@@ -78,6 +79,25 @@ def test_where_ours_is_not_better_the_verdict_begins_with_it(tmp_path, theirs, o
     assert any(words in line for line in found["worse"]), found["worse"]
     assert tables.verdict(found).startswith("In 1 of 1 rows the default is not better")
     assert words in report.markdown(found).splitlines()[0]
+
+
+def test_a_row_is_better_only_where_it_beats_every_rival(tmp_path):
+    runs = {
+        "thesis": [kept_runs.run([0.05] * 4)] * 2,
+        "alone": [kept_runs.run([0.01, 0.01, 0.01, None])] * 2,
+        "default": [kept_runs.run([None, 0.02, 0.3, 0.02])] * 2,
+    }
+    found = document(tmp_path, runs)
+    share, position, _, again, _ = (line.split(": ")[1] for line in found["worse"])
+    assert share == "75.0 % of the frames are localized, the thesis's method 100.0 %"
+    assert position == "position error 17.397 cm, the thesis's method 5.000 cm"
+    assert again == "position error 21.260 cm, each frame alone 1.000 cm"
+    said = tables.verdict(found)
+    assert "not better than the preset thesis and each frame alone: " in said
+    head, row = tables.every(found["experiments"][0])[1]
+    assert row[head.index("wrong TRACKING, frames")] == "2"  # one in each of two runs
+    assert row[head.index("found at first after")] == "0.10 ± 0.00 s"
+    assert row[head.index("alone and default")] == "1.00 → 21.26 cm"
 
 
 def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
@@ -92,7 +112,7 @@ def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
     assert "no two images overlap" in page and "not measured" in page
     (tmp_path / "both").mkdir()
     both = document(tmp_path / "both", {"thesis": [None, None], "default": [None, None]})
-    assert any("both failed: not measured" in line for line in both["worse"])
+    assert any("all failed: not measured" in line for line in both["worse"])
 
 
 def test_a_file_of_a_run_that_was_cut_counts_as_not_measured(tmp_path):

@@ -50,7 +50,7 @@ def run(folder, capfd):
 def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd):
     status, first, _ = run(flown, capfd)
     whole, covered = first["experiments"][0]["cases"]
-    for preset in ("thesis", "default"):
+    for preset in ("thesis", "alone", "default"):
         row = whole["presets"][preset]
         assert row["failed"] == [] and row["keyframes"] == 14 and row["landmarks"] > 300
         assert row["localized"] >= 0.8 and row["position_m"]["mean"] < 0.15, row["position_m"]
@@ -71,7 +71,7 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
     cache = tomllib.loads(file.read_text())["built"]["cache"]
     # By the build that was lost.
     assert (cache["features_found"], cache["features_made"]) == (14, 0)
-    assert again == status and "experiments, jobs: 5" in said
+    assert again == status and "experiments, jobs: 7" in said
     for one, other in zip(_runs(first), _runs(second), strict=True):
         assert one["localized"] == other["localized"]
         assert one["position_m"] == pytest.approx(other["position_m"], abs=1e-4)
