@@ -21,6 +21,7 @@ _PERCENT = 1 / 256  # % per bit of SOC
 _RATE = 0.208  # % per hour and bit of CRATE
 _VCELL, _SOC, _MODE, _VERSION, _HIBRT, _CONFIG = 0x02, 0x04, 0x06, 0x08, 0x0A, 0x0C
 _VALRT, _CRATE, _VRESET, _STATUS = 0x14, 0x16, 0x18, 0x1A
+_RESET = 0x0100
 _AFTER_POWER_UP = {
     _MODE: 0x0000,
     _VERSION: 0x0012,
@@ -28,7 +29,7 @@ _AFTER_POWER_UP = {
     _CONFIG: 0x971C,
     _VALRT: 0x00FF,
     _VRESET: 0x9600,
-    _STATUS: 0x0100,  # the reset indicator, which the driver has to clear
+    _STATUS: _RESET,
 }
 
 
@@ -71,6 +72,11 @@ def word(image: bytes, register: int) -> int:
 def compensation(image: bytes) -> int:
     """The byte RCOMP, which a driver sets for the temperature."""
     return word(image, _CONFIG) >> 8
+
+
+def was_reset(image: bytes) -> bool:
+    """Whether the reset indicator stands that a driver clears once it has set the gauge up."""
+    return bool(word(image, _STATUS) & _RESET)
 
 
 def write(path: Path, volts: float, percentage: float, rate_per_h: float = 0.0) -> None:
