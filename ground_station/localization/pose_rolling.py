@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from ground_station.arrays import F64, Bools
@@ -18,6 +21,11 @@ from ground_station.localization.settings import PoseSettings
 
 _WIDENING = 9.0
 """Squared: an observation may miss by three deviations of its landmark beside `inlier_px`."""
+
+_MEDIAN_OF_TWO = 1.17741
+"""The median length of two standard normal numbers (Rayleigh's distribution)."""
+
+_LEAST_SCALE = 0.02
 
 _SMALLEST = 1e-9
 """A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
@@ -75,6 +83,12 @@ def solve_rolling(
                 spread = linear.spread_px2
             inlier_px = settings.inlier_px * observations.stretch
             residual_px, inlier = _judge(every, wTc, twist, spread, inlier_px)
+            scale = _scale(every, wTc, twist, inlier)
+            every = replace(
+                every,
+                variance_px2=every.variance_px2 * scale,
+                huber_k=settings.huber_k * math.sqrt(scale),
+            )
     covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
     if covariance is None:
         return no_solution(count, "singular", iterations)
@@ -140,6 +154,20 @@ def _inverse(information: F64) -> F64 | None:
     except np.linalg.LinAlgError:
         return None
     return 0.5 * (result + result.T) if np.isfinite(result).all() else None
+
+
+def _scale(observations: Reprojection, wTc: F64, twist: F64, inlier: Bools) -> float:
+    """How far inliers miss over what their noise says: by the median, as of a Gaussian; at most 1.
+
+    Where pictures and map are better than `sigma_px`, pairs that are wrong by a pixel or two would
+    count as right ones do, and they turn the pose.
+    """
+    if not inlier.any():
+        return 1.0
+    r = observations.view(wTc, twist).residual_px[:, inlier]
+    spread = observations.reach(observations.view(wTc, twist))[2][:, inlier]
+    whitened = (solve2(observations.variance_px2[inlier], spread, r)[0] * r).sum(axis=0)
+    return min(1.0, max(_LEAST_SCALE, math.sqrt(float(np.median(whitened))) / _MEDIAN_OF_TWO))
 
 
 def _judge(
