@@ -22,6 +22,7 @@ from ground_station.errors import GroundStationError
 INTAKE, LOCALIZER, WEB, FOXGLOVE, PAYLOAD = "intake", "localizer", "web", "foxglove", "demo-payload"
 BAD_INPUT = 2
 _SILENT_S = 10.0
+_SLEPT_S = 2.0
 _START_S = 60.0  # the first beat of a process that loads a large map on a busy machine
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _STEADY_S = 30.0  # who has lived this long begins with the shortest pause again
@@ -114,6 +115,14 @@ class Child:
             return self._fell(f"was silent for {since_s:.0f} s")
         return ""
 
+    def excuse(self, seconds: float) -> None:
+        """Time in which nobody listened counts for nothing."""
+        now_s = self._clock()
+        self._started_s += seconds
+        self._last_heard_s = min(now_s, self._last_heard_s + seconds)
+        if self._heard_s is not None:
+            self._heard_s = min(now_s, self._heard_s + seconds)
+
     def terminate(self) -> None:
         """Asks it to end."""
         self._due_s = None
@@ -168,10 +177,16 @@ class Child:
 class Children:
     """The table at work; `step` it from the thread that made it, `beat` it from any."""
 
-    def __init__(self, specs: tuple[Spec, ...], report: Callable[[str], object]) -> None:
-        self._report = report
+    def __init__(
+        self,
+        specs: tuple[Spec, ...],
+        report: Callable[[str], object],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._report, self._clock = report, clock
         self._lock = threading.Lock()
-        self._children = {spec.name: Child(spec) for spec in specs}
+        self._children = {spec.name: Child(spec, clock) for spec in specs}
+        self._stepped_s = clock()
         self._leaving: dict[str, tuple[Child, float]] = {}
         """What was removed and has not ended yet, with when it is killed."""
 
@@ -183,7 +198,7 @@ class Children:
         if spec.name in self._leaving:
             return
         with self._lock:
-            self._children.setdefault(spec.name, Child(spec))
+            self._children.setdefault(spec.name, Child(spec, self._clock))
 
     def remove(self, name: str) -> None:
         """Lets a process end, which nobody waits for, and forgets it."""
@@ -201,7 +216,15 @@ class Children:
             child.heartbeat(pid)
 
     def step(self) -> None:
-        """Starts what is due; raises `ServiceError` when a needed process cannot start."""
+        """Starts what is due; raises `ServiceError` when a needed process cannot start.
+
+        After a sleep of the whole computer nobody was silent: this process did not listen.
+        """
+        now_s = self._clock()
+        if (slept_s := now_s - self._stepped_s) > _SLEPT_S:
+            for child in list(self._children.values()):
+                child.excuse(slept_s)
+        self._stepped_s = now_s
         self._leaving = {
             name: (child, until_s)
             for name, (child, until_s) in self._leaving.items()

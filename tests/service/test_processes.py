@@ -100,6 +100,23 @@ def test_a_process_that_falls_silent_is_killed_and_started_anew(modules: Path) -
     child.wait(clock() + LIMIT_S)
 
 
+def test_a_computer_that_slept_restarts_nobody_who_was_well(modules: Path) -> None:
+    clock, said = Time(), list[str]()
+    children = Children((Spec("stays", "stand_in_stays"),), said.append, clock)
+    children.step()
+    pid = children.pids()["stays"]
+    children.heartbeat("stays", pid)
+    clock.now_s += 1000.0
+    children.step()
+    assert children.pids() == {"stays": pid} and said == []
+    assert children.living()  # nor does the watchdog hear of it
+    for _ in range(11):  # one that is silent from then on is
+        clock.now_s += 1.0
+        children.step()
+    assert said == ["stays was silent for 11 s; it is restarted"]
+    children.close()
+
+
 def test_who_ends_slowly_is_not_waited_for(modules: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processes, "_TERM_S", 1.0)
     spec = Spec("stays", "stand_in_stays")
