@@ -38,7 +38,7 @@ from pi_firmware.wire.errors import TelemetryError
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
 _IDR_S = 1.0
-_LOST_S = 3.0
+_LOST_S = 1.0
 """Of a stepped flight, which waits meanwhile: when nothing more came for so long, a frame that was
 sent is lost."""
 _NAME_LENGTH, _TEXT_LENGTH = 64, 500
