@@ -149,7 +149,7 @@ def run(
     """
     result = LiveResult()
     estimates: list[EstimateMessage] = []
-    started_s = last_s = time.monotonic()
+    started_s = last_s = ran_s = time.monotonic()
     while True:
         message = inbox.take(_POLL_S)
         now_s = time.monotonic()
@@ -172,6 +172,8 @@ def run(
             continue
         payload.check()
         idle_s = now_s - last_s
+        if running := payload.running():
+            ran_s = now_s
         if result.payload.ended:
             told = result.payload.frames
             taken = len(estimates) + result.dropped
@@ -179,7 +181,7 @@ def run(
             all_told = taken >= told["received"]
             if (here and all_told) or idle_s > (_DRAIN_S if all_told else _LOCALIZED_S):
                 break
-        elif not payload.running() and idle_s > _DRAIN_S:
+        elif not running and now_s - max(last_s, ran_s) > _DRAIN_S:  # its last words take a moment
             break
         elif not inbox.frames and now_s - started_s > start_timeout_s:
             raise StreamError(
