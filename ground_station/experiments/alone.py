@@ -1,7 +1,8 @@
 """The plain baseline: each frame by itself, against every landmark of the map.
 
-No motion, no time, no prediction: nearest descriptors with the ratio test (Lowe, IJCV 2004, 7.1),
-COLMAP's LO-RANSAC and refinement of the pose. Whoever has a motion and time must not be worse.
+No motion, no time, no prediction: mutually nearest descriptors that pass the ratio test (Lowe, IJCV
+2004, 7.1), COLMAP's LO-RANSAC and refinement of the pose. Whoever has motion and time must not be
+worse.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import time
 
 import numpy as np
 
-from ground_station.arrays import F32, U8, Indices
+from ground_station.arrays import U8
 from ground_station.features.extractor import Extractor
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.estimate import Counts, PoseEstimate, State
+from ground_station.localization.kinematics import Kinematics
+from ground_station.localization.relocalization import match_all
 from ground_station.map.colmap import colmap_camera
 from ground_station.map.colmap_cameras import HALF_PIXEL
 from ground_station.map.store import Map
@@ -24,20 +27,22 @@ _MAX_RATIO, _MAX_ERROR_PX, _MIN_INLIERS = 0.8, 6.0, 12
 
 
 class Alone:
-    """Localizes frames one by one; `process` is called as a `Localizer`'s."""
+    """Localizes frames one by one, called as a `Localizer` is."""
 
     def __init__(self, map_: Map, camera: Camera, extractor: Extractor) -> None:
         self._points_m = map_.landmarks.position_m
         self._descriptors = map_.landmarks.descriptor[:]
         self._camera, self._extractor = colmap_camera(camera), extractor
 
-    def process(self, time_ns: int, image: U8, index: int, _: float | None = None) -> PoseEstimate:
+    def process(
+        self, time_ns: int, image: U8, index: int = 0, exposure_s: float | None = None
+    ) -> PoseEstimate:
         """TRACKING with a pose, or LOST."""
         import pycolmap
 
         begun_s = time.perf_counter()
         features = self._extractor.extract(image)
-        feature, landmark = self._matched(features.descriptors)
+        feature, landmark = match_all(features.descriptors, self._descriptors, _MAX_RATIO)
         options = pycolmap.AbsolutePoseEstimationOptions()
         options.ransac.max_error = _MAX_ERROR_PX
         found = None
@@ -60,13 +65,8 @@ class Alone:
             stage_ms={"total": 1e3 * (time.perf_counter() - begun_s)},
         )
 
-    def _matched(self, descriptors: F32) -> tuple[Indices, Indices]:
-        """Features (N,) and their landmarks (N,): the second nearest is well beyond."""
-        if len(self._descriptors) < 2 or not len(descriptors):
-            return np.empty(0, np.intp), np.empty(0, np.intp)
-        cosine = descriptors @ self._descriptors.T
-        rows, nearest = np.arange(len(cosine)), cosine.argmax(axis=1)
-        first = cosine[rows, nearest]
-        cosine[rows, nearest] = -np.inf
-        sure = 2 - 2 * first < _MAX_RATIO**2 * (2 - 2 * cosine.max(axis=1))
-        return np.flatnonzero(sure), nearest[sure]
+    def smoothed(self) -> list[Kinematics]:
+        """Nothing: no frame helps another."""
+        return []
+
+    finish = smoothed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -52,28 +52,27 @@ def measure(
     features = replace(settings.features, extractor=OF_THE_MAP)
     settings = replace(settings, features=features)
     camera = scaled_camera(flight.camera, alteration.scale)
-    process: Callable[..., PoseEstimate]
+    localizer: Localizer | Alone
     if preset == "alone":
         plain = replace(features, max_features=FEATURES)
-        process = Alone(map_, camera, extractor_for(map_.info, plain)).process
+        localizer = Alone(map_, camera, extractor_for(map_.info, plain))
     else:
         extractor = extractor_for(map_.info, features)
         localizer = Localizer(map_, camera, extractor, settings, smoothing=True)
-        process = localizer.process
+        if preset == "thesis":
+            first = next(iter(flight.frames)).time_ns
+            localizer.set_initial_pose(flight.truth.wTc[flight.truth.nearest(first)], first)
     lossy = alteration.packet_loss > 0 and flight.recording is not None
     arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
     start_ns = next(iter(flight.frames)).time_ns
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     for frame in altered(flight.frames, alteration, arrived):
-        if preset == "thesis" and not estimates:
-            nearest = flight.truth.nearest(frame.time_ns)
-            localizer.set_initial_pose(flight.truth.wTc[nearest], frame.time_ns)
-        estimates.append(process(frame.time_ns, frame.image, frame.index, frame.exposure_s))
-        if preset != "alone":
-            smoothed += localizer.smoothed()
-    if preset != "alone":
-        smoothed += localizer.finish()
+        estimates.append(
+            localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
+        )
+        smoothed += localizer.smoothed()
+    smoothed += localizer.finish()
     tracking = [e for e in estimates if e.state is State.TRACKING and e.wTc is not None]
     off = [(e, error) for e in tracking if (error := _off(e, flight.truth)) is not None]
     right = [e.time_ns for e, error in off if _right(error)]

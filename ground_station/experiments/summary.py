@@ -144,7 +144,7 @@ def _common(found: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     A localizer that gives up when it gets hard has the smaller error over its own frames.
     """
     result: dict[str, Any] = {}
-    for rival in RIVALS.keys() & found.keys() if "default" in found else ():
+    for rival in (name for name in RIVALS if {name, "default"} <= found.keys()):
         result[rival] = {}
         for name in ("position_m", "rotation_deg"):
             values: dict[str, list[float | None]] = {"ours": [], "theirs": []}

@@ -16,7 +16,7 @@ from ground_station.localization.kinematics import (
     Solution,
     no_solution,
 )
-from ground_station.localization.pose_newton import Prior, Reprojection, descend, solve2
+from ground_station.localization.pose_newton import Prior, Reprojection, View, descend, solve2
 from ground_station.localization.settings import PoseSettings
 
 _WIDENING = 9.0
@@ -26,6 +26,7 @@ _MEDIAN_OF_TWO = 1.17741
 """The median length of two standard normal numbers (Rayleigh's distribution)."""
 
 _LEAST_SCALE = 0.02
+"""For residuals of all but nothing: no feature is found to a few hundredths of a pixel."""
 
 _SMALLEST = 1e-9
 """A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
@@ -45,7 +46,8 @@ def solve_rolling(
     covariance, and Huber's loss with `settings.huber_k` is that of a graph with a variable for each
     landmark. With `settings.reject_outliers` it is solved once more from the inliers alone:
     observations that miss by less than `settings.inlier_px`, widened by their landmarks'
-    covariance. Of `settings`, `max_iterations` and `min_inliers` are used besides.
+    covariance. There both their noise and Huber's reach follow what they miss by. Of `settings`,
+    `max_iterations` and `min_inliers` are used besides.
 
     Never raises: bad or too few observations, a covariance that is none and no convergence are a
     `Solution` without a state, with the reason.
@@ -82,13 +84,15 @@ def solve_rolling(
             if chosen is every:
                 spread = linear.spread_px2
             inlier_px = settings.inlier_px * observations.stretch
-            residual_px, inlier = _judge(every, wTc, twist, spread, inlier_px)
-            scale = _scale(every, wTc, twist, inlier)
-            every = replace(
-                every,
-                variance_px2=every.variance_px2 * scale,
-                huber_k=settings.huber_k * math.sqrt(scale),
-            )
+            view = every.view(wTc, twist)
+            residual_px, inlier = _judge(view, spread, inlier_px)
+            if not last and inlier.any():
+                scale = _scale(every.where(inlier), view.residual_px[:, inlier], spread[:, inlier])
+                every = replace(
+                    every,
+                    variance_px2=every.variance_px2 * scale,
+                    huber_k=settings.huber_k * math.sqrt(scale),
+                )
     covariance = _inverse(prior.at(wTc, twist)[0] + linear.information)
     if covariance is None:
         return no_solution(count, "singular", iterations)
@@ -156,25 +160,19 @@ def _inverse(information: F64) -> F64 | None:
     return 0.5 * (result + result.T) if np.isfinite(result).all() else None
 
 
-def _scale(observations: Reprojection, wTc: F64, twist: F64, inlier: Bools) -> float:
+def _scale(inliers: Reprojection, residual_px: F64, spread_px2: F64) -> float:
     """How far inliers miss over what their noise says: by the median, as of a Gaussian; at most 1.
 
     Where pictures and map are better than `sigma_px`, pairs that are wrong by a pixel or two would
     count as right ones do, and they turn the pose.
     """
-    if not inlier.any():
-        return 1.0
-    r = observations.view(wTc, twist).residual_px[:, inlier]
-    spread = observations.reach(observations.view(wTc, twist))[2][:, inlier]
-    whitened = (solve2(observations.variance_px2[inlier], spread, r)[0] * r).sum(axis=0)
-    return min(1.0, max(_LEAST_SCALE, math.sqrt(float(np.median(whitened))) / _MEDIAN_OF_TWO))
+    r = residual_px
+    squared = (solve2(inliers.variance_px2, spread_px2, r)[0] * r).sum(axis=0)
+    return min(1.0, max(_LEAST_SCALE, math.sqrt(float(np.median(squared))) / _MEDIAN_OF_TWO))
 
 
-def _judge(
-    observations: Reprojection, wTc: F64, twist: F64, spread_px2: F64, inlier_px: F64
-) -> tuple[F64, Bools]:
+def _judge(view: View, spread_px2: F64, inlier_px: F64) -> tuple[F64, Bools]:
     """Distances (N,) of observations from projected landmarks, pixels; which are inliers (N,)."""
-    view = observations.view(wTc, twist)
     r = view.residual_px
     share = (solve2(inlier_px**2, _WIDENING * spread_px2, r)[0] * r).sum(axis=0)
     residual_px = np.where(view.front, np.sqrt((r * r).sum(axis=0)), np.inf)

@@ -14,6 +14,9 @@ from pathlib import Path
 from ground_station.errors import MapError
 from pi_firmware.wire import files
 
+FLOORPLAN = ("floorplan.png", "floorplan.yaml")
+FLOWN_IN = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", *FLOORPLAN)
+"""What is needed to localize in a map and to show it."""
 _OURS = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", "sparse")
 PICTURE = "map.png"
 """What a build draws of its map; it is not kept where another map takes the place."""
@@ -61,7 +64,7 @@ def kept_name(folder: Path) -> Path:
 
 def carry_floorplan(source: Path, target: Path) -> None:
     """Copies a map's floor plan, where it has one, into the folder of a map made from it."""
-    for name in ("floorplan.png", "floorplan.yaml"):
+    for name in FLOORPLAN:
         if (source / name).is_file():
             shutil.copy2(source / name, target / name)
 

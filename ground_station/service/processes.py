@@ -22,7 +22,7 @@ from ground_station.errors import GroundStationError
 INTAKE, LOCALIZER, WEB, FOXGLOVE, PAYLOAD = "intake", "localizer", "web", "foxglove", "demo-payload"
 BAD_INPUT = 2
 _SILENT_S = 10.0
-_SLEPT_S = 2.0
+_SLEPT_S = 2.0  # between two steps of a loop that takes a tenth of a second
 _START_S = 60.0  # the first beat of a process that loads a large map on a busy machine
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _STEADY_S = 30.0  # who has lived this long begins with the shortest pause again
@@ -206,7 +206,7 @@ class Children:
             child = self._children.pop(name, None)
         if child is not None:
             child.terminate()
-            self._leaving[name] = child, time.monotonic() + _TERM_S
+            self._leaving[name] = child, self._clock() + _TERM_S
 
     def heartbeat(self, name: str, pid: int) -> None:
         """A process was heard."""
@@ -262,7 +262,7 @@ class Children:
         children += [child for child, _ in self._leaving.values()]
         for child in children:
             child.terminate()
-        until_s = time.monotonic() + _TERM_S
+        until_s = self._clock() + _TERM_S
         for child in children:
             child.wait(until_s)
 

@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.join:
         loaded = lan.joined(loaded, args.join)
     unnamed = args.map is None and loaded.map.folder == settings.MapSettings().folder
-    if loaded.fleet.join and unnamed:
+    if loaded.fleet.join and unnamed and not args.check:
         from ground_station.service.fleet.maps import fetched
 
         folder = dataclasses.replace(loaded.map, folder=str(fetched(loaded)))

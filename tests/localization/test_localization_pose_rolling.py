@@ -11,6 +11,7 @@ from gtsam.symbol_shorthand import L, X
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA as CAMERA
+from ground_station.localization import pose_rolling
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_newton import Prior, Reprojection
@@ -97,6 +98,23 @@ def test_pose_and_velocity_are_recovered_among_a_fifth_of_outliers():
     assert solution.inlier[~wrong].all() and solution.inlier[wrong].mean() < 0.1
     assert np.median(solution.residual_px[~wrong]) < 0.5
     assert solution.iterations < 10 and 0 < solution.innovation < 40
+
+
+def test_pairs_that_are_a_little_wrong_do_not_turn_the_pose_where_the_others_fit(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    def off(seed: int) -> float:
+        """Of pictures that fit to 0.2 px and are said to fit to 2, with a sixth 1.5 px aside."""
+        predicted, observations, _ = _scene(np.random.default_rng(seed), noise_px=0.2)
+        observations.pinhole_px[::6, 0] += 1.5
+        told = dataclasses.replace(observations, sigma_px=np.full(len(observations), 2.0))
+        state = solve_rolling(predicted, told, CAMERA, SETTINGS).state
+        assert state is not None
+        return float(np.linalg.norm(_error(state)[:3]))
+
+    follows = [off(seed) for seed in range(5)]
+    monkeypatch.setattr(pose_rolling, "_LEAST_SCALE", 1.0)  # as their sigma says
+    assert np.mean(follows) < 0.6 * np.mean([off(seed) for seed in range(5)])
 
 
 def test_without_the_rows_the_pose_is_many_times_worse():

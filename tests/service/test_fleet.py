@@ -210,7 +210,7 @@ def test_recordings_are_read_where_they_lie(stations: Any) -> None:
     assert shelf.list() == Shelf().list() and attic.fleet.knows("hall")
     size = shelf.size("one.mcap")
     assert b"".join(shelf.pieces("one.mcap", 0, size)) == (bytes(range(256)) * 1200)[:size]
-    with pytest.raises(GroundStationError, match="has no such recording"):
+    with pytest.raises(GroundStationError, match="has no such file"):
         shelf.size("another.mcap")
     with pytest.raises(GroundStationError, match="station 'hall' did not answer"):
         list(shelf.pieces("one.mcap", 10**6, 10**6 + 1))
@@ -403,7 +403,10 @@ def test_what_is_no_message_is_counted_and_dropped(stations: Any) -> None:
 def test_a_map_is_fetched_once_by_its_content(
     stations: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    hall = stations("hall")
+    building = tmp_path / "atrium"
+    shutil.copytree(SAMPLE, building, ignore=shutil.ignore_patterns("*.mcap", "sparse"))
+    (building / "who flew when.txt").write_text("the map's owner's")
+    hall = stations("hall", more=(f"map.folder={building}",))
     shelf = tmp_path / "shelf"
 
     def fetch() -> Path:
@@ -427,7 +430,7 @@ def test_a_map_is_fetched_once_by_its_content(
     assert map_id(folder) == map_id(SAMPLE)  # so that poses are shown here and there
     for name in ("landmarks.safetensors", "keyframes.safetensors", "floorplan.png"):
         assert (folder / name).read_bytes() == (SAMPLE / name).read_bytes()
-    assert not (folder / "flight.mcap").exists()
+    assert not (folder / "who flew when.txt").exists()
     assert fetch() == folder and "is here already" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(maps, "_LOOK_S", 0.0)

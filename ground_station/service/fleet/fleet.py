@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,7 @@ class Fleet:
             rules=rules(self._held),
             more=SESSION,
         )
+        self._ask = partial(ask, self._session, self.name)
         self.listening = self._session.listening
         self._hears = [self._hear(f"{ROOT}/*/{kind}/*") for kind in (_STATION, *_TOLD)]
         self._serves = self._session.zenoh.declare_queryable(
@@ -182,12 +184,6 @@ class Fleet:
             if isinstance(answer, dict):
                 return {"done": False, "reason": "", **answer}
         return {"done": False, "reason": f"station '{station}' did not answer"}
-
-    def _ask(
-        self, station: str, name: str, request: Mapping[str, Any], timeout_s: float = TIMEOUT_S
-    ) -> bytes:
-        """What another station answers at a name; empty without an answer in time."""
-        return ask(self._session, self.name, station, name, request, timeout_s)
 
     def knows(self, station: str) -> bool:
         """Whether a station flies beside this one."""

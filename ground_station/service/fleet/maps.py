@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from ground_station.errors import GroundStationError, InputError, MapError
 from ground_station.map.folder import check_is_map, replacing
-from ground_station.service.fleet.messages import SESSION, rules
+from ground_station.service.fleet.messages import SESSION, map_files, rules
 from ground_station.service.fleet.shelf import PIECE_BYTES, Elsewhere, ask
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire import credentials
@@ -41,7 +41,7 @@ class _File:
 
 
 class MapFiles:
-    """A map's files as a `Shelf`, without recordings and what COLMAP left."""
+    """A map's own files as a `Shelf`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -50,7 +50,7 @@ class MapFiles:
         name = self._folder.absolute().name
         return [
             asdict(_File(name, path.name, path.stat().st_size, _sha256(path)))
-            for path in _files(self._folder)
+            for path in map_files(self._folder)
         ]
 
     def size(self, name: str) -> int:
@@ -64,7 +64,7 @@ class MapFiles:
                 yield piece
 
     def _path(self, name: str) -> Path:
-        for path in _files(self._folder):
+        for path in map_files(self._folder):
             if path.name == name:
                 return path
         raise MapError(f"{self._folder}: has no file {name!r:.80}")
@@ -134,11 +134,6 @@ def _fetch(theirs: Elsewhere, station: str, listed: Any, shelf: Path) -> Path:
         check_is_map(part)
     print(f"{told} was fetched, {size / 1e6:.1f} MB: {folder}", flush=True)
     return folder
-
-
-def _files(folder: Path) -> list[Path]:
-    found = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in found if path.is_file() and path.suffix != ".mcap"]
 
 
 def _sha256(path: Path) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from ground_station.map.folder import FLOWN_IN
 from ground_station.service.alarms import Alarm
 from ground_station.service.bus_messages import Message, RecordingMessage, WallTime
 from ground_station.service.fleet.allocation import Pin
@@ -51,13 +52,17 @@ class StationMessage(Message):
     pins: Annotated[dict[Word, Pin], Meta(max_length=PAYLOADS)] = field(default_factory=dict)
 
 
+def map_files(folder: Path) -> list[Path]:
+    """The files of a map that localizers and pages read."""
+    return [folder / name for name in FLOWN_IN if (folder / name).is_file()]
+
+
 def map_id(folder: Path) -> str:
     """Tells a map from another of the same name: its files' names and sizes, its `map.toml`."""
     found = hashlib.sha256()
     with contextlib.suppress(OSError):
-        for path in sorted(folder.iterdir()):
-            if path.is_file() and path.suffix != ".mcap":
-                found.update(f"{path.name} {path.stat().st_size}\n".encode())
+        for path in map_files(folder):
+            found.update(f"{path.name} {path.stat().st_size}\n".encode())
         found.update((folder / "map.toml").read_bytes())
     return found.hexdigest()[:16]
 

@@ -47,7 +47,7 @@ def ask(
 
 
 class Elsewhere:
-    """Another station's recordings as a `Shelf`; raises a `BlimpError` where it does not answer."""
+    """Another station's files as a `Shelf`; raises a `BlimpError` where it does not answer."""
 
     def __init__(self, ask: Callable[[Mapping[str, Any]], bytes], station: str) -> None:
         self._ask, self._station = ask, station
@@ -73,7 +73,7 @@ class Elsewhere:
         except ValueError:
             raise GroundStationError(f"station '{self._station}' did not answer") from None
         if found is None:
-            raise GroundStationError(f"station '{self._station}' has no such recording")
+            raise GroundStationError(f"station '{self._station}' has no such file")
         return found
 
 

@@ -37,21 +37,15 @@ YEAR_NS = 365 * 24 * 3600 * 10**9
 KINDS = ["first boot"] * 4 + ["flying"] * 3 + ["booting"] * 3
 STEADY_S = float(os.environ.get("BLIMP_STEADY_S", "60"))
 VCELL_BIT_V = 78.125e-6
-STATUS_OF_FIRMWARE = """
+OF_FIRMWARE = """
 for process in /proc/[0-9]*; do
   case $(tr '\\0' ' ' 2>/dev/null <$process/cmdline) in
-    "/usr/bin/python3 -m pi_firmware "*) cat $process/status ;;
+    "/usr/bin/python3 -m pi_firmware "*) WHAT ;;
   esac
 done
 """
-PROCESSOR_OF_FIRMWARE = """
-for process in /proc/[0-9]*; do
-  case $(tr '\\0' ' ' 2>/dev/null <$process/cmdline) in
-    "/usr/bin/python3 -m pi_firmware "*) cut -d' ' -f14,15 $process/stat ;;
-  esac
-done
-getconf CLK_TCK
-"""
+STATUS_OF_FIRMWARE = OF_FIRMWARE.replace("WHAT", "cat $process/status")
+TICKS_OF_FIRMWARE = OF_FIRMWARE.replace("WHAT", "cut -d' ' -f14,15 $process/stat")
 RELEASE = "PYTHONPATH=/usr/lib/blimp/release:/usr/lib/blimp/release/site"
 IMPORTS = f"""\
 {RELEASE} python3 -c '
@@ -194,7 +188,7 @@ def test_what_a_frame_costs_its_processor(rig: Rig, figures: Figures) -> None:
     ensure_up(rig)
 
     def used() -> tuple[float, int]:
-        *ticks, a_second = map(int, rig.ssh(PROCESSOR_OF_FIRMWARE).split())
+        *ticks, a_second = map(int, rig.ssh(f"{TICKS_OF_FIRMWARE}getconf CLK_TCK").split())
         state = rig.ground.state()
         assert state is not None and state.gate is not None
         return sum(ticks) / a_second, state.gate.sequence
