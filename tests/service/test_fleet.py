@@ -286,6 +286,12 @@ def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: An
         hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
         return bool(attic.fleet.document()["twins"])
 
+    def known() -> bool:
+        attic.bus.publish(bus_messages.PAYLOAD, BLIMP, twin)
+        return attic.last(bus_messages.PAYLOAD) is not None
+
+    # What flies here has to be known before another station tells of its own.
+    eventually(known, 10.0)
     eventually(found, 10.0)
     assert attic.fleet.document()["twins"] == {BLIMP: "hall"}
     assert not any(note.relayed for kind, _, note in attic.heard if kind == "payload")
