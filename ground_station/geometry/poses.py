@@ -122,6 +122,15 @@ def log(aTb: npt.ArrayLike) -> F64:
     )
 
 
+def adjoint(aTb: npt.ArrayLike) -> F64:
+    """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
+    T = np.asarray(aTb, dtype=np.float64)
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = T[:3, :3]
+    result[3:, :3] = np.cross(T[:3, 3], T[:3, :3], axisb=0, axisc=0)
+    return result
+
+
 def rotation_angle(aRb: npt.ArrayLike) -> F64:
     """‖log R‖ of rotations (…, 3, 3), radians."""
     return np.asarray(Rotation.from_matrix(np.asarray(aRb)).magnitude())

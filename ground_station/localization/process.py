@@ -49,11 +49,6 @@ class Density:
         return np.array([self.rotation] * 3 + [self.translation] * 3)
 
 
-def adjoint(aTb: F64) -> F64:
-    """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
-    return np.asarray(gtsam.Pose3(aTb).AdjointMap())
-
-
 def right_jacobian(xi: F64) -> F64:
     """(6, 6) J of exp(ξ + δ) ≈ exp(ξ)·exp(J·δ). Barfoot 2017, section 7.1.5."""
     return np.asarray(gtsam.Pose3.ExpmapDerivative(xi))
@@ -135,7 +130,7 @@ def _constant_velocity(
 def _transition(step: F64, by_twist: F64) -> F64:
     """(12, 12) of wTc·exp(step) when a twist's step δ changes the tangent `step` by by_twist·δ."""
     result = np.eye(12)
-    result[:6, :6] = adjoint(poses.exp(-step))
+    result[:6, :6] = poses.adjoint(poses.exp(-step))
     result[:6, 6:] = right_jacobian(step) @ by_twist
     return result
 
@@ -165,7 +160,7 @@ def _blimp(
     """
     arm = np.eye(4)
     arm[:3, 3] = -settings.swing_arm_m * rest_up
-    to_point, to_camera = adjoint(arm), adjoint(poses.inverse(arm))
+    to_point, to_camera = poses.adjoint(arm), poses.adjoint(poses.inverse(arm))
     basis = _swing_axes(rest_up)
     twist = to_point @ state.twist
     w, v = basis.T @ twist[:3], twist[3:]

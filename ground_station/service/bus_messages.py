@@ -19,7 +19,8 @@ from pi_firmware.wire import messages
 
 FRAME, ESTIMATE, PAYLOAD = "frame", "estimate", "payload"
 EVENT, RECORDING, PROCESS, LEAVE = "event", "recording", "process", "leave"
-KINDS = (FRAME, ESTIMATE, PAYLOAD, EVENT, RECORDING, PROCESS)
+ELSEWHERE = "elsewhere"
+"""An `EstimateMessage` of a payload that flies with another station."""
 STATION = "-"
 """Stands for a payload's id where a message is of none."""
 

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -297,6 +298,33 @@ def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: An
     assert not any(note.relayed for kind, _, note in attic.heard if kind == "payload")
 
 
+def test_poses_from_elsewhere_are_told_to_this_station_by_its_own_name_of_the_map(
+    stations: Any, tmp_path: Path
+) -> None:
+    shutil.copytree(SAMPLE, tmp_path / "lobby", ignore=shutil.ignore_patterns("*.mcap"))
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint, more=(f"map.folder={tmp_path / 'lobby'}",))
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    told: list[EstimateMessage] = []
+    attic.bus.subscribe(
+        bus_messages.ELSEWHERE, EstimateMessage, lambda name, note: told.append(note)
+    )
+
+    sent: list[None] = []
+
+    def heard() -> bool:
+        # By turns, as a station tells not of every one.
+        other = replace(POSE, map="hall", sequence=2) if len(sent) % 8 < 4 else POSE
+        sent.append(None)
+        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.bus.publish(bus_messages.ESTIMATE, BLIMP, other)
+        return bool(told)
+
+    eventually(heard, 10.0)
+    assert {(note.map, note.sequence) for note in told} == {("lobby", POSE.sequence)}
+    assert attic.last(bus_messages.ESTIMATE).map == "lobby"
+
+
 def test_poses_in_another_map_are_not_taken(stations: Any, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
@@ -388,6 +416,20 @@ def test_whoever_is_revoked_or_foreign_is_refused_and_named(stations: Any, tmp_p
     eventually(said, 30.0)
     assert "ground.yard" in later.fleet.document()["refused"][0]
     assert later.others() == [] and later.heard == [] and gone.others() == []
+
+
+def test_whose_certificate_has_ended_is_refused_and_told_why(stations: Any) -> None:
+    hall = stations("hall")
+    stations.authority.renew("ground.yard", days=-1)
+    yard = stations("yard", hall.endpoint)
+
+    def said() -> bool:
+        yard.tell()
+        return bool(yard.fleet.document()["refused"])
+
+    eventually(said, 30.0)
+    assert "expired" in yard.fleet.document()["refused"][0]
+    assert hall.others() == [] and yard.others() == []
 
 
 def test_what_is_no_message_is_counted_and_dropped(stations: Any) -> None:

@@ -22,6 +22,7 @@ from ground_station.service.bus_messages import (
     as_document,
 )
 from ground_station.service.foxglove import conversion, documents, drawing, world
+from ground_station.service.foxglove.neighbours import neighbours
 
 SAMPLES = 40_000
 NEAR = 0.03  # of the deviations' product; a sample's own error is 1 / sqrt(SAMPLES) of it
@@ -74,6 +75,35 @@ def test_the_covariance_does_not_depend_on_which_axes_of_the_camera_the_pose_nam
     turn = np.kron(np.eye(2), conversion.OPTICAL_IN_CAMERA[:3, :3])
     again = conversion.ros_covariance(solved.wTc, turn @ covariance @ turn.T)
     assert np.allclose(solved.covariance, again, rtol=1e-9, atol=1e-15)
+
+
+def test_a_relative_pose_has_the_covariance_of_both() -> None:
+    one, other = a_pose(), a_pose() @ poses.exp([0.5, -0.8, 0.3, 2.0, -1.0, 4.0])
+    scales = 0.3, 0.5
+    notes = [
+        estimate(
+            position_m=wTo[:3, 3].tolist(),
+            quaternion_xyzw=poses.to_quaternion(wTo).tolist(),
+            covariance=(scale * a_covariance()).ravel().tolist(),
+        )
+        for wTo, scale in zip((one, other), scales, strict=True)
+    ]
+    (found,) = neighbours("a", notes[0], {"a": notes[0], "b": notes[1]})
+    body = conversion.body_pose
+    expected = poses.inverse(body(one)) @ body(other)
+    assert np.allclose(found.pose.wTc, expected)
+    assert found.distance_m == pytest.approx(np.linalg.norm(expected[:3, 3]))
+    rng = np.random.default_rng(7)
+    a, b = (rng.multivariate_normal(np.zeros(6), s * a_covariance(), SAMPLES) for s in scales)
+    moved = np.array(
+        [poses.inverse(body(one @ poses.exp(x))) @ body(other @ poses.exp(y))
+         for x, y in zip(a, b, strict=True)]
+    )  # fmt: skip
+    turned = Rotation.from_matrix(moved[:, :3, :3] @ expected[:3, :3].T).as_rotvec()
+    truth = np.cov(np.hstack([moved[:, :3, 3], turned]).T)
+    assert found.pose.covariance is not None and distance(truth, found.pose.covariance) < NEAR
+    far = np.linalg.norm(moved[:, :3, 3], axis=1)
+    assert found.distance_sigma_m == pytest.approx(far.std(), rel=NEAR)
 
 
 def test_a_camera_that_looks_along_x_has_level_body_axes() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import signal
 import socket
 import subprocess
@@ -52,6 +53,7 @@ SCHEMAS = {
     f"/{PAYLOAD}/pose": "foxglove.PoseInFrame",
     f"/{PAYLOAD}/scene": "foxglove.SceneUpdate",
     f"/{PAYLOAD}/estimate": "blimp.Estimate",
+    f"/{PAYLOAD}/neighbours": "blimp.Neighbours",
     f"/{PAYLOAD}/battery": "blimp.Battery",
     f"/{PAYLOAD}/health": "blimp.Health",
     f"/{PAYLOAD}/status": "blimp.Payload",
@@ -115,6 +117,45 @@ def test_a_pose_goes_out_in_ros_frames(stand: SimpleNamespace) -> None:
         covariance = np.reshape(said["pose"]["covariance"], (6, 6))
         assert np.allclose(np.diag(covariance), [3e-4, 1e-4, 2e-4, 3e-6, 1e-6, 2e-6])
         assert (said["state"], said["inliers"], said["sequence"]) == ("TRACKING", 40, 7)
+
+
+def test_the_others_are_seen_from_each_whichever_station_they_fly_with(
+    stand: SimpleNamespace,
+) -> None:
+    # Two metres to the left of the first, and half a second later two and a half.
+    other = estimate(
+        position_m=[3.0, 6.0, 2.5], capture_ns=CAPTURE_NS - 500_000_000,
+        velocity_mps=[0.0, 1.0, 0.0], turn_radps=[0.0, 0.0, 0.0],
+    )  # fmt: skip
+    elsewhere = dataclasses.replace(other, position_m=[5.0, 4.0, 2.5])
+    lost = dataclasses.replace(other, state="LOST")
+    foreign = dataclasses.replace(other, map="hall")
+    bus = stand.station.bus
+
+    def say() -> None:
+        stand.station.say(other, "blimp-2")
+        stand.station.say(lost, "blimp-3")
+        stand.station.say(foreign, "blimp-4")
+        bus.publish(bus_messages.ELSEWHERE, "blimp-5", elsewhere)
+        stand.station.say(estimate())
+
+    say()
+    with Client(stand.port) as client:
+        client.subscribe(f"/{PAYLOAD}/neighbours")
+        topic = f"/{PAYLOAD}/neighbours"
+        got = client.received[topic]
+        whole = lambda: bool(got) and len(got[-1][1]["neighbours"]) == 2  # noqa: E731
+        client.until(whole, "both", say)
+        log_ns, said = got[-1]
+        assert log_ns == CAPTURE_NS and said["header"]["frame_id"] == f"{PAYLOAD}/camera"
+        left, ahead = said["neighbours"]
+        assert (left["payload"], ahead["payload"]) == ("blimp-2", "blimp-5")
+        assert left["child_frame_id"] == "blimp-2/camera" and left["age_s"] == pytest.approx(0.5)
+        at = [[one["pose"]["pose"]["position"][axis] for axis in "xyz"] for one in (left, ahead)]
+        assert np.allclose(at, [[0.0, 2.5, 0.0], [2.0, 0.5, 0.0]], atol=1e-9)
+        assert left["distance_m"] == pytest.approx(2.5)
+        # Both cameras' own deviation to the left, and the turn of the first over the distance.
+        assert left["distance_sigma_m"] == pytest.approx(math.sqrt(2 * 1e-4), rel=1e-6)
 
 
 def test_a_frame_that_was_not_solved_has_no_pose(stand: SimpleNamespace) -> None:

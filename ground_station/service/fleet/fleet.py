@@ -41,6 +41,7 @@ from ground_station.service.fleet.messages import (
     ROOT,
     SESSION,
     WANTS,
+    WORD,
     StationMessage,
     map_id,
     rules,
@@ -105,7 +106,7 @@ class Fleet:
     ) -> None:
         self.name = settings.name
         self._bus, self._version, self._on_picture = bus, version, on_picture
-        self._map = Path(settings.map.folder)
+        self._map = Path(settings.map.folder).resolve()
         self._map_id = map_id(self._map)
         self._lock = threading.Lock()
         self._takes: dict[str, list[Take]] = {kind: [] for kind in _TOLD}
@@ -223,7 +224,7 @@ class Fleet:
         said = StationMessage(
             time_ns=time.time_ns(),
             version=self._version,
-            map=self._map.name[:128],
+            map=self._map.name[:WORD],
             map_id=self._map_id,
             load=round(load, 2),
             overloaded=overloaded,
@@ -444,8 +445,11 @@ class Fleet:
                 note = dataclasses.replace(note, station=station, relayed=True)
             elif kind == bus_messages.EVENT:
                 note = dataclasses.replace(note, text=f"{note.text} (station '{station}')")
-            elif self._told_of(payload_id) != station or not self._same_map(station):
+            elif self._told_of(payload_id) != station or not self._in_our_map(station, note):
                 return
+            else:
+                note = dataclasses.replace(note, map=note.map and self._map.name)
+                self._bus.publish(bus_messages.ELSEWHERE, payload_id, note)
             for take in self._takes[kind]:
                 take(payload_id, note)
 
@@ -467,10 +471,13 @@ class Fleet:
             self._away[payload_id] = (station, now_s)
         return True
 
-    def _same_map(self, station: str) -> bool:
+    def _in_our_map(self, station: str, note: EstimateMessage) -> bool:
+        """Whether a pose is in this station's map, whatever that is called over there."""
         with self._lock:
             other = self._others.get(station)
-        return other is not None and other.said.map_id == self._map_id
+        if other is None or other.said.map_id != self._map_id:
+            return False
+        return note.map[:WORD] in ("", other.said.map)
 
     def _asked(self, query: Any) -> None:
         """Another station's operator asks something of a payload that flies here."""

@@ -27,7 +27,8 @@ SESSION = {
 }
 """Of Zenoh's settings, those between stations."""
 
-Word = Annotated[str, Meta(max_length=128)]
+WORD = 128
+Word = Annotated[str, Meta(max_length=WORD)]
 
 
 @dataclass(frozen=True, slots=True)

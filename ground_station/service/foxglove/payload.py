@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage, FrameMessage, PayloadMessage
 from ground_station.service.foxglove import conversion, documents, drawing
 from ground_station.service.foxglove.conversion import Solved
+from ground_station.service.foxglove.neighbours import neighbours
 from ground_station.service.foxglove.topics import Make, Topic, json_topic
 from ground_station.service.pictures import PictureReader
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web.trail import Trail
 
 _TRAIL_PERIOD_S = 1.0
+_SEEN_PERIOD_S = 0.2
 _EARLY = 0.25
 """A frame may come this share of a period early: cameras and networks are not regular."""
 
@@ -50,7 +52,7 @@ class Payload:
         self._period_s, self._quality = 1.0 / http.video_rate_hz, http.jpeg_quality
         self._pictures = PictureReader(folder, payload_id)
         self._size = (0, 0)
-        self._due_s = self._trail_s = 0.0
+        self._due_s = self._trail_s = self._seen_s = 0.0
         self._trail = Trail()
         self._last: tuple[Solved, int] | None = None
         self._state = ""
@@ -70,6 +72,7 @@ class Payload:
         self._pose = Topic(PoseInFrameChannel(f"{root}/pose", context=context))
         self._scene = Topic(SceneUpdateChannel(f"{root}/scene", context=context), self._drawn)
         self._estimate = json_topic(f"{root}/estimate", documents.estimate_schema(), context)
+        self._neighbours = json_topic(f"{root}/neighbours", documents.neighbours_schema(), context)
         self._messages = {
             name: json_topic(f"{root}/{name}", schema, context, recall(name))
             for name, schema in {
@@ -80,7 +83,7 @@ class Payload:
         }
         self.topics = (
             self._image, self._points, self._calibration, self._pose, self._scene, self._estimate,
-            *self._messages.values(),
+            self._neighbours, *self._messages.values(),
         )  # fmt: skip
 
     def close(self) -> None:
@@ -130,6 +133,18 @@ class Payload:
             if now_s - self._trail_s >= _TRAIL_PERIOD_S:
                 self._trail_s = now_s
                 self._scene.say(lambda: self._line(time_ns), time_ns)
+
+    def see(self, note: EstimateMessage, others: Mapping[str, EstimateMessage]) -> None:
+        """Where the others are at the time of its pose, at most five times a second."""
+        now_s = time.monotonic()
+        if note.position_m is None or now_s - self._seen_s < _SEEN_PERIOD_S:
+            return
+        self._seen_s = now_s
+        time_ns = conversion.stamp_ns(note)
+        self._neighbours.say(
+            lambda: documents.neighbours(self._id, time_ns, neighbours(self._id, note, others)),
+            time_ns,
+        )
 
     def status(self, note: PayloadMessage) -> None:
         """What the intake says of it; its messages when they are new."""

@@ -106,7 +106,7 @@ class Inbox:
             return tasks, frames
 
 
-PAYLOADS, EVENTS = 32, 100
+PAYLOADS, PLACES, EVENTS = 32, 64, 100
 _POLL_S = 0.2
 _BACKLOG = 256
 """Messages that may wait for one client; beyond it the oldest are dropped."""
@@ -129,6 +129,7 @@ class Publishing:
         self._complain = RateLimitedLog(_print)
         self._context = Context()
         self._payloads: dict[str, Payload] = {}
+        self._newest: dict[str, EstimateMessage] = {}  # of payloads elsewhere, too
         self._flown: dict[str, str] = {}  # the map that each payload flies in
         self._events: deque[tuple[str, EventMessage, int]] = deque(maxlen=EVENTS)
         self._recording: tuple[RecordingMessage, int] | None = None
@@ -151,6 +152,7 @@ class Publishing:
         self.server = _listen(settings, context, self)
         bus.subscribe(bus_messages.FRAME, FrameMessage, self._hear_frame)
         bus.subscribe(bus_messages.ESTIMATE, EstimateMessage, self._later(self._take_estimate))
+        bus.subscribe(bus_messages.ELSEWHERE, EstimateMessage, self._later(self._take_place))
         bus.subscribe(bus_messages.PAYLOAD, PayloadMessage, self._later(self._take_status))
         bus.subscribe(bus_messages.EVENT, EventMessage, self._later(self._take_event))
         bus.subscribe(bus_messages.RECORDING, RecordingMessage, self._later(self._take_recording))
@@ -194,7 +196,15 @@ class Publishing:
     def _take_estimate(self, payload_id: str, note: EstimateMessage) -> None:
         if payload := self._payload(payload_id):
             payload.estimate(note)
+            self._take_place(payload_id, note)
+            payload.see(note, self._newest)
             self._follow(payload_id, note.map)
+
+    def _take_place(self, payload_id: str, note: EstimateMessage) -> None:
+        self._newest.pop(payload_id, None)
+        self._newest[payload_id] = note
+        if len(self._newest) > PLACES:
+            del self._newest[next(iter(self._newest))]
 
     def _take_status(self, payload_id: str, note: PayloadMessage) -> None:
         if payload := self._payload(payload_id):
