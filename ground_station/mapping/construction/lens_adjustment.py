@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.arrays import F64, I64
 from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
-from ground_station.mapping.sfm.models import without_images, without_points
+from ground_station.mapping.sfm.models import among, without_points
 
 PARAMETERS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 """The order of a lens as a vector."""
@@ -337,18 +337,14 @@ def _thinned(model: Model) -> Model:
         length = _MOST_IMAGES // _GROUPS
         begins = np.linspace(0, K - length, _GROUPS).astype(np.int64)
         kept = np.isin(np.arange(K), begins[:, None] + np.arange(length))
-        model = without_images(model, ~kept)
-        model = without_points(model, np.bincount(model.point, minlength=len(model.position)) < 2)
+        model = among(model, kept)
     if len(model.image) > _MOST_OBSERVATIONS:
         every = len(model.image) / _MOST_OBSERVATIONS
         kept = np.zeros(len(model.position), dtype=bool)
         kept[np.arange(0, len(kept), every).astype(np.int64)] = True
         model = without_points(model, ~kept)
-    few = np.bincount(model.image, minlength=len(model.names)) < _FEWEST_OBSERVATIONS
-    if few.any():
-        model = without_images(model, few)
-        model = without_points(model, np.bincount(model.point, minlength=len(model.position)) < 2)
-    return model
+    enough = np.bincount(model.image, minlength=len(model.names)) >= _FEWEST_OBSERVATIONS
+    return model if enough.all() else among(model, enough)
 
 
 def _robust_sigma(residuals: F64) -> float:

@@ -29,6 +29,12 @@ def without_points(model: Model, bad: Bools) -> Model:
     )
 
 
+def among(model: Model, kept: Bools) -> Model:
+    """The model with some images (K,) only, and the points that two of them see."""
+    model = without_images(model, ~kept)
+    return without_points(model, np.bincount(model.point, minlength=len(model.position)) < 2)
+
+
 def without_images(model: Model, bad: Bools) -> Model:
     """The model without some images (K,) and their observations."""
     model, kept = without_observations(model, bad[model.image]), ~bad

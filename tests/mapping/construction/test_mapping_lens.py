@@ -149,6 +149,27 @@ def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
         assert "the given camera misfits" in note and "blimp calibrate" in note
 
 
+def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said():
+    """What comes from how the camera moved, as of a rolling shutter, is no fault of the file."""
+    images, model = _views(THESIS_CAMERA, *_flight(True, 1), 1)
+    centre = np.array([THESIS_CAMERA.cx_px, THESIS_CAMERA.cy_px], np.float32)
+    features = [
+        replace(each, keypoints_px=centre + 0.93 * (each.keypoints_px - centre))
+        if k < len(model.names) // 2 else each
+        for k, each in enumerate(images.features)
+    ]  # fmt: skip
+    images = replace(images, features=features)
+    known = LensPrior(THESIS_CAMERA, "file", 0.0)
+    calibration = lens.SelfCalibration(known, images, 0.8)
+    model = _adjusted_with(THESIS_CAMERA, images, model)
+    found = adjust(lens._as_seen(model, images), THESIS_CAMERA, lens.prior_of(known, THESIS_CAMERA))
+    assert found is not None and calibration._misfits(found)
+    assert not calibration.go_on(model, images)
+    assert calibration.camera == THESIS_CAMERA and calibration.as_built()["state"] == "kept"
+    (note,) = calibration.notes()
+    assert "is kept" in note and "both halves" in note and "blimp calibrate" in note
+
+
 def test_the_views_may_change_both_focal_lengths_but_hardly_one_of_them():
     """A rolling shutter stretches a picture's height; a calibration knew fy over fx already."""
     for source, ratio in (("file", 0.0005), ("guess", 0.002)):
