@@ -30,6 +30,8 @@ from ground_station.map.store import Map
 
 _ALLOWED = 32.9
 """Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
+_NARROW = 0.1
+"""Standard deviation of each axis of a prediction, in radians and in depths of the map."""
 _CLOSER = 3
 """Solutions at most that are matched around once more."""
 _FOUND_RADIUS_PX = 15.0
@@ -88,7 +90,7 @@ class Acquirer:
         self, map_: Map, matcher: Matcher, extractor: Extractor, settings: LocalizerSettings
     ) -> None:
         self.matcher, self._extractor, self._settings = matcher, extractor, settings
-        self._landmarks = map_.landmarks
+        self._landmarks, self._depth_m = map_.landmarks, map_.depth_m
         recovery = settings.recovery
         self._relocalizer = (
             Relocalizer(map_, matcher.camera, recovery, settings.seed)
@@ -205,6 +207,8 @@ class Acquirer:
         if isinstance(candidates, str):
             return _nothing(seen, candidates)
         for prediction, found in itertools.product(expected, candidates):
+            if found.doubt and not (prediction is expected[0] and self._narrow(prediction)):
+                continue
             located = self._agreed(seen, found, prediction, estimator, watch)
             if located is not None:
                 wild = prediction is not expected[0]
@@ -218,6 +222,14 @@ class Acquirer:
         assert alone is not None
         located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
         return replace(located, relocalized=True, significance=sole.significance)
+
+    def _narrow(self, expected: Kinematics) -> bool:
+        """Whether a prediction says where the camera is, so that a doubtful find it allows counts.
+
+        A pose drawn by chance lies so near to it once in thousands.
+        """
+        sigma = np.sqrt(np.diag(expected.covariance)[:6]) / np.repeat([1.0, self._depth_m], 3)
+        return bool(sigma.max() < _NARROW)
 
     def _open(self, found: Relocalization) -> F64:
         """The covariance (6, 6) of a find: before a wall a turn is hard to tell from a step aside,

@@ -33,7 +33,7 @@ class Relocalization:
 
     `significance`: by how many standard deviations more landmarks are where they should be than
     chance puts there. `open_by`: the position's standard deviation by the inliers alone, over
-    their depth.
+    their depth. `doubt`: why it is not believed by itself, "" where it is.
     """
 
     wTc: F64
@@ -41,6 +41,7 @@ class Relocalization:
     landmark: Indices
     significance: float = 0.0
     open_by: float = 0.0
+    doubt: str = ""
 
 
 def match_all(
@@ -133,6 +134,9 @@ _NEIGHBOURS = 12
 """Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
 """Inliers of RANSAC that are worth the check that follows."""
+_WEAK = 6.0
+"""Deviations by which a find must show more landmarks than chance to count beside a prediction, as
+of a keyframe that is followed."""
 _MAX_SIGMA = 0.005
 """Of the position, from the inliers alone, over their depth: beyond, a rolling shutter's shear
 moves it far. Right finds of an atrium, a kitchen and a corridor had 0.003 at most."""
@@ -194,19 +198,21 @@ class _Search:
         near = self._residual_px(wTc, support.feature, support.landmark)
         good = near < settings.max_reprojection_px
         feature, landmark = support.feature[good], support.landmark[good]
+        beyond, doubt = support.share - support.chance, ""
         if len(feature) < settings.min_inliers:
-            return f"{len(feature)} of {support.expected} landmarks where they should be"
-        beyond = support.share - support.chance
-        if beyond < settings.min_excess or support.significance < settings.min_significance:
-            return (
+            doubt = f"{len(feature)} of {support.expected} landmarks where they should be"
+        elif beyond < settings.min_excess or support.significance < settings.min_significance:
+            doubt = (
                 f"{support.share:.0%} of {support.expected} landmarks found, "
                 f"{support.chance:.0%} by chance"
             )
+        if doubt and (len(feature) < _MIN_MATCHED or support.significance < _WEAK):
+            return doubt
         if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)
         open_by = self._sigma(wTc, landmark)
-        return Relocalization(wTc, feature, landmark, support.significance, open_by)
+        return Relocalization(wTc, feature, landmark, support.significance, open_by, doubt)
 
     def _sigma(self, wTc: F64, landmark: Indices) -> float:
         """Standard deviation of the position over the inliers' depth, at half the threshold."""
@@ -260,6 +266,8 @@ class Relocalizer:
     def candidates(self, features: Features, normalized: F64) -> list[Relocalization] | str:
         """The poses that a frame may have anywhere in the map, or the reason why there is none.
 
+        Those with a doubt are to be believed only where something else says the same.
+
         `normalized` (F, 2) are the features undistorted, on the plane z = 1. The most alike
         keyframes are matched together, so that only what is unlike all the rest counts, and when
         that fails (in a building that repeats itself) place by place. A map without keyframes is
@@ -280,9 +288,11 @@ class Relocalizer:
             return _only_place(search)
         ranked = self._index.ranked(features.descriptors, _RETRIEVED)
         together = self._try(self._index, search, self._index.seen_by(ranked))
-        if not isinstance(together, str):
-            return [together]
         found = []
+        if not isinstance(together, str):
+            if not together.doubt:
+                return [together]
+            found, together = [together], together.doubt
         for place in self._index.places(ranked, _PLACES, _MIN_SHARED):
             alone = self._try(self._index, search, self._index.seen_by(place))
             if not isinstance(alone, str):
@@ -291,8 +301,12 @@ class Relocalizer:
 
     def alone(self, found: list[Relocalization]) -> Relocalization | str:
         """Which of some candidates is the place, where nothing else is known of it, or why none."""
-        best = _undisputed(found, self._same_m)
-        if isinstance(best, str) or best.open_by <= _MAX_SIGMA:
+        sure = [each for each in found if not each.doubt]
+        if not sure:
+            return f"{found[0].doubt} in the most alike places"
+        best = _undisputed(sure, self._same_m)
+        held = not self._lens.camera.readout_s  # all rows at once: what is open is known
+        if isinstance(best, str) or held or best.open_by <= _MAX_SIGMA:
             return best
         return f"the inliers leave the position open by {best.open_by:.1%} of their depth"
 

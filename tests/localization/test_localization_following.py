@@ -85,6 +85,36 @@ def test_a_search_near_a_wrong_and_certain_prediction_finds_nothing(room, acquir
         assert np.linalg.norm(apart[3:]) < 0.02 and np.linalg.norm(apart[:3]) < 0.005
 
 
+def test_a_doubtful_find_counts_only_beside_a_prediction_that_says_where(room, acquirer):
+    _, path = room.path(120)
+    seen = seen_from(room, path[0])
+    right = acquirer.locate(
+        seen, estimator_at(room, path[0]).predict(0), estimator_at(room, path[0]), Stopwatch()
+    )
+
+    def found(at, sigma, doubt="18 of 60 landmarks where they should be"):
+        rows = right.observations.inlier.nonzero()[0][:40]
+        candidate = Relocalization(
+            at, right.matches.feature[rows], right.matches.landmark[rows], 8.0, 0.001, doubt
+        )
+        acquirer._relocalizer = SimpleNamespace(
+            candidates=lambda *_: [candidate],
+            alone=lambda found: found[0].doubt or found[0],
+        )
+        estimator = estimator_at(room, path[0] @ poses.exp(HERE), sigma)
+        make = lambda: make_estimator(room.camera, load_preset("default"))  # noqa: E731
+        predicted = estimator.predict(0)
+        assert not acquirer.matcher.within_reach(predicted)
+        return acquirer.find(seen, 0, [predicted], estimator, make, Stopwatch())
+
+    near = found(path[0], sigma=0.06).solution.state
+    assert near is not None
+    assert np.linalg.norm((poses.inverse(path[0]) @ near.wTc)[:3, 3]) < 0.02
+    anywhere = found(path[0], sigma=0.8)
+    assert anywhere.solution.state is None and "18 of 60" in anywhere.solution.reason
+    assert found(path[0], sigma=0.8, doubt="").solution.state is not None
+
+
 def test_what_is_far_from_its_prediction_is_found_within_the_predictions_doubt(room, acquirer):
     """The search radius follows the covariance: a sure prediction looks near, an unsure one far."""
     _, path = room.path(1)

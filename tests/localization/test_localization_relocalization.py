@@ -164,6 +164,35 @@ def test_of_two_equal_places_both_are_named_for_who_knows_more(building):
         assert "fit alike" in relocalizer.alone(found)
 
 
+def test_a_few_landmarks_are_named_but_not_believed_by_themselves(building):
+    relocalizer = Relocalizer(building.map, THESIS_CAMERA, SETTINGS, 0)
+    rng = np.random.default_rng(8)
+    for wTc in building.path[:4]:
+        features = building.features(wTc)
+        other = rng.normal(size=features.descriptors.shape)
+        other /= np.linalg.norm(other, axis=1, keepdims=True)
+        few = rng.permutation(len(features)) < 24
+        mixed = np.where(few[:, None], features.descriptors, other).astype(np.float32)
+        faint = replace(features, descriptors=mixed)
+        found = relocalizer.candidates(faint, THESIS_CAMERA.undistort(faint.keypoints_px))
+        assert not isinstance(found, str) and all(one.doubt for one in found)
+        assert apart(found[0], wTc)[0] < 0.1
+        assert "landmarks where they should be" in str(relocalizer.alone(found))
+
+
+def test_what_is_left_open_is_refused_only_where_a_shutter_may_shear_it(building):
+    features = building.features(building.path[0])
+    found = find(building.map, features)
+    assert isinstance(found, Relocalization)
+    far = replace(found, open_by=0.02)
+    still = replace(THESIS_CAMERA, readout_s=0.0)
+    rolling, whole = (
+        Relocalizer(building.map, camera, SETTINGS, 0) for camera in (THESIS_CAMERA, still)
+    )
+    assert "open by 2.0%" in str(rolling.alone([far]))
+    assert whole.alone([far]) is far
+
+
 def test_what_differs_between_two_alike_places_decides(building):
     double = twice(building.map, 20.0)
     rng = np.random.default_rng(6)
