@@ -11,8 +11,14 @@ import pytest
 
 from ground_station.commands import maps
 from ground_station.geometry.alignment import align
+from ground_station.geometry.camera import load_camera
 from ground_station.geometry.trajectory import read_tum
+from ground_station.localization.extraction import extractor_for
+from ground_station.localization.localizer import Localizer
+from ground_station.localization.settings import load_preset
 from ground_station.map import store
+from ground_station.recording.frames import FrameRange
+from ground_station.recording.open import open_input
 
 DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"
 
@@ -44,3 +50,38 @@ def test_twelve_frames_of_a_kitchen_are_one_map_within_two_centimetres(tmp_path)
     assert _run("register", folder, "--trajectory", trajectory, "--json", report) == 0
     assert json.loads(report.read_text())["residual_rms_m"] < 0.01
     assert store.load_info(folder).registered
+
+
+@needs_data
+def test_thirteen_frames_of_a_kitchen_place_nine_in_ten_of_another_pass(tmp_path):
+    """Of a thin map a picture shows few landmarks: a prediction says the rest."""
+    folder, truth = tmp_path / "kitchen", DATA / "official_groundtruth.txt"
+    arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:500:40")
+    assert _run(*arguments, "--out", folder) == 0
+    assert _run("register", folder, "--trajectory", truth) == 0
+    map_, camera, settings = (
+        store.load(folder),
+        load_camera(DATA / "camera.toml"),
+        load_preset("default"),
+    )
+    localizer = Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
+    poses, off_m = read_tum(truth), []
+    frames = list(open_input(DATA / "frames", 30.0, FrameRange(500, 1000, 10)))
+    for frame in frames:
+        found = localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s).wTc
+        if found is not None:
+            off_m.append(
+                np.linalg.norm(found[:3, 3] - poses.position_m[poses.nearest(frame.time_ns)])
+            )
+    assert len(off_m) >= 0.9 * len(frames)
+    assert np.median(off_m) < 0.01 and max(off_m) < 0.1
+
+
+@needs_data
+def test_a_right_lens_is_kept_where_the_camera_s_motion_looks_like_another(tmp_path):
+    folder = tmp_path / "kitchen"
+    arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:200:10")
+    assert _run(*arguments, "--out", folder) == 0
+    lens = store.load_info(folder).built["lens"]
+    assert lens["state"] == "kept" and "both halves" in lens["said"]
+    assert store.load(folder).info.camera == load_camera(DATA / "camera.toml")
