@@ -122,7 +122,7 @@ def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale():
     """As where a walk comes back: two of its images see what those of before have."""
     wTc, world, _ = scene(count=10, points=200)
 
-    def sets(guests: int) -> list[int]:
+    def sets(guests: int, hosts: int = 0) -> list[int]:
         landmark = []
         for k in range(10):
             of = np.full(len(world), -1)
@@ -133,8 +133,12 @@ def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale():
         for k in range(guests):
             rows = np.arange(40 * k, 40 * (k + 1))
             landmark[5 + k][rows] = rows
+        for k in range(hosts):
+            rows = np.arange(100 + 40 * k, 100 + 40 * (k + 1))
+            landmark[k][rows] = rows
         model = Placed(landmark, dict(enumerate(wTc)), world, PINHOLE)
         return [len(each) for each in bridges.separated(model)]
 
     assert sets(1) == [5, 5]
     assert sets(2) == [10]
+    assert sets(1, 1) == [10]  # one each way: the step between these two has both lengths
