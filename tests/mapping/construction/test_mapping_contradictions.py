@@ -118,7 +118,7 @@ def test_an_image_alone_hangs_by_its_pose():
     assert bridges.separated(model) == [set(range(6))]
 
 
-def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale():
+def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale(monkeypatch):
     """As where a walk comes back: two of its images see what those of before have."""
     wTc, world, _ = scene(count=10, points=200)
 
@@ -142,3 +142,6 @@ def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale():
     assert sets(1) == [5, 5]
     assert sets(2) == [10]
     assert sets(1, 1) == [10]  # one each way: the step between these two has both lengths
+    monkeypatch.setattr(bridges, "_NOISE_PX", 50.0)  # which it has too loosely then
+    assert sets(1, 1) == [5, 5]
+    assert sets(2) == [10]

@@ -25,6 +25,7 @@ set may move by a larger deviation. Five of these are a misplaced image, and a s
 errors that are none of noise. By 0.7 % a real corridor hung together rightly; where 2 % were left
 open, a simulated walk's scale was 4 % off."""
 _NOISE_PX = 0.5
+"""Of a key point: builds of a real kitchen and a real corridor find 0.42 to 0.53."""
 
 _PART = 5
 """Images; fewer do not drift by themselves: with two, a right simulated map lost four of 125."""
