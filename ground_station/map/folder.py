@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import hashlib
 import itertools
 import os
 import shlex
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from ground_station.errors import MapError
@@ -20,6 +21,21 @@ FLOWN_IN = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", *FLOOR
 _OURS = ("map.toml", "landmarks.safetensors", "keyframes.safetensors", "sparse")
 PICTURE = "map.png"
 """What a build draws of its map; it is not kept where another map takes the place."""
+
+
+def files_flown_in(folder: Path) -> list[Path]:
+    """The files of a map that localizers and pages read."""
+    return [folder / name for name in FLOWN_IN if (folder / name).is_file()]
+
+
+def content_id(folder: Path) -> str:
+    """Tells a map from another of the same name: its files' names and sizes, its `map.toml`."""
+    found = hashlib.sha256()
+    with contextlib.suppress(OSError):
+        for path in files_flown_in(folder):
+            found.update(f"{path.name} {path.stat().st_size}\n".encode())
+        found.update((folder / "map.toml").read_bytes())
+    return found.hexdigest()[:16]
 
 
 def check_is_map(folder: Path) -> None:
@@ -69,7 +85,7 @@ def carry_floorplan(source: Path, target: Path) -> None:
             shutil.copy2(source / name, target / name)
 
 
-@contextmanager
+@contextlib.contextmanager
 def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
     """Gives an empty folder beside `folder`, which takes its place when the block ends well.
 

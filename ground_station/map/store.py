@@ -102,6 +102,12 @@ class MapInfo:
         return self.frame == "world"
 
     @property
+    def extensions(self) -> list[dict[str, Any]]:
+        """The runs of `blimp map extend` on it, the last one last."""
+        runs = self.extended.get("runs")
+        return [run for run in runs if isinstance(run, dict)] if isinstance(runs, list) else []
+
+    @property
     def noise_px(self) -> float | None:
         """A key point's noise as its build measured it; None where that is no length."""
         found = self.built.get("noise_px")

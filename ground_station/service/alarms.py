@@ -300,6 +300,10 @@ def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
                 f"station '{name}' flies in another map, '{other['map']}': its poses are not shown"
             )
             yield Alarm(f"station-map/{name}", INFO, STATION, text)
+    for offer in fleet.get("offers") or ():
+        station, name = offer["station"], offer["map"]
+        text = f"station '{station}' has '{name}', this map with {offer['more']} landmarks more"
+        yield Alarm(f"station-offers/{station}/{name}", INFO, STATION, f"{text}: Map… (M)")
     for payload_id, name in _table(fleet, "twins").items():
         text = f"two payloads have this name: one flies here, one with station '{name}'"
         yield Alarm(f"twin/{payload_id}", ALARM, payload_id, text)

@@ -181,6 +181,16 @@ def test_another_station_has_its_words(told, other, name, text):
     assert all(text in item.alarm.text for item in found.values())
 
 
+def test_a_map_that_grew_elsewhere_is_offered(told):
+    offers = [{"station": "attic", "map": "hall-2", "more": 500}]
+    found = alarms.judge({**told[0].document(), "fleet": {"offers": offers}}, 0, {})
+    (item,) = found.values()
+    assert (
+        item.alarm.text
+        == "station 'attic' has 'hall-2', this map with 500 landmarks more: Map… (M)"
+    )
+
+
 def test_twins_and_whoever_was_refused_are_named(told):
     fleet = {"stations": [], "twins": {P: "attic"}, "refused": ["ground.yard wants to join"]}
     found = alarms.judge({**told[0].document(), "fleet": fleet}, 0, {})

@@ -443,7 +443,13 @@ def test_another_station_s_payload_says_with_whom_it_flies_and_is_sent_elsewhere
         "name": "attic", "version": "1", "map": "atrium", "same_map": True, "load": 0.2,
         "age_s": 0.2, "clock_s": 0.0, "recording": False, "payloads": ["blimp-2"],
     }  # fmt: skip
-    fleet = {"stations": [other], "pins": {"blimp-1": "attic"}, "twins": {}, "refused": []}
+    fleet = {
+        "stations": [other],
+        "offers": [],
+        "pins": {"blimp-1": "attic"},
+        "twins": {},
+        "refused": [],
+    }
     monkeypatch.setattr(station.web.snapshot, "fleet", lambda: fleet)
     monkeypatch.setitem(station.payloads["blimp-2"].__dict__, "station", "attic")
     shown.until("document.querySelector('#station-name').textContent.endsWith(' + attic')")
@@ -458,6 +464,22 @@ def test_another_station_s_payload_says_with_whom_it_flies_and_is_sent_elsewhere
     assert "404 (Not Found)" in shown.problems.pop()
     other["age_s"] = 9.0
     shown.until("!document.querySelector('#station-name').textContent.includes('attic')")
+
+
+def test_a_map_that_grew_at_another_station_is_fetched_and_chosen(
+    shown: Watched, station: FlownStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offer = {"station": "attic", "map": "hall-2", "more": 1240}
+    fleet = {"stations": [], "offers": [offer], "pins": {}, "twins": {}, "refused": []}
+    monkeypatch.setattr(station.web.snapshot, "fleet", lambda: fleet)
+    shown.until("document.querySelector('#alarms').textContent.includes('1240 landmarks more')")
+    shown.page.route(
+        "**/api/stations/attic/maps/hall-2",
+        lambda route: route.fulfill(json={"done": True, "reason": "", "values": {"map": "atrium"}}),
+    )
+    shown.page.click("#act-map")
+    shown.page.click("#map-dialog >> text=of station attic")
+    eventually(lambda: ("localizer/blimp-1", {"do": "map", "name": "atrium"}) in station.asked)
 
 
 def test_events_are_newest_first_bounded_filtered_and_never_markup(

@@ -17,6 +17,8 @@ from scenarios.tcp_wire import TcpWire
 
 from ground_station.errors import GroundStationError, InputError, KeysError
 from ground_station.keys.authority import Authority
+from ground_station.map import store
+from ground_station.map.folder import content_id
 from ground_station.service import bus_messages, settings
 from ground_station.service.alarms import Alarm
 from ground_station.service.bus import Bus, Router
@@ -28,7 +30,6 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.fleet import maps
 from ground_station.service.fleet.fleet import FRESH_S, Fleet
-from ground_station.service.fleet.messages import map_id
 from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.settings import SAMPLE
 
@@ -329,7 +330,7 @@ def test_poses_in_another_map_are_not_taken(stations: Any, tmp_path: Path) -> No
     other = tmp_path / "other"
     other.mkdir()
     (other / "map.toml").write_bytes((SAMPLE / "map.toml").read_bytes() + b"\n")
-    assert map_id(other) != map_id(SAMPLE)
+    assert content_id(other) != content_id(SAMPLE)
     hall = stations("hall")
     attic = stations("attic", hall.endpoint, more=(f"map.folder={other}",))
     eventually(lambda: acquainted(hall, attic), 20.0)
@@ -475,7 +476,7 @@ def test_a_map_is_fetched_once_by_its_content(
     folder = fetch()
     assert folder.parent == shelf and folder.name.startswith("atrium-")
     assert "was fetched" in capsys.readouterr().out
-    assert map_id(folder) == map_id(SAMPLE)  # so that poses are shown here and there
+    assert content_id(folder) == content_id(SAMPLE)  # so that poses are shown here and there
     for name in ("landmarks.safetensors", "keyframes.safetensors", "floorplan.png"):
         assert (folder / name).read_bytes() == (SAMPLE / name).read_bytes()
     assert not (folder / "who flew when.txt").exists()
@@ -485,6 +486,68 @@ def test_a_map_is_fetched_once_by_its_content(
         assert fetch() == folder and "fetched last" in capsys.readouterr().out
 
 
+def grown(base: Path, name: str, more: int) -> Path:
+    """A map beside another, as `blimp map extend` writes one that found so many landmarks."""
+    folder = base.with_name(name)
+    shutil.copytree(base, folder)
+    info = store.load_info(base)
+    runs = info.extensions
+    had = runs[-1]["landmarks"][1] if runs else len(store.load_positions(base))
+    info.name = name
+    run = {"of": content_id(base), "landmarks": [had, had + more]}
+    info.extended = {"runs": [*runs, run]}
+    store.save_info(folder, info)
+    return folder
+
+
+def test_a_map_that_grew_elsewhere_is_offered_and_its_poses_are_ours(
+    stations: Any, tmp_path: Path
+) -> None:
+    shelves = [tmp_path / name / "maps" for name in ("one", "two")]
+    for shelf in shelves:
+        ignored = shutil.ignore_patterns("*.mcap", "*.jpg", "*.png", "sparse")
+        shutil.copytree(SAMPLE, shelf / "atrium", ignore=ignored)
+    chosen = [(f"map.folder={shelf / 'atrium'}", f"map.shelf={shelf}") for shelf in shelves]
+    hall = stations("hall", more=chosen[0])
+    attic = stations("attic", hall.endpoint, more=chosen[1])
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    assert attic.fleet.document()["offers"] == []
+    once = grown(shelves[0] / "atrium", "atrium-2", 500)
+    grown(once, "atrium-3", 20)
+    moved = grown(once, "moved", 7)  # it was registered anew since
+    info = store.load_info(moved)
+    info.registration = {**info.registration, "residual_rms_m": 0.5}
+    store.save_info(moved, info)
+
+    def offered() -> list[tuple[str, int]]:
+        acquainted(hall, attic)
+        offers = attic.fleet.document()["offers"]
+        assert {offer["station"] for offer in offers} <= {"hall"}
+        return [(offer["map"], offer["more"]) for offer in offers]
+
+    eventually(lambda: offered() == [("atrium-2", 500), ("atrium-3", 520)], 10.0)
+    assert hall.fleet.document()["offers"] == []
+
+    def pose(map_name: str) -> EstimateMessage | None:
+        attic.heard.clear()
+        for _ in range(3):
+            hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+            hall.bus.publish(bus_messages.ESTIMATE, BLIMP, replace(POSE, map=map_name))
+            time.sleep(0.2)
+        found: EstimateMessage | None = attic.last(bus_messages.ESTIMATE)
+        return found
+
+    eventually(lambda: pose("atrium-3"), 10.0)
+    assert attic.last(bus_messages.ESTIMATE).map == "atrium"
+    assert pose("moved") is None
+    name = attic.fleet.fetch_map("hall", "atrium-3")
+    taken = shelves[1] / name
+    assert content_id(taken) == content_id(shelves[0] / "atrium-3")
+    eventually(lambda: offered() == [("atrium-2", 500)], 10.0)
+    with pytest.raises(GroundStationError, match="did not answer"):
+        attic.fleet.fetch_map("nobody", "atrium-3")
+
+
 @pytest.mark.parametrize("name", ["../evil", "/etc/passwd", ".hidden", "a/b", "", "x\n", "n" * 70])
 def test_a_file_of_a_map_cannot_lie_elsewhere(name: str, tmp_path: Path) -> None:
     entry = {"map": "hall", "file": name, "size": 1, "sha256": "0"}
@@ -492,7 +555,7 @@ def test_a_file_of_a_map_cannot_lie_elsewhere(name: str, tmp_path: Path) -> None
     for listed in ([entry], [other], [], "text", [1], [{**entry, "file": "a", "size": -1}]):
         theirs = Elsewhere(lambda _: b"x", "hall")
         with pytest.raises(InputError, match="no map that can be fetched"):
-            maps._fetch(theirs, "hall", listed, tmp_path / "shelf")
+            maps.fetch(theirs, "hall", listed, tmp_path / "shelf")
     assert not (tmp_path / "shelf").exists()
 
 
@@ -500,8 +563,8 @@ def test_a_map_that_changed_meanwhile_leaves_nothing(tmp_path: Path) -> None:
     theirs = Elsewhere(lambda _: b"x", "hall")
     listed = [{"map": "hall", "file": "map.toml", "size": 1, "sha256": "another"}]
     with pytest.raises(InputError, match="changed there meanwhile"):
-        maps._fetch(theirs, "hall", listed, tmp_path)
+        maps.fetch(theirs, "hall", listed, tmp_path)
     gone = Elsewhere(lambda _: b"", "hall")
     with pytest.raises(GroundStationError, match="did not answer"):
-        maps._fetch(gone, "hall", listed, tmp_path)
+        maps.fetch(gone, "hall", listed, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,7 @@ import web_station as station
 
 from ground_station import cli
 from ground_station.cli import parser as blimp
+from ground_station.errors import GroundStationError
 from ground_station.service.settings import (
     MapSettings,
     RecordingSettings,
@@ -66,9 +67,9 @@ def heard(estimate: Any = None, demo: bool = False, **payload: Any) -> dict[str,
     }
 
 
-def record(name: str = "flight.mcap") -> None:
+def record(name: str = "flight.mcap", *maps: str) -> None:
     Path("recordings").mkdir(exist_ok=True)
-    station.write_recording(Path("recordings", name))
+    station.write_recording(Path("recordings", name), maps=maps)
 
 
 def own_map(name: str = "hall", registered: bool = True, inputs: str = "flight.mcap") -> None:
@@ -82,7 +83,7 @@ def own_map(name: str = "hall", registered: bool = True, inputs: str = "flight.m
 
 
 def test_it_begins_with_keys_and_goes_on_as_each_is_made() -> None:
-    assert states(guide()) == ["ready", "ready", "ready", "waiting", "waiting", "waiting"]
+    assert states(guide()) == [*["ready"] * 3, *["waiting"] * 4]
     keys = Path("home/blimp/keys")
     for made, command in (
         (None, "blimp keys init"),
@@ -173,8 +174,9 @@ def test_with_the_payloads_own_recording() -> None:
     assert steps["fly"].ways[0].command == (
         "blimp serve --lan --map maps/hall --set map.camera=camera.toml"
     )
-    assert states(guide(), heard({"state": "TRACKING", "map": "atrium"}))[-1] == "ready"
-    assert states(guide(), heard({"state": "TRACKING", "map": "hall"})) == ["done"] * 6
+    assert states(guide(), heard({"state": "TRACKING", "map": "atrium"}))[-2] == "ready"
+    tracked = states(guide(), heard({"state": "TRACKING", "map": "hall"}))
+    assert tracked == [*["done"] * 6, "waiting"]
     assert first_way(guide().steps(heard({"state": "TRACKING", "map": "hall"}))) == ""
 
 
@@ -197,12 +199,31 @@ def test_with_a_map_of_a_phones_video_the_payload_needs_a_lens_of_its_own() -> N
     assert told(guide())["fly"].found == "needs a payload that is heard"
 
 
+def test_a_flight_in_the_map_may_extend_it() -> None:
+    own_map()
+    record("elsewhere.mcap", "barn")
+    assert told(guide())["extend"].state == "waiting"
+    record("flight.mcap", "hall")
+    extend = told(guide())["extend"]
+    assert extend.state == "done" and extend.choices == ["flight.mcap"]
+    assert "not extended yet; recorded flights in it: 1" in extend.found
+    command = "blimp map extend maps/hall recordings/flight.mcap --out maps/"
+    assert extend.ways[0].command == command + "NAME"
+    document = {"station": {"demo": False, "loopback": True}, "payloads": {}}
+    words = guide().job(document, "extend", "flight.mcap", "hall-2")
+    assert shlex.join(words) == command + "hall-2"
+    for choice, name in (("flight.mcap", "hall"), ("flight.mcap", ""), ("elsewhere.mcap", "b")):
+        with pytest.raises(GroundStationError):
+            guide().job(document, "extend", choice, name)
+
+
 def test_every_command_that_it_names_is_one() -> None:
     """Also with the odd names that a shell would take apart."""
     Path("board.toml").touch()
     Path("it's; a walk.mov").touch()
     own_map("h")
     own_map("i", registered=False)
+    record("flight.mcap", "i")
     for step in (*guide().steps(None), *guide(camera="a b.toml").steps(heard())):
         for text in (step.check, *(way.command for way in step.ways)):
             program, *words = shlex.split(text.removeprefix("sudo ")) or ["", ""]
@@ -217,7 +238,7 @@ def test_init_shows_what_the_page_does(served: Any, capsys: Any, monkeypatch: An
     client = served[0]
     answer = client.get("/api/guide").json()
     assert [step["name"] for step in answer["steps"]] == [
-        "payload", "calibrate", "record", "build", "register", "fly",
+        "payload", "calibrate", "record", "build", "register", "fly", "extend",
     ]  # fmt: skip
     assert answer["steps"][0]["state"] == "done" and "30 frames" in answer["steps"][0]["found"]
     monkeypatch.setattr(

@@ -20,7 +20,13 @@ from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings, ProjectionSettings, load_preset
 from ground_station.localization.visibility import LandmarkIndex
 from ground_station.map import colmap, store
-from ground_station.map.folder import carry_floorplan, check_target, kept_name, replacing
+from ground_station.map.folder import (
+    carry_floorplan,
+    check_target,
+    content_id,
+    kept_name,
+    replacing,
+)
 from ground_station.map.model import model_of
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.refined import FRAME_TIME, Refined
@@ -133,7 +139,7 @@ def extend_map(
         quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
         store.save_tables(part, made, quantise=quantise)
         report["bytes"] = [_bytes(folder), _bytes(part)]
-        made.info.extended = _table(map_, report)
+        made.info.extended = _table(map_, {"of": content_id(folder), **report})
         store.save_info(part, made.info)
     made.folder = target
     return made, Extension(report, notes, kept)
@@ -299,7 +305,9 @@ def _bytes(folder: Path) -> int:
 
 
 def _table(map_: store.Map, report: dict[str, Any]) -> dict[str, Any]:
-    """`extended` of map.toml: every run with its time, inputs and figures, the last one last."""
-    runs = map_.info.extended.get("runs", [])
+    """`extended` of map.toml: every run with its time, inputs and figures, the last one last.
+
+    `of` is the map that was extended, by its content.
+    """
     when = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"runs": [*(runs if isinstance(runs, list) else []), {"time": when, **report}]}
+    return {"runs": [*map_.info.extensions, {"time": when, **report}]}

@@ -33,7 +33,7 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.fleet.allocation import Allocation, Peer, Pin
-from ground_station.service.fleet.maps import MAP, MapFiles
+from ground_station.service.fleet.maps import MAP, MapFiles, OwnMaps, fetch
 from ground_station.service.fleet.messages import (
     ALARMS,
     MESSAGE_BYTES,
@@ -42,8 +42,8 @@ from ground_station.service.fleet.messages import (
     SESSION,
     WANTS,
     WORD,
+    MapMessage,
     StationMessage,
-    map_id,
     rules,
 )
 from ground_station.service.fleet.shelf import TIMEOUT_S, Elsewhere, Shelf, ask, read
@@ -106,8 +106,10 @@ class Fleet:
     ) -> None:
         self.name = settings.name
         self._bus, self._version, self._on_picture = bus, version, on_picture
-        self._map = Path(settings.map.folder).resolve()
-        self._map_id = map_id(self._map)
+        self._own_maps = OwnMaps(settings.map)
+        self._shelf = Path(settings.map.shelf)
+        self._maps = self._own_maps.told()
+        self._fetching = threading.Lock()
         self._lock = threading.Lock()
         self._takes: dict[str, list[Take]] = {kind: [] for kind in _TOLD}
         self._here: dict[str, tuple[float, PayloadMessage]] = {}
@@ -195,6 +197,17 @@ class Fleet:
         """The recordings of another station, read from there."""
         return Elsewhere(lambda request: self._ask(station, _RECORDINGS, request), station)
 
+    def fetch_map(self, station: str, name: str) -> str:
+        """Takes a map that another station offers onto this one's shelf; what it is called here.
+
+        Raises a `BlimpError` with one line.
+        """
+        theirs = Elsewhere(
+            lambda request: self._ask(station, MAP, {**request, "map": name}), station
+        )
+        with self._fetching:
+            return fetch(theirs, station, theirs.list(), self._shelf).name
+
     # What this station's page adds
 
     def tell(self, alarms: list[Alarm], wants: frozenset[str], cpu: float) -> None:
@@ -220,12 +233,15 @@ class Fleet:
             leaves = self._allocation.leaves(here - alone, alone, load, overloaded, peers)
             pins = dict(self._allocation.pins)
         self._leave(leaves)
+        maps = self._own_maps.told()
+        self._maps = maps
         self._watch({f"{ROOT}/{at}/{_PICTURE}/{name}" for name, at in away.items() if at})
         said = StationMessage(
             time_ns=time.time_ns(),
             version=self._version,
-            map=self._map.name[:WORD],
-            map_id=self._map_id,
+            map=maps[0].name,
+            map_id=maps[0].id,
+            maps=maps,
             load=round(load, 2),
             overloaded=overloaded,
             hears=sorted(heard)[:PAYLOADS],
@@ -279,7 +295,7 @@ class Fleet:
                         "name": name,
                         "version": other.said.version,
                         "map": other.said.map,
-                        "same_map": other.said.map_id == self._map_id,
+                        "same_map": _own_map(other.said).shares_frame(self._maps[0]),
                         "load": other.said.load,
                         "age_s": round(now_s - other.came_s, 1),
                         "clock_s": round(other.clock_s, 2),
@@ -288,6 +304,7 @@ class Fleet:
                     }
                     for name, other in sorted(self._others.items())
                 ],
+                "offers": self._offers(now_s),
                 "pins": {
                     name: pin.station for name, pin in self._allocation.pins.items() if pin.station
                 },
@@ -298,6 +315,24 @@ class Fleet:
                 },
                 "refused": sorted(self._refused.values()),
             }
+
+    def _offers(self, now_s: float) -> list[dict[str, Any]]:
+        """Maps of others that grew from this station's, and that it has not yet.
+
+        Call it with the lock held.
+        """
+        own, held = self._maps[0], {one.id for one in self._maps}
+        return [
+            {
+                "station": name,
+                "map": one.name,
+                "more": one.landmarks - one.grown_from[own.id],
+            }
+            for name, other in sorted(self._others.items())
+            if now_s - other.came_s < FRESH_S
+            for one in other.said.maps
+            if own.id in one.grown_from and one.frame == own.frame and one.id not in held
+        ]
 
     def alarms(self) -> list[dict[str, Any]]:
         """The alarms of the other stations and of the payloads that fly with them.
@@ -448,7 +483,7 @@ class Fleet:
             elif self._told_of(payload_id) != station or not self._in_our_map(station, note):
                 return
             else:
-                note = dataclasses.replace(note, map=note.map and self._map.name)
+                note = dataclasses.replace(note, map=note.map and self._maps[0].name)
                 self._bus.publish(bus_messages.ELSEWHERE, payload_id, note)
             for take in self._takes[kind]:
                 take(payload_id, note)
@@ -472,12 +507,14 @@ class Fleet:
         return True
 
     def _in_our_map(self, station: str, note: EstimateMessage) -> bool:
-        """Whether a pose is in this station's map, whatever that is called over there."""
+        """Whether a pose is in this station's coordinates, whatever its map is called there."""
         with self._lock:
             other = self._others.get(station)
-        if other is None or other.said.map_id != self._map_id:
+        if other is None:
             return False
-        return note.map[:WORD] in ("", other.said.map)
+        known = {one.name: one for one in reversed([_own_map(other.said), *other.said.maps])}
+        theirs = known.get(note.map[:WORD] or other.said.map)
+        return theirs is not None and theirs.shares_frame(self._maps[0])
 
     def _asked(self, query: Any) -> None:
         """Another station's operator asks something of a payload that flies here."""
@@ -491,7 +528,8 @@ class Fleet:
                 query.reply(query.key_expr, read(self.shelf, request))
                 return
             if name == MAP:
-                query.reply(query.key_expr, read(MapFiles(self._map), request))
+                folder = self._own_maps.folder(str(request.get("map", "")))
+                query.reply(query.key_expr, read(MapFiles(folder), request))
                 return
             if payload_id:
                 answer = self._bus.query(name, request, timeout_s=TIMEOUT_S)
@@ -538,6 +576,11 @@ def _payload_of(name: str, request: Mapping[str, Any]) -> str:
     if name == _INTAKE and request.get("do") == _COMMAND:
         return str(request.get("payload"))
     return ""
+
+
+def _own_map(said: StationMessage) -> MapMessage:
+    """The map that a station flies in; an older one tells its name and content alone."""
+    return said.maps[0] if said.maps else MapMessage(said.map, said.map_id)
 
 
 def _follows(note: PayloadMessage) -> bool:

@@ -1,4 +1,4 @@
-"""The map of a station that is joined: fetched once, by its content, onto this station's shelf."""
+"""Maps of other stations, fetched once, by their content: that of one joined, or one that grew."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ import msgspec
 from msgspec import Meta
 
 from ground_station.errors import GroundStationError, InputError, MapError
-from ground_station.map.folder import check_is_map, replacing
-from ground_station.service.fleet.messages import SESSION, map_files, rules
+from ground_station.map import store
+from ground_station.map.folder import check_is_map, content_id, files_flown_in, replacing
+from ground_station.service.fleet.messages import MAPS, RUNS, SESSION, WORD, MapMessage, rules
 from ground_station.service.fleet.shelf import PIECE_BYTES, Elsewhere, ask
-from ground_station.service.settings import StationSettings
+from ground_station.service.settings import MapSettings, StationSettings
 from pi_firmware.wire import credentials
+from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.telemetry import open_session
 
 MAP = "map"
 """Asked of a station as its recordings are: list, read."""
+_KEPT = (".before", ".part", ".old")
+"""How folders end that `map.folder` leaves beside a map."""
 _FETCHED = re.compile(r".+-[0-9a-f]{8}")
 _LEAST_FREE_BYTES = 256_000_000
 _LOOK_S = 10.0
@@ -50,7 +54,7 @@ class MapFiles:
         name = self._folder.absolute().name
         return [
             asdict(_File(name, path.name, path.stat().st_size, _sha256(path)))
-            for path in map_files(self._folder)
+            for path in files_flown_in(self._folder)
         ]
 
     def size(self, name: str) -> int:
@@ -64,10 +68,62 @@ class MapFiles:
                 yield piece
 
     def _path(self, name: str) -> Path:
-        for path in map_files(self._folder):
+        for path in files_flown_in(self._folder):
             if path.name == name:
                 return path
         raise MapError(f"{self._folder}: has no file {name!r:.80}")
+
+
+class OwnMaps:
+    """The maps that a station gives to others: the one it flies in, and those grown on its shelf.
+
+    Each is read again when it is another.
+    """
+
+    def __init__(self, settings: MapSettings) -> None:
+        self._own, self._shelf = Path(settings.folder).resolve(), Path(settings.shelf)
+        self._read: dict[Path, tuple[int, MapMessage]] = {}
+
+    def told(self) -> list[MapMessage]:
+        """What is told of them, the station's own first."""
+        grown: list[Path] = []
+        with contextlib.suppress(OSError):
+            grown = sorted(self._shelf.iterdir())
+        found = [self._of(self._own) or MapMessage(self._own.name[:WORD], content_id(self._own))]
+        for folder in grown:
+            kept = folder.suffix.startswith(_KEPT)
+            said = None if kept or folder.resolve() == self._own else self._of(folder)
+            if said is not None and said.grown_from and len(found) < MAPS:
+                found.append(said)
+        return found
+
+    def folder(self, name: str) -> Path:
+        """Where one that was told of lies; "": the station's own."""
+        read = [*self._read.items()]
+        return next((at for at, (_, said) in read if said.name == name), self._own)
+
+    def _of(self, folder: Path) -> MapMessage | None:
+        try:
+            written_ns = (folder / "map.toml").stat().st_mtime_ns
+            before = self._read.get(folder)
+            if before is None or before[0] != written_ns:
+                self._read[folder] = (written_ns, _said(folder))
+        except (OSError, BlimpError):
+            self._read.pop(folder, None)
+            return None
+        return self._read[folder][1]
+
+
+def _said(folder: Path) -> MapMessage:
+    """What is told of a map; raises a `BlimpError` where its map.toml cannot be read."""
+    info = store.load_info(folder)
+    frame = hashlib.sha256(repr((info.frame, info.registration)).encode()).hexdigest()[:16]
+    grown, landmarks = {}, 0
+    for run in info.extensions[-RUNS:]:
+        with contextlib.suppress(LookupError, TypeError, ValueError):  # of before it said of what
+            had, landmarks = (int(count) for count in run["landmarks"])
+            grown[str(run["of"])[:WORD]] = had
+    return MapMessage(folder.name[:WORD], content_id(folder), frame, landmarks, grown)
 
 
 def fetched(settings: StationSettings) -> Path:
@@ -90,7 +146,7 @@ def fetched(settings: StationSettings) -> Path:
                 with contextlib.suppress(GroundStationError):  # it is not there, or not yet
                     listed = theirs.list()
                 if listed is not None:
-                    return _fetch(theirs, station, listed, shelf)
+                    return fetch(theirs, station, listed, shelf)
             time.sleep(0.2)
     finally:
         session.close()
@@ -105,7 +161,8 @@ def fetched(settings: StationSettings) -> Path:
     )
 
 
-def _fetch(theirs: Elsewhere, station: str, listed: Any, shelf: Path) -> Path:
+def fetch(theirs: Elsewhere, station: str, listed: Any, shelf: Path) -> Path:
+    """Takes the map of these files, as `MapFiles` lists them; raises as `fetched` does."""
     try:
         files = msgspec.convert(listed, Annotated[list[_File], Meta(min_length=1, max_length=32)])
     except msgspec.ValidationError as error:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
 
-from ground_station.map.folder import FLOWN_IN
 from ground_station.service.alarms import Alarm
 from ground_station.service.bus_messages import Message, RecordingMessage, WallTime
 from ground_station.service.fleet.allocation import Pin
@@ -18,7 +14,7 @@ from pi_firmware.wire import credentials
 from pi_firmware.wire.credentials import IN, OUT, SERVE
 
 ROOT = "fleet"
-PAYLOADS, ALARMS, WANTS = 64, 64, 16
+PAYLOADS, ALARMS, WANTS, MAPS, RUNS = 64, 64, 16, 16, 32
 """Of one station's message, at most."""
 MESSAGE_BYTES = 512 * 1024
 SESSION = {
@@ -32,12 +28,33 @@ Word = Annotated[str, Meta(max_length=WORD)]
 
 
 @dataclass(frozen=True, slots=True)
+class MapMessage(Message):
+    """A map on a station's shelf: what it is made of, and in which coordinates.
+
+    `id` is made of its content, `frame` of its registration. `grown_from` are the ids of the maps
+    that it was extended from, and how many landmarks each had; `landmarks` is how many it has.
+    """
+
+    name: Word
+    id: Word
+    frame: Word = ""
+    landmarks: int = 0
+    grown_from: Annotated[dict[Word, int], Meta(max_length=RUNS)] = field(default_factory=dict)
+
+    def shares_frame(self, other: MapMessage) -> bool:
+        """Whether a pose in one is a pose in the other: the same map, or grown of the same."""
+        here, there = {self.id, *self.grown_from}, {other.id, *other.grown_from}
+        return self.id == other.id or (self.frame == other.frame and bool(here & there))
+
+
+@dataclass(frozen=True, slots=True)
 class StationMessage(Message):
     """How a station is, twice a second.
 
     `map_id` is made of its map's content, `load` is the share of its processors that it uses,
     `overloaded` that they are too slow for its payloads. `wants` are those that are looked at,
-    `hears` all that are heard, `pins` where a person wants some to fly.
+    `hears` all that are heard, `pins` where a person wants some to fly. `maps` are those that it
+    gives: its own first, then what grew on its shelf.
     """
 
     time_ns: WallTime
@@ -51,21 +68,7 @@ class StationMessage(Message):
     wants: Annotated[list[Word], Meta(max_length=WANTS)] = field(default_factory=list)
     hears: Annotated[list[Word], Meta(max_length=PAYLOADS)] = field(default_factory=list)
     pins: Annotated[dict[Word, Pin], Meta(max_length=PAYLOADS)] = field(default_factory=dict)
-
-
-def map_files(folder: Path) -> list[Path]:
-    """The files of a map that localizers and pages read."""
-    return [folder / name for name in FLOWN_IN if (folder / name).is_file()]
-
-
-def map_id(folder: Path) -> str:
-    """Tells a map from another of the same name: its files' names and sizes, its `map.toml`."""
-    found = hashlib.sha256()
-    with contextlib.suppress(OSError):
-        for path in map_files(folder):
-            found.update(f"{path.name} {path.stat().st_size}\n".encode())
-        found.update((folder / "map.toml").read_bytes())
-    return found.hexdigest()[:16]
+    maps: Annotated[list[MapMessage], Meta(max_length=MAPS)] = field(default_factory=list)
 
 
 def rules(held: credentials.Credentials) -> dict[str, Any]:

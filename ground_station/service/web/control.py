@@ -13,9 +13,11 @@ from ground_station.service.web.maps import Maps
 from ground_station.service.web.models import (
     AnswerModel,
     CommandRequest,
+    MapName,
     MapRequest,
     PayloadId,
     RecordingRequest,
+    StationName,
     StationRequest,
 )
 from ground_station.service.web.problems import Busy, NotFound, problems
@@ -115,6 +117,15 @@ def router(control: Control, maps: Maps, fleet: Fleet | None = None) -> APIRoute
             raise NotFound(f"no station {request.name!r} flies beside this one")
         fleet.pin(payload_id, request.name)
         return {"done": True, "reason": "", "values": {}}
+
+    @result.post(
+        "/stations/{station}/maps/{name}", response_model=AnswerModel, responses=problems(404, 409)
+    )
+    def fetch_map(station: StationName, name: MapName) -> Any:
+        """Takes a map that another station offers; `values.map` is what it is called here."""
+        if fleet is None or not fleet.knows(station):
+            raise NotFound(f"no station {station!r} flies beside this one")
+        return {"done": True, "reason": "", "values": {"map": fleet.fetch_map(station, name)}}
 
     @result.post("/recording", response_model=AnswerModel, responses=problems(413))
     def recording(request: RecordingRequest) -> Any:

@@ -1,8 +1,8 @@
 """The way from a payload to a flight: how far one is, by what is on disk and on the bus.
 
-Six steps, each with what was found of it, how to check it, and the commands that go on. A map may
-come of the payload's own recording or of a phone's video; both ways are told. `blimp init` and the
-dashboard show what `Guide` says.
+Steps, each with what was found of it, how to check it, and the commands that go on. A map may come
+of the payload's own recording or of a phone's video; both ways are told, and how it grows with
+flights. `blimp init` and the dashboard show what `Guide` says.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from pi_firmware.wire.errors import BlimpError
 State = Literal["done", "ready", "waiting"]
 CAMERA, BOARD, REPORT = "camera.toml", "board.toml", "calibration.html"
 PLAN = "floorplan.png"
+NAMED = ("build", "extend")
+"""Steps whose jobs make a map, which wants a name."""
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 _CHOICES = 50
 
@@ -64,7 +66,7 @@ class Guide:
         self._settings, self._shelf, self._recorded = settings, shelf, recorded
 
     def steps(self, station: Mapping[str, Any] | None) -> list[Step]:
-        """All six; `station` is the state's document, None where no station runs."""
+        """All of them; `station` is the state's document, None where no station runs."""
         heard = _heard(station)
         recordings = [item for item in self._recorded.list() if item["duration_s"]]
         maps = list(self._own_maps())
@@ -75,6 +77,7 @@ class Guide:
             self._build(recordings, maps),
             self._register(maps),
             self._fly(heard, maps),
+            self._extend(recordings, maps),
         ]
 
     def _payload(
@@ -233,6 +236,20 @@ class Guide:
             return Step("fly", title, "waiting", "needs a payload that is heard", check, ways)
         return Step("fly", title, "ready", f"{name} is ready", check, ways)
 
+    def _extend(self, recordings: list[Any], maps: list[tuple[str, MapInfo]]) -> Step:
+        """Nobody must: it is to do only where a flight in the map is not yet part of it."""
+        title = "The map grows with flights"
+        name, info = maps[0] if maps else ("NAME", None)
+        flown = [str(item["file"]) for item in recordings if name in item["maps"]]
+        check = f"blimp map info {shlex.quote(self._folder(name))}"
+        if info is None or not flown:
+            return Step("extend", title, "waiting", "needs a recorded flight in the map", check)
+        times = f"extended {len(info.extensions)} times" if info.extensions else "not extended yet"
+        found = f"{name}: {times}; recorded flights in it: {len(flown)}"
+        words = self._words("extend", flown[0])
+        ways = [Way("another wing or another light, of such a flight", shlex.join(words))]
+        return Step("extend", title, "done", found, check, ways, flown[:_CHOICES])
+
     def camera(self) -> str:
         """The payload's calibration as it is or will be given; "" where there is none."""
         return self._settings.map.camera or (CAMERA if Path(CAMERA).is_file() else "")
@@ -251,7 +268,7 @@ class Guide:
         """
         if choice not in next(one.choices for one in self.steps(station) if one.name == step):
             raise NotFound(f"{choice[:80]!r}: cannot be taken for this step now")
-        if step == "build" and (not name or Path(self._folder(name)).exists()):
+        if step in NAMED and (not name or Path(self._folder(name)).exists()):
             raise GroundStationError(f"{name or 'the map'}: give it a name that is not taken")
         return self._words(step, choice, name)
 
@@ -265,6 +282,9 @@ class Guide:
             folder = self._folder(choice)
             plan = [] if (Path(folder) / "floorplan.yaml").is_file() else ["--plan", PLAN]
             return ["blimp", "map", "register", folder, "--page", *plan]
+        if step == "extend":
+            folder = self._folder(next((own for own, _ in self._own_maps()), "NAME"))
+            return ["blimp", "map", "extend", folder, recording, "--out", self._folder(name)]
         if choice.lower().endswith(_VIDEOS):  # whose camera is another than the payload's
             return ["blimp", "map", "build", choice, "--out", self._folder(name)]
         lens = ["--camera", camera] if (camera := self.camera()) else []

@@ -35,7 +35,7 @@ class _Model(BaseModel):
 class JobRequest(_Model):
     """A long job: its step, one of the choices that the guide has for it, and a new map's name."""
 
-    step: Literal["calibrate", "build", "register"]
+    step: Literal["calibrate", "build", "register", "extend"]
     choice: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     map: Annotated[str, StringConstraints(pattern=MAP_PATTERN)] | None = None
 
@@ -60,7 +60,7 @@ class StepModel(BaseModel):
 
 
 class GuideModel(BaseModel):
-    """The six steps as the station sees them from the folder that its commands are given in."""
+    """The steps as the station sees them from the folder that its commands are given in."""
 
     folder: str
     steps: list[StepModel]
@@ -203,6 +203,14 @@ class OtherStationModel(BaseModel):
     payloads: list[str]
 
 
+class OfferModel(BaseModel):
+    """A map of another station: this one's, grown by so many (`more`) landmarks."""
+
+    station: str
+    map: str
+    more: int
+
+
 class FleetModel(BaseModel):
     """The other stations, and where persons want payloads to fly (`pins`).
 
@@ -210,6 +218,7 @@ class FleetModel(BaseModel):
     """
 
     stations: list[OtherStationModel]
+    offers: list[OfferModel]
     pins: dict[str, str]
     twins: dict[str, str]
     refused: list[str]

@@ -10,6 +10,7 @@ from corridor_light import MAPPED_M, RATE_HZ, SETTINGS, extended, unit
 from ground_station.geometry import poses
 from ground_station.localization.settings import load_preset
 from ground_station.map import colmap, store
+from ground_station.map.folder import content_id
 from ground_station.map.refined import Refined
 from ground_station.map_update.extension.extend import extend_map
 from ground_station.map_update.extension.localizing import localize
@@ -90,7 +91,7 @@ def test_another_sunset_flight_is_localized_better_and_a_noon_flight_as_before(
 
 
 def test_everything_in_the_folder_fits_together(by_sunset):
-    _, new, result = by_sunset
+    old, new, result = by_sunset
     model = colmap.to_arrays(colmap.read(new.folder / "sparse"))
     assert model.names == new.keyframes.names
     assert np.array_equal(model.point_id, new.landmarks.id)
@@ -102,6 +103,7 @@ def test_everything_in_the_folder_fits_together(by_sunset):
     assert run["flights"][0]["input"] == "sunset" and run["time"].endswith("+00:00")
     assert run["bytes"] == result.report["bytes"] and run["bytes"][1] > run["bytes"][0] > 0
     assert run["keyframes"][1] == len(new.keyframes)
+    assert run["of"] == content_id(old.folder) != content_id(new.folder)
     groups = Refined.of(new).groups(len(new.keyframes))
     assert (groups == 1).sum() == run["flights"][0]["frames"]
 

@@ -2,18 +2,19 @@
 /** The station's HTTP API. A refusal is an answer with its reason, as a broken network is. */
 
 const LIMIT_MS = 8000;
+const FETCH_MS = 600_000; // a whole map, through a radio
 
 /**
  * @param {string} path @param {unknown} [body] goes as JSON @param {string} [method] with a body
- * @returns {Promise<Response>}
+ * @param {number} [limit_ms] @returns {Promise<Response>}
  */
-function ask(path, body, method = "POST") {
+function ask(path, body, method = "POST", limit_ms = LIMIT_MS) {
   const post = body === undefined ? {} : {
     method,
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(body),
   };
-  return fetch(path, { ...post, cache: "no-store", credentials: "same-origin", signal: AbortSignal.timeout(LIMIT_MS) });
+  return fetch(path, { ...post, cache: "no-store", credentials: "same-origin", signal: AbortSignal.timeout(limit_ms) });
 }
 
 /** @param {Response} response @returns {Promise<string>} */
@@ -29,9 +30,9 @@ async function reasonOf(response) {
   return `the station answered ${response.status} ${response.statusText}`.trim();
 }
 
-/** @param {unknown} error @returns {string} */
-function failure(error) {
-  if (error instanceof DOMException && error.name === "TimeoutError") return `no answer within ${LIMIT_MS / 1000} s`;
+/** @param {unknown} error @param {number} [limit_ms] @returns {string} */
+function failure(error, limit_ms = LIMIT_MS) {
+  if (error instanceof DOMException && error.name === "TimeoutError") return `no answer within ${limit_ms / 1000} s`;
   return "the station cannot be reached";
 }
 
@@ -63,15 +64,18 @@ export async function getBytes(path) {
   return response.arrayBuffer();
 }
 
-/** @param {string} path @param {unknown} body @param {string} [method] @returns {Promise<import("./types.js").Answer>} */
-export async function post(path, body, method) {
+/**
+ * @param {string} path @param {unknown} body @param {string} [method] @param {number} [limit_ms]
+ * @returns {Promise<import("./types.js").Answer>}
+ */
+export async function post(path, body, method, limit_ms) {
   try {
-    const response = await ask(path, body, method);
+    const response = await ask(path, body, method, limit_ms);
     if (!response.ok) return { done: false, reason: await reasonOf(response) };
     const answer = await response.json();
     return { ...answer, done: answer.done !== false, reason: String(answer.reason ?? "") };
   } catch (error) {
-    return { done: false, reason: failure(error) };
+    return { done: false, reason: failure(error, limit_ms) };
   }
 }
 
@@ -81,6 +85,8 @@ export const record = (/** @type {boolean} */ active) => post("/api/recording", 
 export const relocalize = (/** @type {string} */ id) => post(`${payload(id)}/relocalize`, {});
 export const chooseStation = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/station`, { name });
 export const chooseMap = (/** @type {string} */ id, /** @type {string} */ name) => post(`${payload(id)}/map`, { name });
+export const fetchMap = (/** @type {string} */ station, /** @type {string} */ name) =>
+  post(`/api/stations/${station}/maps/${encodeURIComponent(name)}`, {}, "POST", FETCH_MS);
 export const command = (/** @type {string} */ id, /** @type {string} */ name, /** @type {Record<string, number>} */ values = {}) =>
   post(`${payload(id)}/command`, { name, arguments: values });
 export const recordingPath = (/** @type {string} */ file, station = "") =>

@@ -36,10 +36,28 @@ export class MapDialog {
       const maps = await api.get("/api/maps");
       const now = this.store.current?.estimate?.map || this.store.station.map;
       setText(this.f.note, maps.length ? "The localizer restarts in the map that is chosen." : "There are no maps. `blimp map build` makes one.");
-      this.f.choices.replaceChildren(...maps.map((map) => this.choice(map, map.name === now)), ...this.stations(id));
+      const shown = maps.map((map) => this.choice(map, map.name === now));
+      this.f.choices.replaceChildren(...shown, ...this.offers(), ...this.stations(id));
     } catch (error) {
       setText(this.f.note, error instanceof Error ? error.message : String(error));
     }
+  }
+
+  /** What grew from this station's map elsewhere: it is fetched, then chosen. */
+  offers() {
+    return (this.store.fleet?.offers ?? []).map(({ station, map, more }) => {
+      const grown = `grown by ${count(more)} landmarks`;
+      const button = make("button", "choice", make("span", "", map), make("small", "", `of station ${station}`), make("small", "", grown));
+      button.setAttribute("type", "button");
+      button.addEventListener("click", async () => {
+        setText(this.f.note, `Fetching ${map} from station ${station}…`);
+        const answer = await api.fetchMap(station, map);
+        if (!answer.done) return setText(this.f.note, answer.reason);
+        this.dialog.close();
+        this.chosen(String(answer.values?.map));
+      });
+      return button;
+    });
   }
 
   /** Where it may fly, if there is more than one station. @param {string} id */

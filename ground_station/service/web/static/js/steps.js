@@ -8,7 +8,8 @@ import { percent } from "./format.js";
 const AGAIN_MS = 4000;
 const ENDED_MS = 60_000; // so long is told how a job ended
 const STATES = { done: ["check", "done"], ready: ["initializing", "to do"], waiting: ["none", "later"] };
-const JOBS = { calibrate: "Calibrate with", build: "Build a map of", register: "Register" };
+const JOBS = { calibrate: "Calibrate with", build: "Build a map of", register: "Register", extend: "Extend the map by" };
+const NAMED = ["build", "extend"]; // these make a map
 
 export class Steps {
   /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop */
@@ -85,11 +86,11 @@ export class Steps {
     const outcome = make("p", "step-outcome", "");
     outcome.setAttribute("role", "status");
     button.addEventListener("click", async () => {
-      const more = step.name === "build" ? { map: name.value.trim() } : {};
+      const more = NAMED.includes(step.name) ? { map: name.value.trim() } : {};
       const answer = await api.post("/api/job", { step: step.name, choice: select.value, ...more });
       setText(outcome, answer.done ? "It runs, also when this page is closed." : answer.reason);
     });
-    const parts = [make("span", "", label), select, ...(step.name === "build" ? [name] : []), button];
+    const parts = [make("span", "", label), select, ...(NAMED.includes(step.name) ? [name] : []), button];
     return make("div", "starter", ...parts, outcome);
   }
 

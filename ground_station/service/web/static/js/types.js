@@ -80,6 +80,7 @@
  *
  * @typedef {object} Fleet
  * @property {{name: string, age_s: number, payloads: string[]}[]} stations the others
+ * @property {{station: string, map: string, more: number}[]} offers maps of others that grew from this one's
  * @property {Record<string, string>} pins where persons want payloads to fly
  *
  * @typedef {object} PayloadEntry
@@ -158,6 +159,6 @@
  * @typedef {object} Answer of a command
  * @property {boolean} done
  * @property {string} reason
- * @property {Record<string, number>} [values]
+ * @property {Record<string, number|string>} [values]
  */
 export {};
