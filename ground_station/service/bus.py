@@ -24,6 +24,9 @@ from pi_firmware.wire.errors import BlimpError
 
 _SOCKET = "bus"
 _OPEN_LIMIT_S = 10.0
+_LEASE_S = 3600.0
+"""How long a silent process keeps its place: one that dies closes its socket, and one that was only
+stopped, as by a computer that slept, is to hear at once what comes when it wakes."""
 
 Do = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
@@ -45,6 +48,7 @@ def _config(mode: str, folder: Path) -> Any:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": int(_LEASE_S * 1000),
     }.items():
         config.insert_json5(name, json.dumps(value))
     return config
