@@ -320,7 +320,7 @@ class Depacketizer:
             self._cut()
             self._fragment = bytearray([indicator & 0xE0 | header & 0x1F])
         elif self._fragment is None:
-            return False
+            return not self._complete  # its beginning was lost, and that is told already
         else:
             whole = True
         if len(self._fragment) + len(payload) > MAX_ACCESS_UNIT_BYTES:

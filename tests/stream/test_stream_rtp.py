@@ -165,6 +165,16 @@ def test_a_malformed_payload_makes_its_access_unit_incomplete(payload: bytes) ->
     assert counters.malformed == 1
 
 
+def test_what_was_lost_is_lost_and_not_malformed() -> None:
+    """An IDR in fragments, of which the first, or one between, does not come."""
+    datagrams = packets(flight_units(frames=1))
+    begins = next(n for n, one in enumerate(datagrams) if one[12] & 0x1F == 28)
+    for missing in (begins, begins + 1):
+        (unit,), counters = received([*datagrams[:missing], *datagrams[missing + 1 :]])
+        assert not unit.complete and counters.packets_lost == 1
+        assert counters.malformed == 0
+
+
 @settings(deadline=None, max_examples=300)
 @given(st.lists(st.binary(max_size=60), max_size=20))
 def test_any_datagrams_are_taken_or_refused(datagrams: list[bytes]) -> None:
