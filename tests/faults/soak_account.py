@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from soaking.table import Row
@@ -47,6 +49,11 @@ def account_rows(account: Account) -> list[Row]:
     showable = witness.showable()
     lost = counts["sent"] - len(account.seen)
     given_up = received["packets_late"] - link["duplicated"]
+    odd = {
+        "not shown": sorted({*visible} - {*whole}),
+        "shown, but cut": sorted({*whole} - {*showable}),
+        "twice or late": [b for a, b in itertools.pairwise(account.seen) if b <= a],
+    }
     return [
         *rows,
         Row("captured", str(counts["captured"]), "", counts["captured"] > 0),
@@ -66,9 +73,9 @@ def account_rows(account: Account) -> list[Row]:
         Row("received", str(len(account.seen)), "", len(account.seen) > 0),
         Row(
             "shown whole, at least and at most",
-            f"{len(visible)} <= {len(whole)} <= {len(showable)}",
+            f"{len(visible)} <= {len(whole)} <= {len(showable)}{_named(odd)}",
             "exact, one by one",
-            {*visible} <= {*whole} <= {*showable} and account.seen == sorted({*account.seen}),
+            not any(odd.values()),
         ),
         Row(
             "shown damaged, lost, of damaged and following",
@@ -85,3 +92,8 @@ def account_rows(account: Account) -> list[Row]:
         ),
         Row("packets given up too early", str(given_up)),
     ]
+
+
+def _named(odd: Mapping[str, Sequence[int]]) -> str:
+    """The frames that something is wrong with, some of them."""
+    return "".join(f"; {what}: {[*frames[:5]]}" for what, frames in odd.items() if frames)
