@@ -319,7 +319,7 @@ def test_the_steps_lead_on_and_start_a_job(
     shown.page.keyboard.press("n")
     shown.page.wait_for_selector("#steps-dialog .step")
     rows = shown.page.locator("#steps-dialog .step").all_text_contents()
-    assert len(rows) == 6 and "done" in rows[0] and "to do" in rows[3] and "later" in rows[4]
+    assert len(rows) == 7 and "done" in rows[0] and "to do" in rows[3] and "later" in rows[4]
     assert "videos: <b>a walk<.mp4" in rows[2]
     assert str(station.folder) in shown.text("#steps-dialog [data-f=note]")
     build = shown.page.locator("#steps-dialog .step").nth(3)
