@@ -101,8 +101,8 @@ def spread(pixel_px: npt.ArrayLike, camera: Camera) -> float:
 
 _PROPOSED = 2.0
 """Times what an inlier of a find may miss by: a pose from three landmarks misses the others by more
-than one from all does. In maps of 13 and 20 images of a kitchen, frames whose right pose had 17 of
-70 matches within 3 px, and a wrong one 18, had 21 within 6 px, and the wrong one no more."""
+than one from all does. In a map of 20 images of a kitchen a frame's right pose had 17 of 69 matches
+within 3 px, and a wrong one 18; within 6 px the right one had the most, 21."""
 
 
 def pose_from_matches(

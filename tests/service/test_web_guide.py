@@ -212,6 +212,13 @@ def test_a_flight_in_the_map_may_extend_it() -> None:
     document = {"station": {"demo": False, "loopback": True}, "payloads": {}}
     words = guide().job(document, "extend", "flight.mcap", "hall-2")
     assert shlex.join(words) == command + "hall-2"
+    own_map("hall-2")
+    Path("camera.toml").write_text(CAMERA)
+    record("again.mcap", "hall", "hall-2")  # it grows further where it was flown last
+    words = guide().job(document, "extend", "again.mcap", "hall-3")
+    assert shlex.join(words) == (
+        "blimp map extend maps/hall-2 recordings/again.mcap --camera camera.toml --out maps/hall-3"
+    )
     for choice, name in (("flight.mcap", "hall"), ("flight.mcap", ""), ("elsewhere.mcap", "b")):
         with pytest.raises(GroundStationError):
             guide().job(document, "extend", choice, name)

@@ -77,7 +77,7 @@ class Guide:
             self._build(recordings, maps),
             self._register(maps),
             self._fly(heard, maps),
-            self._extend(recordings, maps),
+            self._extend(maps),
         ]
 
     def _payload(
@@ -236,19 +236,36 @@ class Guide:
             return Step("fly", title, "waiting", "needs a payload that is heard", check, ways)
         return Step("fly", title, "ready", f"{name} is ready", check, ways)
 
-    def _extend(self, recordings: list[Any], maps: list[tuple[str, MapInfo]]) -> Step:
-        """Nobody must: it is to do only where a flight in the map is not yet part of it."""
-        title = "The map grows with flights"
-        name, info = maps[0] if maps else ("NAME", None)
-        flown = [str(item["file"]) for item in recordings if name in item["maps"]]
-        check = f"blimp map info {shlex.quote(self._folder(name))}"
-        if info is None or not flown:
+    def _extend(self, maps: list[tuple[str, MapInfo]]) -> Step:
+        """Nobody must: it is there for a flight beyond the map, or in another light."""
+        title, known = "The map grows with flights", dict(maps)
+        flown = self._flown_in()
+        newest = next(iter(flown.items()), None)
+        if newest is None:
+            check = f"blimp map info {shlex.quote(self._folder('NAME'))}"
             return Step("extend", title, "waiting", "needs a recorded flight in the map", check)
-        times = f"extended {len(info.extensions)} times" if info.extensions else "not extended yet"
-        found = f"{name}: {times}; recorded flights in it: {len(flown)}"
-        words = self._words("extend", flown[0])
-        ways = [Way("another wing or another light, of such a flight", shlex.join(words))]
-        return Step("extend", title, "done", found, check, ways, flown[:_CHOICES])
+        file, name = newest
+        check = f"blimp map info {shlex.quote(self._folder(name))}"
+        times = len(known[name].extensions)
+        found = f"{name}: {f'extended {times} times' if times else 'not extended yet'}"
+        found += f"; recorded flights in it: {[*flown.values()].count(name)}"
+        ways = [
+            Way(
+                "another wing or another light, of such a flight",
+                shlex.join(self._words("extend", file)),
+            )
+        ]
+        return Step("extend", title, "done", found, check, ways, [*flown][:_CHOICES])
+
+    def _flown_in(self) -> dict[str, str]:
+        """Recordings, the newest first, by the last of one's own maps that each was flown in."""
+        own = {name for name, _ in self._own_maps()}
+        flown = {}
+        for item in self._recorded.list():
+            maps = [name for name in item["maps"] if name in own]
+            if maps and item["duration_s"]:
+                flown[str(item["file"])] = maps[-1]
+        return flown
 
     def camera(self) -> str:
         """The payload's calibration as it is or will be given; "" where there is none."""
@@ -282,13 +299,11 @@ class Guide:
             folder = self._folder(choice)
             plan = [] if (Path(folder) / "floorplan.yaml").is_file() else ["--plan", PLAN]
             return ["blimp", "map", "register", folder, "--page", *plan]
-        if step == "extend":
-            folder = self._folder(next((own for own, _ in self._own_maps()), "NAME"))
-            return ["blimp", "map", "extend", folder, recording, "--out", self._folder(name)]
         if choice.lower().endswith(_VIDEOS):  # whose camera is another than the payload's
             return ["blimp", "map", "build", choice, "--out", self._folder(name)]
         lens = ["--camera", camera] if (camera := self.camera()) else []
-        return ["blimp", "map", "build", recording, *lens, "--out", self._folder(name)]
+        doing = ["build"] if step == "build" else ["extend", self._folder(self._flown_in()[choice])]
+        return ["blimp", "map", *doing, recording, *lens, "--out", self._folder(name)]
 
     def _own_maps(self) -> Iterator[tuple[str, MapInfo]]:
         """Those that do not ship: the station's own map first, then the newest."""

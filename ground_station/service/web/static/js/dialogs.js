@@ -37,14 +37,14 @@ export class MapDialog {
       const now = this.store.current?.estimate?.map || this.store.station.map;
       setText(this.f.note, maps.length ? "The localizer restarts in the map that is chosen." : "There are no maps. `blimp map build` makes one.");
       const shown = maps.map((map) => this.choice(map, map.name === now));
-      this.f.choices.replaceChildren(...shown, ...this.offers(), ...this.stations(id));
+      this.f.choices.replaceChildren(...shown, ...this.offers(id), ...this.stations(id));
     } catch (error) {
       setText(this.f.note, error instanceof Error ? error.message : String(error));
     }
   }
 
-  /** What grew from this station's map elsewhere: it is fetched, then chosen. */
-  offers() {
+  /** What grew from this station's map elsewhere: fetched, then chosen if that is still wanted. @param {string} id */
+  offers(id) {
     return (this.store.fleet?.offers ?? []).map(({ station, map, more }) => {
       const grown = `grown by ${count(more)} landmarks`;
       const button = make("button", "choice", make("span", "", map), make("small", "", `of station ${station}`), make("small", "", grown));
@@ -52,6 +52,7 @@ export class MapDialog {
       button.addEventListener("click", async () => {
         setText(this.f.note, `Fetching ${map} from station ${station}…`);
         const answer = await api.fetchMap(station, map);
+        if (!this.dialog.open || this.store.selected !== id) return;
         if (!answer.done) return setText(this.f.note, answer.reason);
         this.dialog.close();
         this.chosen(String(answer.values?.map));
