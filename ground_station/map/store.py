@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,7 +19,7 @@ from ground_station.arrays import F32, F64, I32, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.descriptors import Descriptors, open_descriptors, quantised
-from ground_station.map.folder import check_is_map
+from ground_station.map.folder import check_is_map, content_id
 from ground_station.map.modes import MOST, Modes
 from pi_firmware.wire import config, files
 from pi_firmware.wire.errors import ConfigError
@@ -208,6 +209,13 @@ def save_info(folder: Path, info: MapInfo) -> None:
 
 def _save(path: Path, arrays: dict[str, npt.NDArray[Any]], metadata: dict[str, str]) -> None:
     files.write(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata))
+
+
+def coordinates_id(folder: Path, info: MapInfo) -> str:
+    """Tells coordinates from others: a map has those of the map that it was extended from first."""
+    first = next((str(run["of"]) for run in info.extensions if "of" in run), None)
+    of = repr((first or content_id(folder), info.registration))
+    return hashlib.sha256(of.encode()).hexdigest()[:16]
 
 
 def load_info(folder: str | Path) -> MapInfo:

@@ -268,7 +268,7 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
 
 
 def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    """Two blimps in one map that are too near each other, whichever stations they fly with."""
+    """Two blimps too near each other, whichever stations they fly with, in maps of one origin."""
     limit_m = _number(_table(state, "station").get("apart_m")) or 0.0
     where: dict[str, Any] = {}
     for payload_id, view in _table(state, "payloads").items():
@@ -276,11 +276,11 @@ def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterat
         position_m = [_number(value) for value in estimate.get("position_m") or ()]
         known = estimate.get("state") in ("TRACKING", "DEGRADED") and len(position_m) == 3
         if known and None not in position_m and age_s is not None and age_s <= NO_FRAMES_S:
-            where[payload_id] = estimate.get("map"), position_m
+            where[payload_id] = estimate.get("coordinates") or estimate.get("map"), position_m
     for one, other in itertools.combinations(sorted(where), 2):
-        (one_map, here), (other_map, there) = where[one], where[other]
+        (ours, here), (theirs, there) = where[one], where[other]
         name, distance_m = f"near/{one}/{other}", math.dist(here, there)
-        if one_map == other_map and distance_m < limit_m * (NEAR_OVER if name in standing else 1.0):
+        if ours == theirs and distance_m < limit_m * (NEAR_OVER if name in standing else 1.0):
             yield Alarm(name, ALARM, one, f"{distance_m:.1f} m from {other}")
 
 

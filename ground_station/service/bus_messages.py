@@ -84,6 +84,7 @@ class EstimateMessage(Message):
     position's covariance in world axes, m². `points_px` are the tracked landmarks, u, v by turns,
     `landmarks` their indices in the map, which only a replay asks for.
     `processed`, `localized` and `skipped` count the frames of this payload's session.
+    `coordinates` are those of the map, which maps that grew from it have, too.
     `overload` says in words that the processor is too slow for them; "" while it is not. `damaged`
     is the share of the picture that a loss took.
     """
@@ -112,6 +113,7 @@ class EstimateMessage(Message):
     landmarks: list[int] = field(default_factory=list)
     stage_ms: dict[str, float] = field(default_factory=dict)
     map: str = ""
+    coordinates: str = ""
     processed: int = 0
     localized: int = 0
     skipped: int = 0

@@ -226,6 +226,12 @@ def test_two_blimps_that_are_near_each_other(told, apart_m, standing, found):
     state = snapshot.document()
     state["station"]["apart_m"] = 1.5
     assert name not in alarms.judge(state, now_ns, {})  # not in one map: no distance
+    for payload_id, map_name in ((P, "hall"), ("z", "hall-2")):  # of which one grew of the other
+        grown = {"map": map_name, "coordinates": "c", "position_m": [1.0, 2.0, 3.0]}
+        snapshot.estimate(payload_id, station.estimate(state="TRACKING", **grown))
+    state = snapshot.document()
+    state["station"]["apart_m"] = 1.5
+    assert name in alarms.judge(state, now_ns, {})
 
 
 def test_telemetry_without_any_video_names_the_firewall(told):

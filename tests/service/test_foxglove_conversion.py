@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,9 @@ def test_a_relative_pose_has_the_covariance_of_both() -> None:
     turned = Rotation.from_matrix(moved[:, :3, :3] @ expected[:3, :3].T).as_rotvec()
     truth = np.cov(np.hstack([moved[:, :3, 3], turned]).T)
     assert found.pose.covariance is not None and distance(truth, found.pose.covariance) < NEAR
+    grown = [replace(note, map=f"hall-{k}", coordinates="c") for k, note in enumerate(notes)]
+    assert [one.payload_id for one in neighbours("a", grown[0], {"b": grown[1]})] == ["b"]
+    assert not [*neighbours("a", grown[0], {"b": replace(grown[1], coordinates="d")})]
     far = np.linalg.norm(moved[:, :3, 3], axis=1)
     assert found.distance_sigma_m == pytest.approx(far.std(), rel=NEAR)
 

@@ -173,7 +173,8 @@ def test_a_map_is_changed_while_frames_come(
     running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
 ) -> None:
     told, _ = running
-    assert localized(told, flight[0]).map == "atrium"
+    before = localized(told, flight[0])
+    assert before.map == "atrium"
     answer = told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
     assert answer["done"] and answer["map"] == "hall"
     eventually(
@@ -182,6 +183,7 @@ def test_a_map_is_changed_while_frames_come(
     changed = localized(told, flight[1])
     assert changed.map == "hall" and changed.relocalized and error_m(changed) < 0.1
     assert (changed.processed, changed.localized) == (2, 2)
+    assert "" != changed.coordinates != before.coordinates != ""
 
 
 @pytest.mark.parametrize(

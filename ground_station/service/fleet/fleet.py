@@ -42,7 +42,6 @@ from ground_station.service.fleet.messages import (
     SESSION,
     WANTS,
     WORD,
-    MapMessage,
     StationMessage,
     rules,
 )
@@ -295,7 +294,7 @@ class Fleet:
                         "name": name,
                         "version": other.said.version,
                         "map": other.said.map,
-                        "same_map": _own_map(other.said).shares_frame(self._maps[0]),
+                        "same_map": self._is_ours(other.said),
                         "load": other.said.load,
                         "age_s": round(now_s - other.came_s, 1),
                         "clock_s": round(other.clock_s, 2),
@@ -331,7 +330,9 @@ class Fleet:
             for name, other in sorted(self._others.items())
             if now_s - other.came_s < FRESH_S
             for one in other.said.maps
-            if own.id in one.grown_from and one.frame == own.frame and one.id not in held
+            if own.id in one.grown_from
+            and one.coordinates == own.coordinates
+            and one.id not in held
         ]
 
     def alarms(self) -> list[dict[str, Any]]:
@@ -483,7 +484,10 @@ class Fleet:
             elif self._told_of(payload_id) != station or not self._in_our_map(station, note):
                 return
             else:
-                note = dataclasses.replace(note, map=note.map and self._maps[0].name)
+                ours = self._maps[0]
+                note = dataclasses.replace(
+                    note, map=note.map and ours.name, coordinates=ours.coordinates
+                )
                 self._bus.publish(bus_messages.ELSEWHERE, payload_id, note)
             for take in self._takes[kind]:
                 take(payload_id, note)
@@ -512,9 +516,17 @@ class Fleet:
             other = self._others.get(station)
         if other is None:
             return False
-        known = {one.name: one for one in reversed([_own_map(other.said), *other.said.maps])}
-        theirs = known.get(note.map[:WORD] or other.said.map)
-        return theirs is not None and theirs.shares_frame(self._maps[0])
+        if note.coordinates:
+            return note.coordinates == self._maps[0].coordinates
+        return self._is_ours(other.said) and note.map[:WORD] in ("", other.said.map)
+
+    def _is_ours(self, said: StationMessage) -> bool:
+        """Whether another station's map has the coordinates of this one's; an older one tells the
+        content of its map alone."""
+        own = self._maps[0]
+        if said.maps and said.maps[0].coordinates:
+            return said.maps[0].coordinates == own.coordinates
+        return said.map_id == own.id
 
     def _asked(self, query: Any) -> None:
         """Another station's operator asks something of a payload that flies here."""
@@ -576,11 +588,6 @@ def _payload_of(name: str, request: Mapping[str, Any]) -> str:
     if name == _INTAKE and request.get("do") == _COMMAND:
         return str(request.get("payload"))
     return ""
-
-
-def _own_map(said: StationMessage) -> MapMessage:
-    """The map that a station flies in; an older one tells its name and content alone."""
-    return said.maps[0] if said.maps else MapMessage(said.map, said.map_id)
 
 
 def _follows(note: PayloadMessage) -> bool:

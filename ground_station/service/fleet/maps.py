@@ -98,9 +98,11 @@ class OwnMaps:
         return found
 
     def folder(self, name: str) -> Path:
-        """Where one that was told of lies; "": the station's own."""
-        read = [*self._read.items()]
-        return next((at for at, (_, said) in read if said.name == name), self._own)
+        """Where one that was told of lies; "": the station's own. Raises `MapError` for others."""
+        told = {said.name: at for at, (_, said) in [*self._read.items()]}
+        if name and name not in told:
+            raise MapError(f"there is no map {name[:64]!r} to give")
+        return told[name] if name else self._own
 
     def _of(self, folder: Path) -> MapMessage | None:
         try:
@@ -117,13 +119,13 @@ class OwnMaps:
 def _said(folder: Path) -> MapMessage:
     """What is told of a map; raises a `BlimpError` where its map.toml cannot be read."""
     info = store.load_info(folder)
-    frame = hashlib.sha256(repr((info.frame, info.registration)).encode()).hexdigest()[:16]
+    coordinates = store.coordinates_id(folder, info)
     grown, landmarks = {}, 0
     for run in info.extensions[-RUNS:]:
         with contextlib.suppress(LookupError, TypeError, ValueError):  # of before it said of what
             had, landmarks = (int(count) for count in run["landmarks"])
             grown[str(run["of"])[:WORD]] = had
-    return MapMessage(folder.name[:WORD], content_id(folder), frame, landmarks, grown)
+    return MapMessage(folder.name[:WORD], content_id(folder), coordinates, landmarks, grown)
 
 
 def fetched(settings: StationSettings) -> Path:

@@ -31,20 +31,15 @@ Word = Annotated[str, Meta(max_length=WORD)]
 class MapMessage(Message):
     """A map on a station's shelf: what it is made of, and in which coordinates.
 
-    `id` is made of its content, `frame` of its registration. `grown_from` are the ids of the maps
-    that it was extended from, and how many landmarks each had; `landmarks` is how many it has.
+    `id` is made of its content. `grown_from` are the ids of the maps that it was extended from, and
+    how many landmarks each had; `landmarks` is how many it has.
     """
 
     name: Word
     id: Word
-    frame: Word = ""
+    coordinates: Word = ""
     landmarks: int = 0
     grown_from: Annotated[dict[Word, int], Meta(max_length=RUNS)] = field(default_factory=dict)
-
-    def shares_frame(self, other: MapMessage) -> bool:
-        """Whether a pose in one is a pose in the other: the same map, or grown of the same."""
-        here, there = {self.id, *self.grown_from}, {other.id, *other.grown_from}
-        return self.id == other.id or (self.frame == other.frame and bool(here & there))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ class Neighbour:
 def neighbours(
     payload_id: str, own: EstimateMessage, others: Mapping[str, EstimateMessage]
 ) -> Iterator[Neighbour]:
-    """Those of `others` that have a pose in the same map within a second of `own`, by name.
+    """Those of `others` that have a pose in the same coordinates within a second of `own`, by name.
 
     With right tangents a and b of both poses the relative one, inverse(wTa)·wTb, moves by
     b - Ad(bTa)·a (Barfoot 2017, section 7.1.5). The errors of two cameras are taken as
@@ -50,7 +50,8 @@ def neighbours(
     for name in sorted(others.keys() - {payload_id}):
         note = others[name]
         there, age_s = _pose(note), 1e-9 * (stamp_ns - conversion.stamp_ns(note))
-        if there is None or note.map != own.map or abs(age_s) > OLD_S:
+        apart = (note.coordinates or note.map) != (own.coordinates or own.map)
+        if there is None or apart or abs(age_s) > OLD_S:
             continue
         aTb = conversion.OPTICAL_IN_CAMERA @ poses.inverse(here) @ _carried(there, note, age_s)
         distance_m, covariance, sigma_m = math.hypot(*aTb[:3, 3]), None, None

@@ -21,6 +21,7 @@ from ground_station.errors import GroundStationError, MapError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
+from ground_station.map import store
 from ground_station.service import bus_messages, pictures
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
@@ -142,7 +143,8 @@ class Localizing:
         self._pictures = pictures.PictureReader(folder, payload_id)
         self._loader = Loader(run)
         self._localizer: Localizer | None = None
-        self._map, self._waiting = "", "the map is being loaded"
+        self._map, self._coordinates = "", ""
+        self._waiting = "the map is being loaded"
         self._forget = threading.Event()
         self._stream: tuple[int, int] | None = None  # ssrc and time of the last frame
         self._failed = 0
@@ -227,7 +229,7 @@ class Localizing:
             localizer, time.monotonic(), accounts.processed, accounts.skipped
         )
         share = 0.0 if damaged is None else round(float(damaged.mean()), 3)
-        told = replace(told, overload=said, damaged=share)
+        told = replace(told, overload=said, damaged=share, coordinates=self._coordinates)
         self._bus.publish(bus_messages.ESTIMATE, self._payload_id, told)
 
     def _fail(self, localizer: Localizer, reason: str) -> None:
@@ -248,7 +250,9 @@ class Localizing:
         else:
             self._localizer, self._map = loading.localizer, loading.name
             self._failed = 0
-            count = len(loading.localizer.map.landmarks)
+            used = loading.localizer.map
+            self._coordinates = store.coordinates_id(loading.folder, used.info)
+            count = len(used.landmarks)
             text = f"the map '{loading.name}' is in use: {count} landmarks"
             self._event(bus_messages.INFO, "map-loaded", text)
         loading.taken.set()
