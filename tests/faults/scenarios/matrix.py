@@ -44,7 +44,7 @@ MATRIX: tuple[Scenario, ...] = (
     _one("dashboard without descriptors", hostile.Descriptors(0, 8, "web")),
     _one("intake without descriptors", hostile.Descriptors(0, 8, "intake")),
     # Certificates.
-    _one("keys rotated", *(certificates.KeysRotated(15.0 * n, 6) for n in range(3))),
+    _one("keys rotated", *(certificates.KeysRotated(15.0 * n, 12) for n in range(3))),
     _one("payload's certificate ends", certificates.CertificateEnds(0, 16)),
     _one("another's certificate revoked", certificates.Revoked(0, 8)),
     _one("two stations command", certificates.SecondStation(0, 10)),
