@@ -1,4 +1,4 @@
-"""The intake's threads share two heaps: what each payload's leave behind does not add up."""
+"""What threads or large blocks leave behind in a process's heaps does not add up."""
 
 import subprocess
 import sys
@@ -7,10 +7,10 @@ import pytest
 
 HEAPS = """
 import ctypes, sys, threading
-from ground_station.service.intake import __main__ as intake
+from ground_station.service import heaps
 
 if sys.argv[1] == "few":
-    intake.few_heaps()
+    heaps.few()
 here = threading.Barrier(8)
 
 def hold():
@@ -39,3 +39,42 @@ def heaps(words: str) -> int:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks glibc")
 def test_its_threads_share_two_heaps() -> None:
     assert heaps("few") <= 2 < heaps("many")
+
+
+LARGE = """
+import ctypes, sys
+from ground_station.service import heaps
+
+if sys.argv[1] == "apart":
+    heaps.large_apart()
+libc = ctypes.CDLL(None)
+
+class Info(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_size_t) for name in
+                ("arena", "ordblks", "smblks", "hblks", "mapped", "b", "c", "d", "e", "f")]
+
+libc.mallinfo2.restype, libc.malloc.restype = Info, ctypes.c_void_p
+libc.free.argtypes = [ctypes.c_void_p]
+first = libc.malloc(ctypes.c_size_t(14_200_000))
+libc.free(first)
+before = libc.mallinfo2().mapped
+libc.malloc(ctypes.c_size_t(14_000_000))
+print(libc.mallinfo2().mapped - before)
+"""
+
+
+def mapped(words: str) -> int:
+    """Bytes beside the heap that a block takes after a larger one was freed."""
+    done = subprocess.run(
+        [sys.executable, "-c", LARGE, words],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks glibc")
+def test_a_large_block_lies_beside_the_heap_each_time() -> None:
+    assert mapped("apart") >= 14_000_000 and mapped("glibc's way") == 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import os
 import sys
 import threading
@@ -11,7 +9,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first imported
 
-from ground_station.service import bus_messages
+from ground_station.service import bus_messages, heaps
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage, EventMessage, LeaveMessage
 from ground_station.service.cameras import camera_of
@@ -22,17 +20,6 @@ from ground_station.service.settings import load_run
 from pi_firmware.wire.errors import BlimpError
 
 _STEP_S = 0.1
-_M_ARENA_MAX = -8  # glibc's malloc.h
-
-
-def few_heaps() -> None:
-    """At most two heaps for all threads (glibc's mallopt(3); elsewhere nothing).
-
-    Each payload brings threads of its own, glibc gives them up to eight heaps a core, and what one
-    leaves in each of them adds up: 29 flights in an hour grew the intake by 8 MB.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
 def serve(folder: Path, stop: threading.Event) -> None:
@@ -61,7 +48,7 @@ def main() -> int:
     if len(sys.argv) != 2:
         print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
         return 2
-    few_heaps()
+    heaps.few()
     stop = ending(None)  # a recording ends in its own time
     import cv2
 

@@ -24,12 +24,13 @@ def main(arguments: list[str]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import cv2
 
-    from ground_station.service import processes, settings
+    from ground_station.service import heaps, processes, settings
     from ground_station.service.bus import Bus
     from ground_station.service.localizing.process import RESTART, Localizing
     from pi_firmware.wire.keys import check_payload_id
 
     cv2.setNumThreads(1)
+    heaps.large_apart()
     folder, payload_id = Path(arguments[0]), arguments[1]
     try:
         check_payload_id(payload_id)
