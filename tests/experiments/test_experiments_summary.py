@@ -100,6 +100,18 @@ def test_a_row_is_better_only_where_it_beats_every_rival(tmp_path):
     assert row[head.index("alone and default")] == "1.00 → 21.26 cm"
 
 
+def test_a_share_is_that_of_the_frames_which_the_rival_saw(tmp_path):
+    ours = kept_runs.run([0.01, None, None, 0.01, None, None])
+    theirs = kept_runs.run([0.05] * 6, step=3)
+    found = document(tmp_path, {"alone": [theirs] * 2, "default": [ours] * 2})
+    case = found["experiments"][0]["cases"][0]
+    assert case["common"]["alone"]["localized"] == {"ours": 1.0, "theirs": 1.0}
+    assert case["presets"]["alone"]["localized"] == 1.0 and found["worse"] == []
+    every = kept_runs.run([0.05] * 6)
+    (share,) = document(tmp_path, {"alone": [every] * 2, "default": [ours] * 2})["worse"]
+    assert "33.3 % of the frames are localized, each frame alone 100.0 %" in share
+
+
 def test_a_run_that_failed_or_was_not_measured_is_said(tmp_path):
     good = kept_runs.run([0.05] * 4)
     runs = {"thesis": [good, good], "default": [{"failed": "no two images overlap"}, None]}
