@@ -3,7 +3,7 @@
 BLIMP := .venv/bin/blimp
 
 .PHONY: help setup demo serve test check bench experiments budget hil soak soak-service limits faults fuzz \
-  soak-stream install-service uninstall-service image release flash update hil-image lock sample picture virtual-camera
+  soak-stream fleet install-service uninstall-service image release flash update hil-image lock sample picture virtual-camera
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-18s %s\n", $$1, $$2}' Makefile
@@ -120,6 +120,10 @@ soak-service: setup  ## The same for the whole service, HOURS=1, with a payload 
 soak-stream: setup  ## One unbroken stream of HOURS=1 through the live localizer, as fast as it takes it
 	@mkdir -p out
 	@.venv/bin/python tests/service/soak_stream.py --hours "$(or $(HOURS),1)" --out out/soak-stream.json
+
+fleet: setup  ## What a payload and the page cost on 1, 3 and 6 stations of two payloads each
+	@mkdir -p out
+	@.venv/bin/python tests/service/fleet_growth.py --out out/fleet.json
 
 lock:  ## Resolve requirements.lock again from pyproject.toml
 	@mkdir -p out && python3 -m venv out/lock && out/lock/bin/pip install -q uv

@@ -1,0 +1,178 @@
+"""What a payload and the page cost as a fleet grows: 1, 3 and 6 stations with two payloads each.
+
+    python tests/service/fleet_growth.py --out out/fleet.json
+
+Whole services on one machine, joined over mutual TLS, each with two payloads of its own that fly
+the sample's simulated flight at a tenth of its pace, so that two cores bear twelve of them. Prints
+the processor time of each, and of the first station's page with a viewer on it, and ends with
+status 1 when a bound is missed. pytest does not collect it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from intake_stand import eventually
+from payload_process import free_port
+from soaking.table import Row, show
+from standing import ATRIUM, Service, Viewer
+
+from ground_station.files import write_json
+
+STATIONS = 1, 3, 6
+EACH = 2
+"""Payloads of a station."""
+FRAME_HZ, PACE = 20.0, 0.1
+"""Of the flight's frames a second, and how much slower it is flown: two frames a second."""
+SETTLE_S, MEASURE_S, LOOK_S, LIMIT_S = 20.0, 90.0, 3.0, 240.0
+SAME = 0.2
+"""How far a payload's cost, and the page's beside a straight line, may differ."""
+LOCALIZED = 0.95
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Processor time in milliseconds a second.
+
+    `payload` is a payload's share of all processes but those that serve pages, `page` that of the
+    first station, which somebody looks at, `other_page` the mean of the others. `tracking` is the
+    share of looks at the first page that showed a payload as localized.
+    """
+
+    stations: int
+    payloads: int
+    payload: float
+    page: float
+    other_page: float
+    frames_hz: float
+    skipped: int
+    tracking: float
+
+
+def measured(stations: int, folder: Path) -> Cost:
+    """Flies so many stations with their payloads."""
+    names = [f"blimp-{k}" for k in range(1, stations * EACH + 1)]
+    fleet = json.dumps([f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"])
+    camera = f"camera.uri=replay:{ATRIUM / 'flight.mcap'}?loop=1&rate_hz={FRAME_HZ:g}&speed={PACE}"
+    with contextlib.ExitStack() as flying:
+        there: list[Service] = []
+        for k in range(stations):
+            (folder / f"station-{k}").mkdir(parents=True)
+            service = Service(
+                folder / f"station-{k}",
+                f"fleet.join={fleet}" if k else f"fleet.listen={fleet}",
+                payloads=names,
+                name=f"station-{k}",
+                authority=there[0].authority if there else None,
+            )
+            there.append(service)
+        for service in there:  # each one's certificates tell of all
+            flying.enter_context(service)
+        for k, name in enumerate(names):
+            flying.enter_context(
+                there[k // EACH].fly(name, folder / name, camera, rate_hz=FRAME_HZ)
+            )
+        page = there[0]
+        flying.enter_context(Viewer(page, names[0]))
+        eventually(lambda: all(page.tracking(name) for name in names), LIMIT_S)
+        time.sleep(SETTLE_S)
+        start_s, before, (frames, skipped) = time.monotonic(), _used_s(there), _counts(there)
+        looks: list[bool] = []
+        while time.monotonic() - start_s < MEASURE_S:
+            time.sleep(LOOK_S)
+            looks += [page.tracking(name) for name in names]
+        took_s = time.monotonic() - start_s
+        after, (frames_then, skipped_then) = _used_s(there), _counts(there)
+    spent = {key: 1e3 * (used_s - before[key]) / took_s for key, used_s in after.items()}
+    pages = [spent.pop((k, "web")) for k in range(stations)]
+    return Cost(
+        stations,
+        len(names),
+        sum(spent.values()) / len(names),
+        pages[0],
+        sum(pages[1:]) / max(1, stations - 1),
+        (frames_then - frames) / took_s,
+        skipped_then - skipped,
+        sum(looks) / len(looks),
+    )
+
+
+def _used_s(there: Sequence[Service]) -> dict[tuple[int, str], float]:
+    """Processor time of every process by station and name, seconds."""
+    return {
+        (k, name): one.cpu_s()
+        for k, service in enumerate(there)
+        for name, one in {**service.processes(), "serve": service.parent()}.items()
+    }
+
+
+def _counts(there: Sequence[Service]) -> tuple[int, int]:
+    """Frames that the localizers took, and those that they skipped."""
+    told = [
+        view["estimate"]
+        for service in there
+        for view in service.state()["payloads"].values()
+        if view["payload"]["station"] == ""
+    ]
+    return sum(note["processed"] for note in told), sum(note["skipped"] for note in told)
+
+
+def rows(costs: Sequence[Cost]) -> list[Row]:
+    """The table: each fleet, then what grew."""
+    table = []
+    for cost in costs:
+        name = f"{cost.stations} stations, {cost.payloads} payloads"
+        table += [
+            Row(f"{name}: frames", f"{cost.frames_hz:.1f} Hz, {cost.skipped} skipped"),
+            Row(
+                f"{name}: localized", f"{100 * cost.tracking:.1f} %", f">= {100 * LOCALIZED:g} %",
+                cost.tracking >= LOCALIZED,
+            ),
+            Row(f"{name}: a payload", f"{cost.payload:.1f} ms/s"),
+            Row(f"{name}: its page, others", f"{cost.page:.1f}, {cost.other_page:.1f} ms/s"),
+        ]  # fmt: skip
+    each = [cost.payload for cost in costs]
+    first, middle, last = costs[0], costs[1], costs[-1]
+    slope = (middle.page - first.page) / (middle.payloads - first.payloads)
+    straight = first.page + slope * (last.payloads - first.payloads)
+    return [
+        *table,
+        Row(
+            "a payload's cost, most by least", f"{max(each) / min(each):.2f}", f"<= {1 + SAME:g}",
+            max(each) <= (1 + SAME) * min(each),
+        ),
+        Row(
+            "the last page beside a straight line", f"{last.page / straight:.2f}",
+            f"<= {1 + SAME:g}", last.page <= (1 + SAME) * straight,
+        ),
+    ]  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Flies, prints, writes; 1 when a bound is missed."""
+    parser = argparse.ArgumentParser(prog="fleet", description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, metavar="FILE", help="figures as JSON")
+    options = parser.parse_args(arguments)
+    costs = []
+    with tempfile.TemporaryDirectory() as folder:
+        for stations in STATIONS:
+            costs.append(measured(stations, Path(folder) / str(stations)))
+            print(costs[-1], flush=True)
+    table = rows(costs)
+    show(table)
+    if options.out:
+        write_json(options.out, {"costs": [asdict(cost) for cost in costs]})
+    return int(not all(row.holds for row in table))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
