@@ -19,8 +19,8 @@ _BESIDE = {annexb.NAL_SEI, annexb.NAL_SPS, annexb.NAL_PPS}
 _FU_A, _FU_END = 28, 0x40
 _CLOSING_BYTES = 3
 """Of a slice's last fragment with its two bytes of header, one more: with what closes arithmetic
-coding (H.264, 9.3.4.5) and the trailing bits it says nothing of the picture. Two in 4,464 frames
-were so; decoded without it they and those after them were the same, bit for bit."""
+coding (H.264, 9.3.4.5) and the trailing bits it may say nothing of the picture. Two in 4,464 frames
+ended so; decoded without it they and those after them were the same, bit for bit."""
 
 
 @dataclass(frozen=True)
