@@ -27,6 +27,12 @@ from ground_station.features.padding import padded
 
 _OPERATORS = ["Conv", "Relu", "Clip", "MaxPool", "AveragePool", "Add", "Concat", "Resize"]
 """Those that onnxruntime's CPU runs on integers; what stands between others stays float."""
+_EXACT = {
+    "blobs": ("descriptors", "details", "worth"),
+    "cells": ("logits", "descriptors"),
+    "pixels": ("scores",),
+}
+"""Outputs whose last convolutions stay float: rounding there makes ties."""
 _READY = ("onnx.quant.pre_process", "onnxruntime.quant")
 """Says to the quantizer that nothing is left to fold: our graphs are built folded."""
 _LONGEST_ORIGIN = 180
@@ -37,9 +43,7 @@ def int8(model: Model, images: Sequence[U8], name: str) -> tuple[bytes, ModelInf
     """The file of a model in int8, with its own name, and what it is.
 
     `images` (H, W) uint8 calibrate it: static, per channel of the weights, unsigned activations,
-    with the range that each had at most (Jacob et al., CVPR 2018). The last convolutions of the
-    detector, and at low resolution of the descriptors, stay float: rounding there makes ties.
-    Raises `FeatureError`.
+    with the range that each had at most (Jacob et al., CVPR 2018). Raises `FeatureError`.
     """
     changed = _int8(check(model), model.info, images)
     origin = model.info.source[:_LONGEST_ORIGIN]
@@ -59,14 +63,13 @@ def check(model: Model) -> onnx.ModelProto:
 def network_input(info: ModelInfo, image: U8) -> F32:
     """What a model's network takes, (1, channels, H', W') 0..1, of a picture (H, W)."""
     grey = padded(image, info.multiple).astype(np.float32)[None, None] * np.float32(1 / 255)
-    return grey if info.layout == "cells" else np.repeat(grey, 3, axis=1)
+    return np.repeat(grey, info.channels, axis=1)
 
 
 def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[U8]) -> onnx.ModelProto:
     if not images:
         raise FeatureError("int8 needs pictures to calibrate by, and there is none")
     helper.set_model_props(proto, dict([_READY]))
-    outputs = ("logits", "descriptors") if info.layout == "cells" else ("scores",)
     with tempfile.TemporaryDirectory(prefix="blimp-quantize-") as folder:
         path = Path(folder) / "model.onnx"
         try:
@@ -82,7 +85,9 @@ def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[U8]) -> onnx
                 reduce_range=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
-                nodes_to_exclude=[name for end in outputs for name in _last(proto.graph, end)],
+                nodes_to_exclude=[
+                    name for end in _EXACT[info.layout] for name in _last(proto.graph, end)
+                ],
                 calibrate_method=CalibrationMethod.MinMax,
             )
             return onnx.load(path)

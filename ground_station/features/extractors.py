@@ -66,11 +66,16 @@ def of_network(
     network: Network, max_features: int = 1500, learned: LearnedSettings = _DEFAULT
 ) -> Extractor:
     """The extractor over a network, by the layout of its model."""
+    from ground_station.features.blobs import BlobFeatures
     from ground_station.features.cells import CellFeatures
     from ground_station.features.pixels import PixelFeatures
 
-    kind = CellFeatures if network.model.info.layout == "cells" else PixelFeatures
-    return kind(network, max_features, learned)
+    kinds: dict[str, Callable[[Network, int, LearnedSettings], Extractor]] = {
+        "blobs": BlobFeatures,
+        "cells": CellFeatures,
+        "pixels": PixelFeatures,
+    }
+    return kinds[network.model.info.layout](network, max_features, learned)
 
 
 def names() -> list[str]:

@@ -70,10 +70,9 @@ class Network:
                 f"features: the execution provider '{provider}' is installed but cannot run here"
             )
         self._outputs = [output.name for output in self._session.get_outputs()]
-        self._channels = 1 if model.info.layout == "cells" else 3
         rows, columns = (-(-side // model.info.multiple) * model.info.multiple
                          for side in _WARM_UP_PX)  # fmt: skip
-        self.run(np.zeros((1, self._channels, rows, columns), np.float32))
+        self.run(np.zeros((1, model.info.channels, rows, columns), np.float32))
 
     def run(self, image: F32) -> dict[str, F32]:
         """The outputs by name for pictures (N, channels, H, W), H and W of the right multiple."""

@@ -134,17 +134,19 @@ def _is_weight(graph: onnx.GraphProto, value: onnx.ValueInfoProto) -> bool:
 
 def _expected(info: ModelInfo) -> tuple[dict[str, tuple[int, ...]], dict[str, tuple[int, ...]]]:
     """Shapes of inputs and outputs for one picture of the probe's size."""
-    side = _PROBE_PX
+    side, quarter, eighth = _PROBE_PX, _PROBE_PX // 4, _PROBE_PX // 8
+    inputs: dict[str, tuple[int, ...]] = {"image": (1, info.channels, side, side)}
+    if info.layout == "blobs":
+        return inputs, {
+            "descriptors": (1, info.dimension - info.details, eighth, eighth),
+            "details": (1, info.details, quarter, quarter),
+            "worth": (1, 1, eighth, eighth),
+        }
     if info.layout == "cells":
-        low = side // 8
-        return (
-            {"image": (1, 1, side, side)},
-            {"logits": (1, 65, low, low), "descriptors": (1, info.dimension, low, low)},
-        )
-    return (
-        {"image": (1, 3, side, side)},
-        {"scores": (1, 1, side, side), "descriptors": (1, info.dimension, side, side)},
-    )
+        descriptors = (1, info.dimension, eighth, eighth)
+        return inputs, {"logits": (1, 65, eighth, eighth), "descriptors": descriptors}
+    descriptors = (1, info.dimension, side, side)
+    return inputs, {"scores": (1, 1, side, side), "descriptors": descriptors}
 
 
 def _check_ends(

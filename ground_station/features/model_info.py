@@ -10,7 +10,7 @@ from pathlib import Path
 from ground_station.features.extractor import FeatureError
 
 SCHEMA = "blimp.features/1.0"
-LAYOUTS = ("cells", "pixels")
+LAYOUTS = ("blobs", "cells", "pixels")
 MAX_BYTES = 64 << 20
 """SuperPoint's weights have 5.2 MB; a file that claims more than this is none of ours."""
 
@@ -28,6 +28,10 @@ class ModelInfo:
 
     `layout` is what goes in and out, images always with centres of pixels at whole numbers:
 
+    - `blobs` (our own): `image` (N, 1, H, W) grey 0..1 to `descriptors` (N, D - `details`, H/8,
+      W/8), `details` (N, `details`, H/4, W/4), the two parts of a descriptor before it is
+      normalised, and `worth` (N, 1, H/8, W/8), log odds; key points are the picture's own
+      (`features.blobs`);
     - `cells` (SuperPoint's): `image` (N, 1, H, W) grey 0..1 to `logits` (N, 65, H/8, W/8), where
       channel k < 64 is pixel (k // 8, k % 8) of its cell and 64 is "none", and `descriptors`
       (N, D, H/8, W/8), not normalised;
@@ -51,6 +55,7 @@ class ModelInfo:
     threshold: float | None = None
     subpixel_px: int = 0
     distance_scale: float = 1.0
+    details: int = 0
 
     def __post_init__(self) -> None:
         """Raises `FeatureError` with one line for a value that no model has."""
@@ -64,15 +69,25 @@ class ModelInfo:
             ("threshold", 0.0 if self.threshold is None else self.threshold, 0, 1),
             ("subpixel_px", self.subpixel_px, 0, 8),
             ("distance_scale", self.distance_scale, *SCALES),
+            (
+                "details",
+                self.details,
+                *((1, self.dimension - 1) if self.layout == "blobs" else (0, 0)),
+            ),
         )
         for key, value, low, high in numbers:
             if not low <= value <= high:  # neither is NaN
                 raise FeatureError(f"{key} is {value}; allowed: {low} to {high}")
-        if self.layout == "cells" and self.multiple % 8:
-            raise FeatureError(f"multiple is {self.multiple}; cells need a multiple of 8")
+        if self.layout != "pixels" and self.multiple % 8:
+            raise FeatureError(f"multiple is {self.multiple}; {self.layout} need a multiple of 8")
         for key, text in (("licence", self.licence), ("source", self.source)):
             if not text.isprintable() or not 0 < len(text) <= _MOST_TEXT:
                 raise FeatureError(f"{key} must be one line of at most {_MOST_TEXT} characters")
+
+    @property
+    def channels(self) -> int:
+        """Of the picture that goes in."""
+        return 3 if self.layout == "pixels" else 1
 
     def metadata(self) -> dict[str, str]:
         """The file's metadata, as `of_metadata` reads it."""
@@ -88,6 +103,7 @@ class ModelInfo:
             "threshold": None if self.threshold is None else repr(self.threshold),
             "subpixel_px": str(self.subpixel_px) if self.subpixel_px else None,
             "distance_scale": None if self.distance_scale == 1 else repr(self.distance_scale),
+            "details": str(self.details) if self.details else None,
         }
         return {_PREFIX + key: value for key, value in values.items() if value is not None}
 
@@ -129,6 +145,7 @@ class ModelInfo:
             nms_px=whole("nms_px") if _PREFIX + "nms_px" in metadata else None,
             threshold=real("threshold") if _PREFIX + "threshold" in metadata else None,
             subpixel_px=whole("subpixel_px") if _PREFIX + "subpixel_px" in metadata else 0,
+            details=whole("details") if _PREFIX + "details" in metadata else 0,
             distance_scale=(
                 real("distance_scale") if _PREFIX + "distance_scale" in metadata else 1.0
             ),

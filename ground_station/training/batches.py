@@ -1,7 +1,7 @@
 """The places that a step may draw from: rooms, and textures that come and go as training runs.
 
-Other processes paint the textures; the teacher labels them on the device. What is there at a step
-follows from seed and step, so that a resumed run sees what it would have seen.
+Other processes paint the textures. What is there at a step follows from seed and step, so that a
+resumed run sees what it would have seen.
 """
 
 from __future__ import annotations
@@ -23,18 +23,12 @@ from ground_station.training import corpus, pairs
 from ground_station.training.corpus import LIGHTS
 from ground_station.training.pairs import Batch, Places
 from ground_station.training.recipe import Recipe
-from ground_station.training.teacher import Teacher
 from ground_station.training.views import Chance
 
 _GROUP = 16
-"""Textures that are painted and labelled together."""
+"""Textures that are painted together."""
 _AHEAD = 2
 """Groups that each process has ready."""
-_TURNS = 8
-"""Turned pictures that the teacher sees of each place, beside those as they are."""
-_POINTS = 600
-_LABELLED = 8
-"""Places that the teacher looks at together: it takes half a gigabyte for them."""
 
 
 class _Textures(Dataset[Tensor]):
@@ -70,41 +64,19 @@ def _start(_: int) -> None:
 class Source:
     """The places, in the device's memory."""
 
-    def __init__(
-        self, recipe: Recipe, teacher: Teacher, folder: Path, device: torch.device
-    ) -> None:
-        self._recipe, self._teacher, self._device = recipe, teacher, device
+    def __init__(self, recipe: Recipe, folder: Path, device: torch.device) -> None:
+        self._recipe, self._device = recipe, device
         size = (recipe.corpus.rows, recipe.corpus.columns)
         rooms = [corpus.read(folder, k, size) for k in range(recipe.corpus.rooms - 1)]
         self._rooms = sum(len(room) for room in rooms)
-        most = self._rooms + recipe.textures
-        self._places = Places(
-            torch.empty(LIGHTS * self._rooms + recipe.textures, *size, dtype=torch.uint8,
-                        device=device),
-            torch.zeros(most, 2, dtype=torch.int64, device=device),
-            torch.zeros(most, _POINTS, 2, device=device),
-            torch.zeros(most, _POINTS, device=device),
-        )  # fmt: skip
-        first = 0
-        for number, room in enumerate(rooms):
-            views = torch.from_numpy(room)
-            self._put(first, LIGHTS * first, views, Chance(device, recipe.seed, 1, number))
-            first += len(views)
-
-    def _put(self, place: int, picture: int, views: Tensor, chance: Chance) -> None:
-        """Pictures (N, L, H, W) of N places, from that one on."""
-        views = views.to(self._device)
-        count, lights = views.shape[:2]
-        numbers = picture + torch.arange(count * lights, device=self._device).view(count, lights)
-        rows = slice(place, place + count)
-        p = self._places
-        p.pictures[picture : picture + count * lights] = views.flatten(0, 1)
-        p.lights[rows] = numbers[:, [0, -1]]
-        for k in range(0, count, _LABELLED):
-            part = slice(place + k, place + min(k + _LABELLED, count))
-            p.points_px[part], p.scores[part] = self._teacher.label(
-                views[k : k + _LABELLED].float() / 255, _TURNS, _POINTS, chance
-            )
+        lit = LIGHTS * self._rooms
+        self._pictures = torch.empty(lit + recipe.textures, *size, dtype=torch.uint8, device=device)
+        if rooms:
+            views = torch.from_numpy(np.concatenate(rooms))
+            self._pictures[:lit] = views.flatten(0, 1).to(device)
+        # A texture is there in one light.
+        numbers = torch.arange(lit + recipe.textures, device=device)
+        self._lights = torch.cat([numbers[:lit].view(-1, 2), numbers[lit:, None].expand(-1, 2)])
 
     def batches(self, first: int, last: int, jobs: int) -> Generator[Batch, None, None]:
         """Those of steps `first` to `last` - 1, in order."""
@@ -123,14 +95,11 @@ class Source:
         group = oldest
         for step in range(first, last):
             while group < self._groups_at(step):
-                slot = (group % most) * _GROUP
-                chance = Chance(self._device, recipe.seed, 2, group)
-                self._put(self._rooms + slot, LIGHTS * self._rooms + slot,
-                          next(stream)[:, None], chance)  # fmt: skip
+                slot = LIGHTS * self._rooms + (group % most) * _GROUP
+                self._pictures[slot : slot + _GROUP] = next(stream).to(self._device)
                 group += 1
             there = self._rooms + min(group, most) * _GROUP
-            p = self._places
-            places = Places(p.pictures, p.lights[:there], p.points_px[:there], p.scores[:there])
+            places = Places(self._pictures, self._lights[:there])
             chance = Chance(self._device, recipe.seed, 3, step)
             yield pairs.make(
                 places, chance, recipe.batch, (recipe.rows, recipe.columns), recipe.points
@@ -150,9 +119,6 @@ def held_out(recipe: Recipe, folder: Path, count: int) -> Batch:
         kinds.append(corpus.read(folder, recipe.corpus.rooms - 1, size))
     views = torch.from_numpy(np.concatenate(kinds))
     total = len(views)
-    places = Places(
-        views.flatten(0, 1), torch.arange(2 * total).view(total, 2), torch.zeros(total, 8, 2),
-        torch.zeros(total, 8),
-    )  # fmt: skip
+    places = Places(views.flatten(0, 1), torch.arange(2 * total).view(total, 2))
     chance = Chance(torch.device("cpu"), seed)
     return pairs.make(places, chance, count, (recipe.rows, recipe.columns), 16, lens=False)

@@ -17,9 +17,8 @@ Example: blimp models train --size swift --teacher alike-n --out out/training/sw
 
          blimp models train --device cpu --batch 8 --rate 0.0015 --fresh 1
 
-The teacher is ALIKE, brought by `blimp models import alike-n.safetensors`. All pictures are made by
-code. A killed run goes on with --resume where its last checkpoint stands. Torch is needed:
-.venv/bin/pip install torch."""
+All pictures are made by code; there is no teacher. A killed run goes on with --resume where its
+last checkpoint stands. Torch is needed: .venv/bin/pip install torch."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,13 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXAMPLE
     parser.set_defaults(next="blimp models list")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--size", default="swift", help="swift (default) or wren")
+    parser.add_argument("--size", default="lark", help="of the network: lark (default)")
     parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")
     parser.add_argument("--resume", action="store_true", help="go on where this folder stands")
     parser.add_argument(
         "--decay-from", type=Path, metavar="CHECKPOINT", help="end another run from here"
     )
-    parser.add_argument("--teacher", default="alike-n", help="model or .onnx file (alike-n)")
     parser.add_argument("--corpus", type=Path, help="folder of the pictures (out/training/corpus)")
     parser.add_argument("--seed", type=int, help="of pictures, weights and pairs (1)")
     for name, text in (
@@ -83,7 +81,6 @@ def run(args: argparse.Namespace) -> int:
     if args.steps is not None:  # a short run has a short end
         given.setdefault("decay", min(Recipe.decay, args.steps // 4))
         given["warm_up"] = min(Recipe.warm_up, args.steps // 4)
-        given["place_from"] = min(Recipe.place_from, args.steps // 4)
     numbers = {k: getattr(args, k) for k in ("rooms", "seed")}
     corpus = replace(CorpusSettings(), **{k: v for k, v in numbers.items() if v is not None})
     out = args.out or Path("out/training") / args.size
@@ -99,7 +96,6 @@ def run(args: argparse.Namespace) -> int:
         Recipe(**given, corpus=corpus),
         out=out,
         corpus_folder=args.corpus or Path("out/training/corpus"),
-        teacher_name=args.teacher,
         machine=machine,
         resume=args.resume,
         decay_from=args.decay_from,

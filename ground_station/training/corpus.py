@@ -37,7 +37,7 @@ class CorpusSettings:
     """What a corpus holds; more rooms may be asked for later."""
 
     seed: int = 1
-    rooms: int = 36
+    rooms: int = 40
     """The last one is held out."""
     places: int = 24
     """Of a room."""

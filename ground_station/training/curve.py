@@ -59,7 +59,7 @@ def plot(log: Path, out: Path) -> None:
     tried = [line for line in lines if line["kind"] == "validation"]
     others = [line for line in lines if line["kind"] == "baseline"]
     figure, axes = plt.subplots(1, 4, figsize=(16, 3.6), layout="constrained")
-    for name in ("detector", "descriptor", "found", "place", "reliability"):
+    for name in ("blobs", "anywhere", "worth"):
         axes[0].plot([t["step"] for t in trained], [t[name] for t in trained], lw=0.8, label=name)
     axes[0].set(title="loss", yscale="log")
     titles = {

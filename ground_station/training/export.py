@@ -11,15 +11,12 @@ from ground_station.feature_models import scale
 from ground_station.feature_models.graph import Graph, fold_batch_norm
 from ground_station.features.model_info import ModelInfo
 from ground_station.training.errors import TrainingError
-from ground_station.training.topology import LOGITS, Conv, Shape
+from ground_station.training.topology import OUTPUTS, Conv, Shape
 
 EPSILON = 1e-5
 """Of the batch normalisations, in training and where they are folded."""
 
 LICENCE = "BSD-3-Clause"
-NMS_PX = 3
-THRESHOLD = 0.005
-SUBPIXEL_PX = 2
 
 Weights = Mapping[str, F32]
 
@@ -28,14 +25,12 @@ def info(shape: Shape, source: str) -> ModelInfo:
     """What the file says of itself."""
     return ModelInfo(
         name=shape.name,
-        layout="cells",
+        layout="blobs",
         dimension=shape.dimension,
         multiple=shape.multiple,
         licence=LICENCE,
         source=source,
-        nms_px=NMS_PX,
-        threshold=THRESHOLD,
-        subpixel_px=SUBPIXEL_PX,
+        details=shape.details,
     )
 
 
@@ -74,9 +69,6 @@ class _OnnxOperations:
     def add(self, first: str, second: str) -> str:
         return self._graph.add(first, second)
 
-    def concat(self, first: str, second: str) -> str:
-        return self._graph.concat([first, second])
-
     def double(self, x: str) -> str:
         return self._graph.resize_bilinear(x, 2)
 
@@ -92,10 +84,11 @@ def export(shape: Shape, weights: Weights, path: str | Path, source: str) -> Mod
     """
     graph = Graph(shape.name)
     image = graph.input("image", 1)
-    logits, descriptors = shape.build(_OnnxOperations(graph, weights), image)
-    graph.output(logits, "logits", LOGITS)
-    graph.output(descriptors, "descriptors", shape.dimension)
-    made = info(shape, source)
-    made = replace(made, distance_scale=scale.measured(graph.model(made), made))
-    graph.save(path, made)
-    return made
+    made = shape.build(_OnnxOperations(graph, weights), image)
+    channels = (shape.dimension - shape.details, shape.details, 1)
+    for value, name, count in zip(made, OUTPUTS, channels, strict=True):
+        graph.output(value, name, count)
+    said = info(shape, source)
+    said = replace(said, distance_scale=scale.measured(graph.model(said), said))
+    graph.save(path, said)
+    return said

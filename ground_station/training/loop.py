@@ -14,16 +14,15 @@ import cv2
 import numpy as np
 import torch
 
-from ground_station.features import model
-from ground_station.features.cells import CellFeatures
+from ground_station.features import catalogue, model
+from ground_station.features.blobs import BlobFeatures
 from ground_station.features.extractor import Extractor
 from ground_station.features.extractors import of_network
 from ground_station.features.inference import Network
 from ground_station.features.methods.rootsift import RootSift
-from ground_station.features.model_info import Model
 from ground_station.features.settings import LearnedSettings
 from ground_station.progress import Progress, stop_noted
-from ground_station.training import checkpoint, corpus, curve, teacher, validation
+from ground_station.training import checkpoint, corpus, curve, validation
 from ground_station.training.batches import Source, held_out
 from ground_station.training.errors import TrainingError
 from ground_station.training.export import export
@@ -31,6 +30,7 @@ from ground_station.training.losses import Losses
 from ground_station.training.network import FeatureNetwork
 from ground_station.training.pairs import Batch
 from ground_station.training.recipe import Recipe, finite, is_due, pairs_seen
+from ground_station.training.topology import OUTPUTS
 from ground_station.training.trainer import Trainer
 
 _LOG_EVERY = 25
@@ -77,7 +77,6 @@ def train(
     *,
     out: Path,
     corpus_folder: Path,
-    teacher_name: str,
     machine: Machine,
     resume: bool = False,
     decay_from: Path | None = None,
@@ -89,6 +88,8 @@ def train(
     """
     device = machine.chosen()
     torch.set_num_threads(machine.threads)
+    # Of what is not the network's: places of blobs are differences of neighbouring pixels.
+    torch.backends.cudnn.allow_tf32 = False
     cv2.setNumThreads(1)
     checkpoints = out / "checkpoints"
     try:
@@ -113,13 +114,12 @@ def train(
         trainer.restore(start)
         step, before_s = start.step, float(start.state.get("seconds", 0))
     corpus.make(corpus_folder, recipe.corpus, machine.jobs)
-    found = teacher.load(teacher_name)
-    source = Source(recipe, teacher.Teacher(found, device), corpus_folder, device)
+    source = Source(recipe, corpus_folder, device)
     held = held_out(recipe, corpus_folder, _HELD_OUT_PAIRS)
     run = _Run(recipe, trainer, out, machine, before_s, held, fresh)
-    run.begins(found.sha256, step)
+    run.begins(step)
     if fresh:
-        run.baselines(found, step)
+        run.baselines(step)
     return run.go(source, step)
 
 
@@ -151,19 +151,19 @@ class _Run:
             self.log = curve.Log(self.out / "log.jsonl", -1 if self._fresh else step)
         return self.log
 
-    def begins(self, teacher_sha256: str, step: int) -> None:
+    def begins(self, step: int) -> None:
         """Notes what goes on from here: a resumed run may have a larger corpus."""
         self.note(step).add(
-            "recipe", step=step, recipe=self.recipe.as_dict(), teacher=teacher_sha256,
+            "recipe", step=step, recipe=self.recipe.as_dict(),
             device=str(self.trainer.device), bfloat16=self.trainer.bfloat16,
         )  # fmt: skip
 
-    def baselines(self, found: Model, step: int) -> None:
+    def baselines(self, step: int) -> None:
         """What others make of the same held-out pairs."""
+        wren = Network(catalogue.find("wren"), threads=self.machine.threads)
         others: dict[str, Extractor] = {
-            "rootsift": RootSift(_MOST_POINTS),
-            found.info.name: of_network(Network(found, threads=self.machine.threads), _MOST_POINTS),
-        }
+            "rootsift": RootSift(_MOST_POINTS), "wren": of_network(wren, _MOST_POINTS)
+        }  # fmt: skip
         for name, extractor in others.items():
             figures = validation.figures(extractor, self.held)
             self.note(step).add("baseline", step=step, name=name, **asdict(figures))
@@ -223,12 +223,12 @@ class _Run:
     def validate(self, step: int) -> dict[str, Any]:
         """Exports the weights' mean, holds the file to torch's outputs, and judges it."""
         pairs = pairs_seen(self.recipe, step)
-        source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs; teacher ALIKE, BSD-3"
+        source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs"
         weights, shape = self.trainer.weights(), self.trainer.shape
         export(shape, weights, self.model, source)
         network = Network(model.read(self.model), threads=self.machine.threads)
         self.compare(network)
-        extractor = CellFeatures(network, _MOST_POINTS, LearnedSettings())
+        extractor = BlobFeatures(network, _MOST_POINTS, LearnedSettings())
         figures = validation.figures(extractor, self.held)
         _say(f"step {step}", figures)
         values = asdict(figures)
@@ -248,7 +248,7 @@ class _Run:
         with torch.no_grad():
             wanted = mean(image)
         said = network.run(image.numpy())
-        for name, ours in zip(("logits", "descriptors"), wanted, strict=True):
+        for name, ours in zip(OUTPUTS, wanted, strict=True):
             gap = float(np.abs(said[name] - ours.numpy()).max())
             if not gap <= _DIFFERENCE * max(1.0, float(ours.abs().max())):
                 raise TrainingError(f"{self.model}: its {name} differ from torch's by {gap:.2g}")

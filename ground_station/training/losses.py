@@ -1,13 +1,10 @@
-"""What the two heads are to learn.
+"""What the network is to learn: descriptors that find each other, and which blobs are worth it.
 
-Detector: cross-entropy with the teacher's soft cells (DeTone et al., "SuperPoint", CVPR-W 2018,
-eq. 2, with distributions for labels); its peaks, refined as extraction does, are to be found again
-exactly where the other view has them (the reprojection loss of Zhao et al., "ALIKE", IEEE T-MM
-2022, section III-D) and to be worth it: a score that is high where the other view has no peak, or
-where descriptors take another point for it, costs (their reliability loss, section III-D, on a cell
-detector's chances). Descriptors: in both directions, of all points in the other view the right one
-(InfoNCE: van den Oord et al. 2018; both ways as the dual softmax of LoFTR, Sun et al., CVPR 2021),
-points of another picture beside them; at the pairs' points, and at the peaks as they are found.
+Key points are the views' own blobs (`features.blobs`). Of those that both views have, each is to
+find its partner, in both directions, among all blobs of the other view and of another picture
+(InfoNCE: van den Oord et al. 2018; both ways as the dual softmax of LoFTR, Sun et al., CVPR 2021);
+so are points anywhere. The score is the chance that a blob has a partner and that its descriptor
+finds it (the reliability of Revaud et al., "R2D2", NeurIPS 2019, as odds).
 """
 
 from __future__ import annotations
@@ -18,77 +15,70 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ground_station.training.export import NMS_PX, SUBPIXEL_PX
+from ground_station.features.blobs import NMS_PX
 from ground_station.training.pairs import Batch
-from ground_station.training.peaks import highest, refined
+from ground_station.training.peaks import response, strongest
 from ground_station.training.topology import CELL_PX
-from ground_station.training.views import Views, inside
+from ground_station.training.views import inside
 
-_MOST = 256
-"""Peaks of a view that are compared, the strongest."""
-_LEAST_SCORE = 0.01
-_NEAR_PX = 3.0
-"""Two peaks farther apart are two points."""
+_MOST = 320
+"""Blobs of a view that are compared."""
+_NEAR_PX = 1.5
+"""Two blobs farther apart are two points."""
 _FAR = -1e4
 """The logit of what is no choice."""
+
+Outputs = tuple[Tensor, Tensor, Tensor]
+"""Of the network; see `topology.OUTPUTS`."""
 
 
 @dataclass(frozen=True)
 class LossSettings:
     """Weights and temperatures."""
 
-    descriptor: float = 1.0
-    found: float = 1.0
-    """Of the descriptors at peaks."""
-    place: float = 2.0
-    """A pixel."""
-    reliability: float = 1.0
+    anywhere: float = 0.5
+    """Of the descriptors at points that are no blobs."""
+    worth: float = 0.5
     temperature: float = 0.06
-    apart_px: float = 8.0
-    """A point nearer than this to the right one is no wrong one."""
+    apart_px: float = 2.5
+    """A blob nearer than this to the right one is no wrong one."""
+    apart_anywhere_px: float = 6.0
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Means over the batch; `total` is what is minimised, `right` the share of nearest points."""
+    """Means over the batch; `total` is what is minimised, `right` the share of blobs with a
+    partner whose nearest descriptor is that."""
 
     total: Tensor
-    detector: Tensor
-    descriptor: Tensor
-    found: Tensor
-    place: Tensor
-    reliability: Tensor
+    blobs: Tensor
+    anywhere: Tensor
+    worth: Tensor
     right: Tensor
 
 
-def scores_of(logits: Tensor) -> Tensor:
-    """Chances (N, 8h, 8w) of the pixels from logits (N, 65, h, w), as extraction takes them."""
-    chances = functional.softmax(logits.float(), dim=1)[:, :-1]
-    return functional.pixel_shuffle(chances, CELL_PX)[:, 0]
-
-
-def detector_loss(logits: Tensor, labels: Tensor, known: Tensor) -> Tensor:
-    """Cross-entropy (N, 65, h, w) with soft labels, mean over the known cells (N, h, w), nats."""
-    per_cell = -(labels * functional.log_softmax(logits.float(), dim=1)).sum(dim=1)
-    return (per_cell * known).sum() / known.sum().clamp(min=1)
-
-
-def sampled(descriptors: Tensor, points_px: Tensor) -> Tensor:
-    """Unit descriptors (N, P, D) at points (N, P, 2), x then y, px, as an extractor samples them:
-    cell k's centre is at 8k + 3.5, cubic between the centres."""
-    h, w = descriptors.shape[2:]
-    size = torch.tensor([w, h], dtype=torch.float32, device=points_px.device) * CELL_PX
+def _at(field: Tensor, points_px: Tensor, cell_px: int, mode: str) -> Tensor:
+    """A map (N, D, h, w) of cells at points (N, P, 2), x then y, px: (N, P, D)."""
+    h, w = field.shape[2:]
+    size = torch.tensor([w, h], dtype=torch.float32, device=points_px.device) * cell_px
     grid = (points_px + 0.5) / size * 2 - 1
     taken = functional.grid_sample(
-        descriptors.float(), grid[:, None], mode="bicubic", padding_mode="border",
-        align_corners=False,
-    )  # fmt: skip
-    return functional.normalize(taken[:, :, 0].transpose(1, 2), dim=2)
+        field.float(), grid[:, None], mode=mode, padding_mode="border", align_corners=False
+    )
+    return taken[:, :, 0].transpose(1, 2)
+
+
+def sampled(outputs: Outputs, points_px: Tensor) -> Tensor:
+    """Unit descriptors (N, P, D) at points (N, P, 2), px, as the extractor samples them."""
+    descriptors, details, _ = outputs
+    both = (_at(descriptors, points_px, CELL_PX, "bicubic"),
+            _at(details, points_px, CELL_PX // 2, "bicubic"))  # fmt: skip
+    return functional.normalize(torch.cat(both, dim=2), dim=2)
 
 
 def likeness(
     one: Tensor, other: Tensor, wanted_px: Tensor, at_px: Tensor, there: Tensor, target: Tensor,
-    settings: LossSettings,
+    apart_px: float, temperature: float,
 ) -> Tensor:  # fmt: skip
     """Log chances (B, P, 2Q) that points are the other view's, the next picture's behind them.
 
@@ -96,11 +86,11 @@ def likeness(
     the other view; `at_px` (B, Q, 2), `there` (B, Q): its points and which are any; `target` (B, P)
     is the right one: others so near it that they show the same are no choice.
     """
-    near = torch.cdist(wanted_px, at_px) < settings.apart_px
+    near = torch.cdist(wanted_px, at_px) < apart_px
     barred = (near | ~there[:, None, :]).scatter(2, target[:, :, None], False)
-    logits = (one @ other.transpose(1, 2) / settings.temperature).masked_fill(barred, _FAR)
+    logits = (one @ other.transpose(1, 2) / temperature).masked_fill(barred, _FAR)
     if len(one) > 1:
-        strangers = one @ other.roll(1, 0).transpose(1, 2) / settings.temperature
+        strangers = one @ other.roll(1, 0).transpose(1, 2) / temperature
         strangers = strangers.masked_fill(~there.roll(1, 0)[:, None, :], _FAR)
         logits = torch.cat([logits, strangers], dim=2)
     return functional.log_softmax(logits, dim=2)
@@ -110,86 +100,68 @@ def _mean(values: Tensor, weight: Tensor) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp(min=1e-6)
 
 
-def descriptor_loss(
-    descriptors: Tensor, batch: Batch, settings: LossSettings
-) -> tuple[Tensor, Tensor]:
-    """InfoNCE both ways at the pairs' points, and the share of them that find theirs."""
-    vectors = sampled(descriptors, batch.points_px)
+def anywhere_loss(outputs: Outputs, batch: Batch, settings: LossSettings) -> Tensor:
+    """InfoNCE both ways at the pairs' points."""
+    vectors = sampled(outputs, batch.points_px)
     count = vectors.shape[1]
     target = torch.arange(count, device=vectors.device).expand(len(batch.used), count)
-    losses, rights = [], []
+    made = []
     for start in (0, 1):
         at = batch.points_px[1 - start :: 2]
         chances = likeness(
-            vectors[start::2], vectors[1 - start :: 2], at, at, batch.used, target, settings
-        )
-        right = chances[:, :, :count].argmax(dim=2) == target
-        losses.append(-_mean(chances.gather(2, target[:, :, None])[:, :, 0], batch.used.float()))
-        rights.append(_mean(right.float(), batch.used.float()))
-    return torch.stack(losses).mean(), torch.stack(rights).mean()
+            vectors[start::2], vectors[1 - start :: 2], at, at, batch.used, target,
+            settings.apart_anywhere_px, settings.temperature,
+        )  # fmt: skip
+        made.append(-_mean(chances.gather(2, target[:, :, None])[:, :, 0], batch.used.float()))
+    return torch.stack(made).mean()
 
 
-def peak_losses(
-    logits: Tensor, descriptors: Tensor, known: Tensor, views: Views, settings: LossSettings
+def blob_losses(
+    outputs: Outputs, batch: Batch, settings: LossSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the peaks: InfoNCE of the descriptors, the mean distance, px, of those that are each
-    other's nearest, and the chance, weighted by score, that a peak is of no use.
+    """InfoNCE of the blobs' descriptors, cross-entropy of their scores, the share that is right.
 
-    Logits (2B, 65, h, w) and `known` (2B, h, w); nought where no point is near another.
+    Nought where no view has what the other has.
     """
-    scores = scores_of(logits)
-    area = known.repeat_interleave(CELL_PX, 1).repeat_interleave(CELL_PX, 2)
-    pixels, values = highest(scores, NMS_PX, SUBPIXEL_PX, _LEAST_SCORE, _MOST, area)
-    places = refined(scores, pixels, SUBPIXEL_PX)
-    # The whole window's chance: where between the pixels a point is must not cost its score.
-    mass = functional.avg_pool2d(scores[:, None], 2 * SUBPIXEL_PX + 1, 1, SUBPIXEL_PX)[:, 0]
-    mass = mass * (2 * SUBPIXEL_PX + 1) ** 2
-    flat = pixels[:, :, 1] * scores.shape[2] + pixels[:, :, 0]
-    strength = mass.flatten(1).gather(1, flat).clamp(max=1)
-    vectors = sampled(descriptors, places.detach())
-    found, apart, useless = [], [], []
+    views = batch.views
+    area = batch.known.repeat_interleave(CELL_PX, 1).repeat_interleave(CELL_PX, 2)
+    with torch.no_grad():
+        places, heights = strongest(response(batch.images), NMS_PX, _MOST, area, batch.favour)
+    vectors = sampled(outputs, places)
+    odds = _at(outputs[2], places, CELL_PX, "bilinear")[:, :, 0] + heights.clamp(min=1e-9).log()
+    found, worth, rights = [], [], []
     for start in (0, 1):
-        good, there = values[start::2] > 0, values[1 - start :: 2] > 0
-        carried = views.across(places[start::2], start)
-        other = places[1 - start :: 2]
-        in_view = good & inside(carried.detach(), views.size, 2 * NMS_PX)
-        # Only where the other view knows something can it have a peak.
-        at = carried.detach().round().long().clamp(min=0)
+        good, there = heights[start::2] > 0, heights[1 - start :: 2] > 0
+        wanted, other = views.across(places[start::2], start), places[1 - start :: 2]
+        in_view = good & inside(wanted, views.size, CELL_PX)
+        # Only where the other view knows something can it have a blob.
+        at = wanted.round().long().clamp(min=0)
         x, y = at[:, :, 0].clamp(max=views.size[1] - 1), at[:, :, 1].clamp(max=views.size[0] - 1)
         in_view &= area[1 - start :: 2].flatten(1).gather(1, y * views.size[1] + x)
-        with torch.no_grad():
-            gaps = torch.cdist(carried, other)
-            gaps = gaps.masked_fill(~in_view[:, :, None] | ~there[:, None, :], torch.inf)
-            nearest, back = gaps.argmin(dim=2), gaps.argmin(dim=1)
-            mutual = back.gather(1, nearest) == torch.arange(gaps.shape[1], device=gaps.device)
-            pair = (mutual & (gaps.amin(dim=2) < _NEAR_PX)).float()
-        to = other.gather(1, nearest[:, :, None].expand(-1, -1, 2))
-        # Rounded at nought, where a distance has no direction.
-        apart.append(_mean(((carried - to).square().sum(dim=2) + 1e-4).sqrt(), pair))
+        gaps = torch.cdist(wanted, other)
+        gaps = gaps.masked_fill(~in_view[:, :, None] | ~there[:, None, :], torch.inf)
+        nearest, back = gaps.argmin(dim=2), gaps.argmin(dim=1)
+        mutual = back.gather(1, nearest) == torch.arange(gaps.shape[1], device=gaps.device)
+        pair = mutual & (gaps.amin(dim=2) < _NEAR_PX)
         chances = likeness(
-            vectors[start::2], vectors[1 - start :: 2], carried.detach(), other.detach(), there,
-            nearest, settings,
-        ).gather(2, nearest[:, :, None])[:, :, 0]  # fmt: skip
-        found.append(-_mean(chances, pair))
-        use = (chances.exp() * pair).detach()
-        useless.append(_mean((1 - use) * in_view, strength[start::2] * in_view))
-    return torch.stack(found).mean(), torch.stack(apart).mean(), torch.stack(useless).mean()
-
-
-def losses(
-    logits: Tensor, descriptors: Tensor, batch: Batch, placed: bool, settings: LossSettings
-) -> Losses:
-    """Of a batch; `placed`: whether the detector's own peaks count by now."""
-    detector = detector_loss(logits, batch.labels, batch.known)
-    descriptor, right = descriptor_loss(descriptors, batch, settings)
-    total = detector + settings.descriptor * descriptor
-    found = place = reliability = torch.zeros((), device=logits.device)
-    if placed:
-        found, place, reliability = peak_losses(
-            logits, descriptors, batch.known, batch.views, settings
-        )
-        total = (
-            total + settings.found * found + settings.place * place
-            + settings.reliability * reliability
+            vectors[start::2], vectors[1 - start :: 2], wanted, other, there, nearest,
+            settings.apart_px, settings.temperature,
         )  # fmt: skip
-    return Losses(total, detector, descriptor, found, place, reliability, right)
+        right = pair & (chances.argmax(dim=2) == nearest)
+        chance = chances.gather(2, nearest[:, :, None])[:, :, 0]
+        found.append(-_mean(chance, pair.float()))
+        worth.append(_mean(
+            functional.binary_cross_entropy_with_logits(
+                odds[start::2], right.float(), reduction="none"
+            ), in_view.float(),
+        ))  # fmt: skip
+        rights.append(_mean(right.float(), pair.float()))
+    return torch.stack(found).mean(), torch.stack(worth).mean(), torch.stack(rights).mean()
+
+
+def losses(outputs: Outputs, batch: Batch, settings: LossSettings) -> Losses:
+    """Of a batch."""
+    blobs, worth, right = blob_losses(outputs, batch, settings)
+    anywhere = anywhere_loss(outputs, batch, settings)
+    total = blobs + settings.anywhere * anywhere + settings.worth * worth
+    return Losses(total, blobs, anywhere, worth, right)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -17,7 +16,7 @@ _TERMS = {"weight": "weight", "bias": "bias", "mean": "running_mean", "var": "ru
 
 
 class FeatureNetwork(nn.Module):
-    """A shape with weights: image (N, 1, H, W) to logits and descriptors, see `topology`."""
+    """A shape with weights: image (N, 1, H, W) to its outputs, see `topology`."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -26,10 +25,10 @@ class FeatureNetwork(nn.Module):
         for layer in layers(shape):
             self.layers[_key(layer.name)] = _module(layer)
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (N, 65, H/8, W/8) and descriptors (N, D, H/8, W/8), not normalised."""
-        logits, descriptors = self.shape.build(_TorchOperations(self.layers), image)
-        return logits, descriptors
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Descriptors (N, D - d, H/8, W/8), details (N, d, H/4, W/4), worth (N, 1, H/8, W/8)."""
+        descriptors, details, worth = self.shape.build(_TorchOperations(self.layers), image)
+        return descriptors, details, worth
 
 
 class _TorchOperations:
@@ -45,9 +44,6 @@ class _TorchOperations:
 
     def add(self, first: Tensor, second: Tensor) -> Tensor:
         return first + second
-
-    def concat(self, first: Tensor, second: Tensor) -> Tensor:
-        return torch.cat([first, second], dim=1)
 
     def double(self, x: Tensor) -> Tensor:
         return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)

@@ -10,7 +10,7 @@ from ground_station.training.corpus import CorpusSettings
 from ground_station.training.errors import TrainingError
 from ground_station.training.topology import shape_of
 
-_LENGTHS = ("steps", "decay", "warm_up", "place_from")
+_LENGTHS = ("steps", "decay", "warm_up")
 """When what begins and ends: a run may be made longer or shorter while it goes."""
 
 
@@ -18,7 +18,7 @@ _LENGTHS = ("steps", "decay", "warm_up", "place_from")
 class Recipe:
     """Everything that decides the weights, but for the machine's rounding."""
 
-    size: str = "swift"
+    size: str = "lark"
     seed: int = 1
     corpus: CorpusSettings = field(default_factory=CorpusSettings)
     textures: int = 4096
@@ -32,16 +32,14 @@ class Recipe:
     """Pairs a step."""
     points: int = 256
     """Pairs of points a pair of views, for the descriptors."""
-    steps: int = 6_800
+    steps: int = 3_200
     warm_up: int = 200
-    decay: int = 2_600
+    decay: int = 1_100
     """The last so many steps, over which the rate goes to nought."""
     rate: float = 3e-3
     weight_decay: float = 1e-4
     average: float = 0.999
     """Of the weights that are exported: what each step leaves of the mean so far."""
-    place_from: int = 400
-    """The first step that also learns from the detector's own peaks (`losses.peak_losses`)."""
 
     def __post_init__(self) -> None:
         """Raises `TrainingError` with one line for a number that trains nothing."""
@@ -61,7 +59,6 @@ class Recipe:
             "rate": (1e-7, 1.0),
             "weight_decay": (0, 1),
             "average": (0, 0.99999),
-            "place_from": (0, 10_000_000),
         }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:  # nor NaN
@@ -92,10 +89,8 @@ class Recipe:
 
     def as_long_as(self, other: dict[str, Any]) -> Recipe:
         """The same for as many steps as another recipe, with its beginning and end."""
-        steps, decay, warm_up, place_from = (
-            int(other.get(name, getattr(self, name))) for name in _LENGTHS
-        )
-        return replace(self, steps=steps, decay=decay, warm_up=warm_up, place_from=place_from)
+        steps, decay, warm_up = (int(other.get(k, getattr(self, k))) for k in _LENGTHS)
+        return replace(self, steps=steps, decay=decay, warm_up=warm_up)
 
     def as_dict(self) -> dict[str, Any]:
         """For checkpoint and log."""

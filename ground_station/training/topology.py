@@ -12,8 +12,7 @@ from typing import Any, Protocol
 from ground_station.training.errors import TrainingError
 
 CELL_PX = 8
-LOGITS = CELL_PX * CELL_PX + 1
-"""A cell's pixels and "none", as SuperPoint's detector has them."""
+"""Of the descriptors' map; that of the details has half of it."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,6 @@ class Operations(Protocol):
     def add(self, first: Any, second: Any) -> Any:
         """The sum."""
 
-    def concat(self, first: Any, second: Any) -> Any:
-        """Channels after channels."""
-
     def double(self, x: Any) -> Any:
         """Twice the size, bilinear, pixel centres at half numbers."""
 
@@ -55,19 +51,32 @@ class Operations(Protocol):
 
 @dataclass(frozen=True)
 class Shape:
-    """A network: image (N, 1, H, W) to logits (N, 65, H/8, W/8) and descriptors (N, D, ...).
+    """A network: image (N, 1, H, W) to what layout `blobs` has, in the order of `OUTPUTS`.
 
     H and W must be multiples of `multiple`.
     """
 
     name: str
     dimension: int
+    details: int
     multiple: int
-    build: Callable[[Operations, Any], tuple[Any, Any]]
+    build: Callable[[Operations, Any], tuple[Any, Any, Any]]
 
 
-def _parts(o: Operations) -> tuple[Callable[..., Any], Callable[[str, Any, int], Any]]:
-    """A convolution with what follows it, and two of them that the input goes around."""
+OUTPUTS = ("descriptors", "details", "worth")
+
+
+_COARSE, _FINE = 40, 24
+"""Numbers of a descriptor: what is around a point, and what it is itself."""
+
+
+def _lark(o: Operations, image: Any) -> tuple[Any, Any, Any]:
+    """The picture folded to a quarter of its size, residual blocks at 1/8 and 1/16, three heads.
+
+    A convolution over a single channel costs as much as one over 32, whatever it computes with:
+    nothing but the fold sees the picture at its own size. Context comes from 1/16; what tells a
+    point from its neighbours is seen at 1/4.
+    """
 
     def layer(name: str, x: Any, a: int, b: int, size: int = 3, stride: int = 1) -> Any:
         return o.relu(o.conv(Conv(name, a, b, size, stride), x))
@@ -76,59 +85,23 @@ def _parts(o: Operations) -> tuple[Callable[..., Any], Callable[[str, Any, int],
         y = layer(f"{name}.1", x, width, width)
         return o.relu(o.add(x, o.conv(Conv(f"{name}.2", width, width), y)))
 
-    return layer, residual
+    def head(name: str, x: Any, width: int, channels: int) -> Any:
+        return o.conv(Conv(name, width, channels, 1, norm=False), x)
 
-
-def _wren(o: Operations, image: Any) -> tuple[Any, Any]:
-    """Strided stem to a quarter of the size, residual blocks at 1/8 and 1/16, two heads.
-
-    Context comes from 1/16; where a point is to a fraction of a pixel, the detector sees at 1/4.
-    """
-
-    layer, residual = _parts(o)
-    x = layer("stem.1", image, 1, 16, stride=2)
-    x = layer("stem.2", x, 16, 32, stride=2)
-    quarter = layer("quarter", x, 32, 32)
+    quarter = layer("quarter", layer("stem", o.fold(image, 4), 16, 32), 32, 32)
     eighth = residual("eighth", layer("to_eighth", quarter, 32, 64, stride=2), 64)
     x = layer("to_sixteenth", eighth, 64, 64, stride=2)
     x = residual("sixteenth.b", residual("sixteenth.a", x, 64), 64)
     x = layer("fuse", o.add(eighth, o.double(x)), 64, 64, size=1)
-    fine = layer("detector.fine", quarter, 32, 64, stride=2)
-    y = layer("detector.both", o.concat(fine, x), 128, 64, size=1)
-    logits = o.conv(Conv("detector.logits", 64, LOGITS, 1, norm=False), y)
-    y = layer("descriptor.wide", x, 64, 128, size=1)
-    return logits, o.conv(Conv("descriptor.out", 128, 64, 1, norm=False), y)
+    wide = layer("descriptor.wide", x, 64, 96, size=1)
+    fine = layer("details.wide", quarter, 32, 32)
+    return (
+        head("descriptor.out", wide, 96, _COARSE), head("details.out", fine, 32, _FINE),
+        head("worth.out", wide, 96, 1),
+    )  # fmt: skip
 
 
-def _swift(o: Operations, image: Any) -> tuple[Any, Any]:
-    """The picture folded to a quarter of its size, residual blocks at 1/16, two heads at 1/8.
-
-    A convolution over a single channel costs as much as one over 32, whatever it computes with:
-    nothing but the fold sees the picture at its own size. Context comes from 1/16; where a point is
-    to a fraction of a pixel, the detector sees at 1/4 and in the 64 pixels of its cell.
-    """
-
-    layer, residual = _parts(o)
-    x = layer("stem", o.fold(image, 4), 16, 32)
-    quarter = layer("quarter", x, 32, 32)
-    eighth = layer("to_eighth", quarter, 32, 64, stride=2)
-    x = layer("to_sixteenth", eighth, 64, 64, stride=2)
-    for name in "abc":
-        x = residual(f"sixteenth.{name}", x, 64)
-    x = layer("fuse", o.add(eighth, o.double(x)), 64, 64, size=1)
-    y = layer("descriptor.wide", x, 64, 128, size=1)
-    descriptors = o.conv(Conv("descriptor.out", 128, 64, 1, norm=False), y)
-    fine = layer("detector.fine", quarter, 32, 64, stride=2)
-    pixels = layer("detector.pixels", o.fold(image, CELL_PX), 64, 64, size=1)
-    y = layer("detector.all", o.concat(o.concat(fine, pixels), x), 192, 96, size=1)
-    y = layer("detector.wide", y, 96, 96, size=1)
-    return o.conv(Conv("detector.logits", 96, LOGITS, 1, norm=False), y), descriptors
-
-
-SHAPES = {
-    "wren": Shape("wren", 64, 16, _wren),
-    "swift": Shape("swift", 64, 16, _swift),
-}
+SHAPES = {"lark": Shape("lark", _COARSE + _FINE, _FINE, 16, _lark)}
 
 
 def shape_of(size: str) -> Shape:
@@ -151,9 +124,6 @@ class _Listing:
         return None
 
     def add(self, first: None, second: None) -> None:
-        return None
-
-    def concat(self, first: None, second: None) -> None:
         return None
 
     def double(self, x: None) -> None:

@@ -49,10 +49,8 @@ class Trainer:
         images = batch.images.contiguous(memory_format=torch.channels_last)
         # It has float32's range, so that no loss needs scaling.
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            logits, descriptors = self.network(images)
-        result = losses(
-            logits, descriptors, batch, self.recipe.place_from <= number, self._settings
-        )
+            outputs = self.network(images)
+        result = losses(outputs, batch, self._settings)
         self.optimizer.zero_grad(set_to_none=True)
         result.total.backward()
         clip_grad_norm_(self.network.parameters(), _MOST_GRADIENT)

@@ -81,13 +81,6 @@ class Views:
         share = (torch.log2(step.clamp(1, 2)))[:, None]
         return (large * (1 - share) + small * share)[:, 0]
 
-    def given_back(self, maps: Tensor) -> Tensor:
-        """Maps (V, H, W) of the views as the pictures' pixels see them, of the same size."""
-        at = self.of_picture(self._pixels()).clamp(-1e4, 1e4).unflatten(1, self.size)
-        side = torch.tensor(self.size[::-1], device=at.device)
-        place = (at + 0.5) / side * 2 - 1
-        return functional.grid_sample(maps[:, None], place, align_corners=False)[:, 0]
-
 
 def _apply(matrix: Tensor, points_px: Tensor) -> Tensor:
     made = points_px @ matrix[:, :, :2].transpose(1, 2) + matrix[:, None, :, 2]
@@ -210,16 +203,3 @@ def pairs_of_views(chance: Chance, pairs: int, picture: Size, view: Size, lens: 
     # One camera takes both.
     of_lens = lenses.repeat_interleave(2) if lens else torch.zeros(count, device=device)
     return Views(to_picture, torch.linalg.inv(to_picture), of_lens, view)
-
-
-def around(chance: Chance, count: int, size: Size) -> Views:
-    """Views of the same size of whole pictures: what homographic adaptation turns by."""
-    sides = torch.tensor(size[::-1], device=chance.generator.device, dtype=torch.float32)
-    low, high = (float(torch.tensor(limit).log()) for limit in (0.65, 1.35))
-    nought = torch.zeros(count, device=sides.device)
-    to_picture = of_planes(
-        size, size, (sides - 1) / 2 + chance.uniform(-0.12, 0.12, count, 2) * sides,
-        chance.uniform(low, high, count).exp(), chance.uniform(-_ROLL_DEG, _ROLL_DEG, count),
-        0.7 * _TILT_DEG * chance.uniform(0, 1, count), chance.uniform(0, 360, count), nought,
-    )  # fmt: skip
-    return Views(to_picture, torch.linalg.inv(to_picture), nought, size)

@@ -58,3 +58,18 @@ def write_pixels(folder: Path, about: ModelInfo, seed: int = 0) -> Path:
     path = folder / f"{about.name}.onnx"
     graph.save(path, about)
     return path
+
+
+def write_blobs(folder: Path, about: ModelInfo, seed: int = 0) -> Path:
+    """A small network of layout `blobs`: two halving stages, details, a third, the other heads."""
+    rng = np.random.default_rng(seed)
+    graph = Graph(about.name)
+    x = graph.max_pool(graph.relu(graph.conv(graph.input("image", 1), drawn(rng, 8, 1, 3))), 4)
+    graph.output(graph.conv(x, drawn(rng, about.details, 8, 3)), "details", about.details)
+    x = graph.max_pool(graph.relu(graph.conv(x, drawn(rng, 12, 8, 3))), 2)
+    rest = about.dimension - about.details
+    graph.output(graph.conv(x, drawn(rng, rest, 12, 1)), "descriptors", rest)
+    graph.output(graph.conv(x, drawn(rng, 1, 12, 1)), "worth", 1)
+    path = folder / f"{about.name}.onnx"
+    graph.save(path, about)
+    return path

@@ -42,9 +42,23 @@ def test_what_was_written_is_read(path):
     assert ModelInfo.of_metadata(found.info.metadata()) == found.info
 
 
-def test_a_model_of_pixels_is_read(tmp_path):
+def test_models_of_pixels_and_of_blobs_are_read(tmp_path):
     about = made_up.info(layout="pixels", multiple=32)
     assert model.read(made_up.write_pixels(tmp_path, about)).info == about
+    about = made_up.info("spots", layout="blobs", details=6)
+    path = made_up.write_blobs(tmp_path, about)
+    assert model.read(path).info == about
+    proto = onnx.load(path)
+    for item in proto.metadata_props:
+        if item.key == "blimp.details":
+            item.value = "5"
+    onnx.save(proto, path)
+    with pytest.raises(FeatureError, match=r"'descriptors' has the shape 1x10x16x16"):
+        model.read(path)
+    with pytest.raises(FeatureError, match=r"details is 0; allowed: 1 to 15"):
+        made_up.info(layout="blobs")
+    with pytest.raises(FeatureError, match=r"details is 6; allowed: 0 to 0"):
+        made_up.info(details=6)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +68,7 @@ def test_a_model_of_pixels_is_read(tmp_path):
         ("blimp.schema", "blimp.features/2.0", "its schema is 'blimp.features/2.0'"),
         ("blimp.name", None, "lacks 'blimp.name'"),
         ("blimp.name", "../x", "name is '../x'"),
-        ("blimp.layout", "voxels", "layout is 'voxels'; allowed: cells, pixels"),
+        ("blimp.layout", "voxels", "layout is 'voxels'; allowed: blobs, cells, pixels"),
         ("blimp.dimension", "many", "dimension is 'many', not a whole number"),
         ("blimp.dimension", "5000", "dimension is 5000; allowed: 2 to 1024"),
         ("blimp.dimension", "32", "'descriptors' has the shape 1x16x16x16"),

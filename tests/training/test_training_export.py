@@ -8,12 +8,12 @@ import training_models
 
 from ground_station.feature_models import images
 from ground_station.features import model
-from ground_station.features.cells import CellFeatures
+from ground_station.features.blobs import BlobFeatures
 from ground_station.features.inference import Network
 from ground_station.features.settings import LearnedSettings
 from ground_station.training import export
 from ground_station.training.errors import TrainingError
-from ground_station.training.topology import SHAPES, shape_of
+from ground_station.training.topology import OUTPUTS, SHAPES, shape_of
 
 
 def counted(path, rows: int, columns: int) -> int:
@@ -38,8 +38,8 @@ def counted(path, rows: int, columns: int) -> int:
 
 
 def test_what_ships_is_small(tmp_path):
-    shape = SHAPES["swift"]
-    path = tmp_path / "swift.onnx"
+    shape = SHAPES["lark"]
+    path = tmp_path / "lark.onnx"
     export.export(shape, training_models.weights(shape), path, "a test")
     assert 0 < counted(path, 480, 640) <= 1.5e9
     assert path.stat().st_size <= 2_000_000
@@ -47,15 +47,15 @@ def test_what_ships_is_small(tmp_path):
 
 
 def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
-    shape = SHAPES["swift"]
+    shape = SHAPES["lark"]
     paths = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
     for path in paths:
         export.export(shape, training_models.weights(shape), path, "a test")
     assert paths[0].read_bytes() == paths[1].read_bytes()
     read = model.read(paths[0])
-    assert (read.info.name, read.info.layout, read.info.dimension) == ("swift", "cells", 64)
+    assert (read.info.name, read.info.layout, read.info.dimension) == ("lark", "blobs", 64)
     picture = images.procedural(1, 0, (120, 168))  # no multiple of 16: it is padded
-    found = CellFeatures(Network(read), 200, LearnedSettings()).extract(picture)
+    found = BlobFeatures(Network(read), 200, LearnedSettings()).extract(picture)
     assert len(found) > 20
     assert np.linalg.norm(found.descriptors, axis=1) == pytest.approx(1, abs=1e-5)
     assert (found.keypoints_px >= 0).all()
@@ -64,15 +64,15 @@ def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
 
 def test_normalisation_is_folded_into_the_weights(tmp_path):
     """The graph against the network reckoned layer by layer in numpy, on a small picture."""
-    shape = SHAPES["swift"]
+    shape = SHAPES["lark"]
     weights = training_models.weights(shape, seed=2)
-    path = tmp_path / "swift.onnx"
+    path = tmp_path / "lark.onnx"
     export.export(shape, weights, path, "a test")
     picture = np.random.default_rng(0).random((1, 1, 32, 48)).astype(np.float32)
     said = Network(model.read(path)).run(picture)
-    logits, descriptors = shape.build(Reference(weights), picture[0].astype(np.float64))
-    assert said["logits"][0] == pytest.approx(logits, abs=1e-3)
-    assert said["descriptors"][0] == pytest.approx(descriptors, abs=1e-3)
+    wanted = shape.build(Reference(weights), picture[0].astype(np.float64))
+    for name, values in zip(OUTPUTS, wanted, strict=True):
+        assert said[name][0] == pytest.approx(values, abs=1e-3)
 
 
 class Reference:
@@ -101,9 +101,6 @@ class Reference:
     def add(self, first, second):
         return first + second
 
-    def concat(self, first, second):
-        return np.concatenate([first, second])
-
     def fold(self, x, side):
         _, rows, columns = x.shape
         squares = x.reshape(rows // side, side, columns // side, side)
@@ -115,7 +112,7 @@ class Reference:
 
 
 def test_wrong_weights_and_sizes_are_refused_by_name(tmp_path):
-    shape = SHAPES["swift"]
+    shape = SHAPES["lark"]
     weights = training_models.weights(shape)
     missing = {k: v for k, v in weights.items() if k != "fuse.norm.var"}
     with pytest.raises(TrainingError, match=r"lack 'fuse\.norm\.var'"):
@@ -124,5 +121,5 @@ def test_wrong_weights_and_sizes_are_refused_by_name(tmp_path):
     with pytest.raises(TrainingError, match=r"'stem\.weight' is \(32, 16, 2, 3\)"):
         export.export(shape, weights, tmp_path / "x.onnx", "a test")
     assert not (tmp_path / "x.onnx").exists()
-    with pytest.raises(TrainingError, match="size is 'tiny'; there are: wren, swift"):
+    with pytest.raises(TrainingError, match="size is 'tiny'; there are: lark"):
         shape_of("tiny")

@@ -1,4 +1,4 @@
-"""Views, labels and pairs: what training calls true must be. With torch only."""
+"""Views and pairs: what training calls true must be. With torch only."""
 
 from dataclasses import fields, replace
 
@@ -7,16 +7,10 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training's tests need torch, an optional extra")
 
-import training_models  # noqa: E402
-
 from ground_station.feature_models import images  # noqa: E402
-from ground_station.features import detection, model  # noqa: E402
-from ground_station.features.inference import Network  # noqa: E402
 from ground_station.features.methods.rootsift import RootSift  # noqa: E402
 from ground_station.training import pairs, validation, views  # noqa: E402
 from ground_station.training.degradation import degraded  # noqa: E402
-from ground_station.training.errors import TrainingError  # noqa: E402
-from ground_station.training.teacher import Teacher, load  # noqa: E402
 from ground_station.training.views import Chance, Views  # noqa: E402
 
 PICTURE, VIEW = (192, 256), (96, 128)
@@ -107,54 +101,19 @@ def test_degrading_moves_nothing_and_is_a_function_of_its_seed():
     assert len(offs) > 60 and np.abs(np.median(offs, axis=0)).max() < 0.3
 
 
-def test_cells_are_distributions_and_keep_a_points_fraction_of_a_pixel():
-    points = np.array([[10.25, 20.5], [40.0, 7.9], [3.0, 3.0], [-5.0, 2.0]], np.float32)
-    chances = np.array([1, 0.8, 0.4, 1], np.float32)
-    made = pairs.soft_cells(torch.from_numpy(points)[None], torch.from_numpy(chances)[None],
-                            (48, 64))[0].numpy()  # fmt: skip
-    assert made.shape == (65, 6, 8) and made.min() >= 0
-    assert made.sum(axis=0) == pytest.approx(np.ones((6, 8)))
-    mass = made[:64].reshape(8, 8, 6, 8).transpose(2, 0, 3, 1).reshape(48, 64)
-    y, x = np.mgrid[:48, :64]
-    for point, chance in zip(points[:3], chances[:3], strict=True):
-        near = np.hypot(x - point[0], y - point[1]) < 3
-        assert mass[near].sum() == pytest.approx(chance)
-        assert (mass * near * x).sum() / chance == pytest.approx(point[0], abs=1e-4)
-        assert (mass * near * y).sum() / chance == pytest.approx(point[1], abs=1e-4)
-    assert mass.sum() == pytest.approx(2.2, abs=1e-4)
-    crowd = pairs.soft_cells(torch.tensor([[[2.0, 2], [5, 5], [2, 5]]]), torch.ones(1, 3), (16, 16))
-    assert crowd[0, :64, 0, 0].sum() == pytest.approx(1) and crowd[0, 64, 0, 0] == 0
-
-
-def test_the_extractor_reads_from_perfect_logits_where_the_points_are():
-    rng = np.random.default_rng(4)
-    grid = np.stack(np.meshgrid(np.arange(12, 110, 13), np.arange(12, 80, 13)), axis=-1)
-    points = (grid.reshape(-1, 2) + rng.uniform(-2, 2, (grid[..., 0].size, 2))).astype(np.float32)
-    made = pairs.soft_cells(torch.from_numpy(points)[None], torch.ones(1, len(points)), VIEW)[0]
-    scores = detection.cell_scores(np.log(np.maximum(made.numpy(), 1e-6)))
-    rows, columns = detection.strongest(scores, radius_px=3, threshold=0.02, border_px=4, most=1000)
-    found = detection.refined(scores, rows, columns, radius_px=1)
-    gaps = np.linalg.norm(points[:, None] - found[None], axis=2).min(axis=1)
-    assert np.median(gaps) < 0.15 and (gaps < 1).mean() > 0.97
-
-
-def places(seed: int) -> pairs.Places:
-    rng = np.random.default_rng(seed)
+def places() -> pairs.Places:
     picture = images.procedural(9, 2, PICTURE)
-    points = torch.from_numpy(rng.uniform(5, 180, (1, 80, 2)).astype(np.float32))
-    scores = torch.linspace(0.6, 0.06, 80)[None]
     pictures = torch.from_numpy(np.stack([picture, 255 - picture]))
-    return pairs.Places(pictures, torch.tensor([[0, 1]]), points, scores)
+    return pairs.Places(pictures, torch.tensor([[0, 1]]))
 
 
 def test_a_batch_has_fixed_shapes_and_true_correspondences():
-    batch = pairs.make(places(5), Chance(CPU, 5), 12, VIEW, 48)
-    assert batch.images.shape == (24, 1, *VIEW) and batch.labels.shape == (24, 65, 12, 16)
+    batch = pairs.make(places(), Chance(CPU, 5), 12, VIEW, 48)
+    assert batch.images.shape == (24, 1, *VIEW) and batch.favour.min() > 0
     assert batch.points_px.shape == (24, 48, 2) and batch.used.sum() > 12 * 24
     moved = batch.views.across(batch.points_px[::2], 0)
     assert (moved - batch.points_px[1::2])[batch.used].abs().max() < 1e-2
     assert views.inside(batch.points_px[1::2], VIEW, 3.9)[batch.used].all()
-    assert (batch.labels.sum(dim=1) - 1).abs().max() < 1e-4
     assert batch.known.any(dim=(1, 2)).all() and not batch.known.all()
     first = batch.used.sum(dim=1, keepdim=True) > torch.arange(48)
     assert (first == batch.used).all()
@@ -162,7 +121,7 @@ def test_a_batch_has_fixed_shapes_and_true_correspondences():
 
 def test_the_same_seed_gives_the_same_batch():
     def made(step: int) -> pairs.Batch:
-        return pairs.make(places(6), Chance(CPU, 3, step), 2, VIEW, 32)
+        return pairs.make(places(), Chance(CPU, 3, step), 2, VIEW, 32)
 
     first, again, other = made(7), made(7), made(8)
     names = [field.name for field in fields(first) if field.name != "views"]
@@ -178,7 +137,7 @@ def test_the_figures_of_validation_are_those_of_the_truth():
     matrix = torch.tensor([[1, 0, -6], [0, 1, 4], [0, 0, 1.0]])
     eye = torch.eye(3)
     truth = Views(torch.stack([eye, eye]), torch.stack([eye, matrix]), torch.zeros(2), size)
-    batch = replace(pairs.make(places(6), Chance(CPU, 1), 1, VIEW, 32), images=both, views=truth)
+    batch = replace(pairs.make(places(), Chance(CPU, 1), 1, VIEW, 32), images=both, views=truth)
     right = validation.figures(RootSift(200), batch)
     assert right.accuracy > 0.9 and right.repeatability > 0.8 and right.correct > 20
     assert right.error_px < 0.1
@@ -187,35 +146,3 @@ def test_the_figures_of_validation_are_those_of_the_truth():
     wrong = replace(batch, views=replace(truth, from_picture=torch.stack([eye, off])))
     chance = validation.figures(RootSift(200), wrong)
     assert chance.accuracy < 0.2 and chance.error_px > 0.5
-
-
-@pytest.fixture(scope="module")
-def teacher(tmp_path_factory) -> str:
-    return training_models.teacher(tmp_path_factory.mktemp("teacher") / "made-up.onnx")
-
-
-def test_the_teacher_scores_in_torch_as_its_file_does(teacher):
-    picture = np.random.default_rng(0).random((1, 96, 128)).astype(np.float32)
-    wanted = Network(model.read(teacher)).run(np.repeat(picture[None], 3, axis=1))["scores"]
-    said = Teacher(load(teacher), CPU).scores(torch.from_numpy(picture)).numpy()
-    assert np.ptp(wanted) > 0.1 and said == pytest.approx(wanted[:, 0], abs=1e-5)
-
-
-def test_labels_are_points_that_are_found_again_in_turned_pictures(teacher):
-    labelled = Teacher(load(teacher), CPU)
-    picture = torch.from_numpy(images.procedural(3, 7, (128, 160)))[None, None].float() / 255
-    points, scores = labelled.label(picture, 4, 60, Chance(CPU, 1))
-    assert points.shape == (1, 60, 2) and (scores > 0).sum() > 5
-    assert (scores.diff() <= 1e-6).all()  # strongest first
-    again, _ = labelled.label(picture, 4, 60, Chance(CPU, 1))
-    assert (again == points).all()
-
-
-def test_a_teacher_of_another_layout_is_refused(tmp_path):
-    from ground_station.training import export
-    from ground_station.training.topology import SHAPES
-
-    path = tmp_path / "cells.onnx"
-    export.export(SHAPES["swift"], training_models.weights(SHAPES["swift"]), path, "a test")
-    with pytest.raises(TrainingError, match=r"layout .* 'cells', not 'pixels'"):
-        load(str(path))
