@@ -22,6 +22,8 @@ places blur."""
 KERNEL_PX = 15
 BORDER_PX = 8
 """Where the picture is mirrored, blobs are none."""
+FLAT = 1e-9
+"""Added to the trace: less than any picture of 255 steps makes."""
 LEAST = 1e-5
 """Of the response: a tenth of what noise of one step makes."""
 _MARGIN = 4
@@ -31,9 +33,12 @@ _MARGIN = 4
 def response(image: U8) -> F32:
     """How much of a blob each pixel of a picture (H, W) is the middle of (H, W), 0..1 a px².
 
-    The geometric mean of the two principal curvatures of the smoothed picture where both have one
-    sign, else nought: the root of the determinant of its Hessian (Lindeberg, "Feature Detection
-    with Automatic Scale Selection", IJCV 1998, section 5.1), here at one scale.
+    The harmonic mean of the two principal curvatures of the smoothed picture where both have one
+    sign, else nought: it is high on what is round, dark or bright, and low along edges. Its maxima
+    are found again to a fraction of a pixel. Of the measures on the Hessian (Lindeberg, "Image
+    Matching Using Generalized Scale-Space Interest Points", JMIV 2015, section 3) this is the
+    determinant over the trace, as Brown, Szeliski and Winder (CVPR 2005, eq. 2) take it for
+    corners; here at one scale.
     """
     smooth = cv2.GaussianBlur(
         image.astype(np.float32) * np.float32(1 / 255), (KERNEL_PX, KERNEL_PX), SIGMA_PX
@@ -42,7 +47,8 @@ def response(image: U8) -> F32:
     yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=1)
     xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
     determinant = cv2.subtract(cv2.multiply(xx, yy), cv2.multiply(xy, xy))
-    return np.asarray(cv2.sqrt(np.maximum(determinant, 0)), np.float32)
+    trace = np.abs(cv2.add(xx, yy)) + np.float32(FLAT)
+    return np.asarray(cv2.divide(np.maximum(determinant, 0), trace, scale=2), np.float32)
 
 
 def strongest(values: F32, radius_px: int, most: int) -> tuple[F32, F32]:

@@ -32,8 +32,8 @@ _ALLOWED = 32.9
 """Squared Mahalanobis distance from a prediction: 99.9 % of twelve degrees of freedom."""
 _NARROW = 0.1
 """Standard deviation of each axis of a prediction, in radians and in depths of the map."""
-_CLOSER = 3
-"""Solutions at most that are matched around once more."""
+_CLOSER = 8
+"""Solutions at most that are matched around once more; most stay after one."""
 _FOUND_RADIUS_PX = 15.0
 """Around a pose that was found in the whole map: it explains its inliers to a few pixels, and what
 is left is the shear of a shutter whose motion nobody knows yet."""
@@ -46,7 +46,7 @@ class Located:
     Observations are in the order of the matches. `relocalized`: found in the whole map, away from
     any prediction; `wild`: near one, but of a camera that moves as nothing foretold.
     `significance`: by how many standard deviations more landmarks are seen than by
-    chance; 0 where that was not asked.
+    chance, and `excess`: the share of them; 0 where that was not asked.
     """
 
     solution: Solution
@@ -56,6 +56,7 @@ class Located:
     relocalized: bool = False
     wild: bool = False
     significance: float = 0.0
+    excess: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Acquirer:
         self._landmarks, self._depth_m = map_.landmarks, map_.depth_m
         recovery = settings.recovery
         self._relocalizer = (
-            Relocalizer(map_, matcher.camera, recovery, settings.seed)
+            Relocalizer(map_, matcher.camera, recovery, settings.seed, matcher.scale)
             if recovery.relocalize
             else None
         )
@@ -127,7 +128,7 @@ class Acquirer:
             if (
                 after is None
                 or self.matcher.reach_px(poses.log(poses.inverse(state.wTc) @ after.wTc))
-                < closer_px
+                < self._settings.pose.sigma_px
             ):
                 break
         held = self._held_by_near(seen, found, expected, estimator, watch)
@@ -189,6 +190,10 @@ class Acquirer:
     ) -> Located:
         """The frame near its prediction, or else anywhere in the map.
 
+        What is found near is held against what is found anywhere where so few landmarks speak for
+        it that they would not do so alone: around a prediction that is degrees off neighbours
+        agree with each other, too, and a frame must not be the worse for having been predicted.
+
         `expected` are the predictions, the surest first; none before a start. Where one of them
         allows what was found anywhere, it is solved with that prediction: only its velocity tells a
         rolling shutter's shear from another place. Else it is solved with an estimator of `make`,
@@ -201,8 +206,26 @@ class Acquirer:
         if expected and self.matcher.within_reach(expected[0]):
             near = self._verified(seen, self.locate(seen, expected[0], estimator, watch), watch)
             if near.solution.state is not None:
-                return near
-        candidates = self._relocalizer.candidates(seen.features, seen.normalized)
+                if near.excess >= self._settings.recovery.min_excess:
+                    return near
+                elsewhere = self._anywhere(
+                    self._relocalizer, seen, time_ns, expected, estimator, make, watch
+                )
+                return elsewhere if elsewhere.significance > near.significance else near
+        return self._anywhere(self._relocalizer, seen, time_ns, expected, estimator, make, watch)
+
+    def _anywhere(
+        self,
+        relocalizer: Relocalizer,
+        seen: Described,
+        time_ns: int,
+        expected: Sequence[Kinematics],
+        estimator: Estimator,
+        make: Callable[[], Estimator],
+        watch: Stopwatch,
+    ) -> Located:
+        """The frame anywhere in the map: where a prediction allows it, or else without one."""
+        candidates = relocalizer.candidates(seen.features, seen.normalized)
         watch.lap("relocalization")
         if isinstance(candidates, str):
             return _nothing(seen, candidates)
@@ -213,7 +236,7 @@ class Acquirer:
             if located is not None:
                 wild = prediction is not expected[0]
                 return replace(located, wild=wild, significance=found.significance)
-        sole = self._relocalizer.alone(candidates)
+        sole = relocalizer.alone(candidates)
         if isinstance(sole, str):
             return _nothing(seen, sole)
         estimator = make()
@@ -328,10 +351,11 @@ class Acquirer:
         state, least = found.solution.state, self._settings.tracking.min_significance
         if state is None:
             return found
-        sure = self.matcher.significance(seen, state.wTc)
+        support = self.matcher.support(seen, state.wTc)
         watch.lap("verification")
+        sure = support.significance
         if sure >= least:
-            return replace(found, significance=sure)
+            return replace(found, significance=sure, excess=support.share - support.chance)
         reason = f"only {sure:.1f} sigma more landmarks than by chance"
         return _nothing(seen, reason)
 

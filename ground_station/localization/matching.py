@@ -20,17 +20,13 @@ from ground_station.localization.chance import count_beyond_chance
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.localization.verification import Support, Witness
+from ground_station.localization.verification import APART, Support, Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.map.modes import described
 from ground_station.map.store import Map
 
 _WIDTH_PX = 640.0
 """Of the pictures for which the settings name a search radius."""
-
-_APART = 1.2
-"""Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
-"""
 
 _DESCRIBED_PX = 10
 """A SIFT descriptor looks further than this around its key point, but with little weight."""
@@ -101,9 +97,9 @@ class Matcher:
         distance_scale: float = 1.0,
     ) -> None:
         """`distance_scale` is the extractor's, by which all descriptor distances are divided."""
-        self._scale = distance_scale if settings.association.scale_distances else 1.0
+        self.scale = distance_scale if settings.association.scale_distances else 1.0
         limit = settings.association.max_descriptor_distance
-        self._farthest = min(limit * self._scale, max(limit, _APART))
+        self._farthest = min(limit * self.scale, max(limit, APART))
         self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
         self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
@@ -183,7 +179,7 @@ class Matcher:
         return Matches(
             pairs.feature[best],
             projected.landmark[pairs.candidate[best]],
-            pairs.distance[best] / np.float32(self._scale),
+            pairs.distance[best] / np.float32(self.scale),
             len(projected.landmark),
             len(pairs),
         )
@@ -205,10 +201,6 @@ class Matcher:
         variance = _variance_px2(points_m, expected, self.camera)
         return float(_REACH * np.sqrt(np.quantile(variance, 0.9)))
 
-    def significance(self, seen: Described, wTc: F64) -> float:
-        """By how many standard deviations a pose (4, 4) explains more landmarks than chance."""
-        return self.support(seen, wTc).significance
-
     def support(self, seen: Described, wTc: F64, nearer_than: float = np.inf) -> Support:
         """The landmarks of less than a depth that speak for a pose (4, 4).
 
@@ -223,7 +215,7 @@ class Matcher:
         return [witness.count(each, self.landmarks, among) for each in wTc]
 
     def _witness(self, seen: Described) -> Witness:
-        return Witness(seen.features, self._lens, self._modes)
+        return Witness(seen.features, self._lens, self._modes, self.scale)
 
     def _among(self, wTc: F64, nearer_than: float) -> Indices:
         among = self._index.near(wTc, self._lens, self.settings.projection)

@@ -164,6 +164,7 @@ class _Search:
         settings: RecoverySettings,
         seed: int,
         modes: Modes | None,
+        scale: float,
     ) -> None:
         camera = lens.camera
         self.modes = modes
@@ -171,7 +172,7 @@ class _Search:
         self.features = features
         focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
         self.pinhole_px = normalized * focal + centre
-        self.witness = Witness(features, lens, modes)
+        self.witness = Witness(features, lens, modes, scale)
 
     def propose(self, candidates: Indices) -> tuple[F64, Indices] | str:
         """wTc and its inliers from matches with some landmarks (M,), or why there is none."""
@@ -253,7 +254,11 @@ class _Search:
 class Relocalizer:
     """Finds frames in one map, whose keyframes are indexed once."""
 
-    def __init__(self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int) -> None:
+    def __init__(
+        self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int, scale: float = 1.0
+    ) -> None:
+        """`scale` of the descriptors' distances, over RootSIFT's."""
+        self._scale = scale
         self._landmarks, self._modes = map_.landmarks, map_.modes
         self._same_m = _SAME * map_.depth_m
         self._lens, self._settings, self._seed = Lens(camera), settings, seed
@@ -289,6 +294,7 @@ class Relocalizer:
             self._settings,
             self._seed,
             self._modes,
+            self._scale,
         )
         if self._index is None:
             return _only_place(search)

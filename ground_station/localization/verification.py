@@ -21,7 +21,10 @@ RADIUS_PX = 5.0
 _NEIGHBOURS = 4
 """Features that are looked at within the radius."""
 _MAX_DISTANCE = 0.75
-"""Of unit descriptors: a landmark seen again, in other light, too."""
+"""Of RootSIFT's descriptors: a landmark seen again, in other light, too."""
+APART = 1.2
+"""Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
+"""
 _SHIFTS_PX = np.array([[24.0, 10.0], [-24.0, -10.0], [-10.0, 24.0], [10.0, -24.0]])
 """Where the landmarks are certainly not: what matches there matches by chance."""
 _CONES = ProjectionSettings(viewing_cone=True)
@@ -53,9 +56,12 @@ class Support:
 class Witness:
     """A frame's features as a place to look landmarks up in."""
 
-    def __init__(self, features: Features, lens: Lens, modes: Modes | None = None) -> None:
-        """`modes` of the map's landmarks."""
+    def __init__(
+        self, features: Features, lens: Lens, modes: Modes | None = None, scale: float = 1.0
+    ) -> None:
+        """`modes` of the map's landmarks; `scale` of descriptor distances, over RootSIFT's."""
         self.features, self.lens, self._modes = features, lens, modes
+        self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
     def support(self, wTc: F64, landmarks: Landmarks, index: Indices) -> Support:
@@ -65,10 +71,10 @@ class Witness:
             return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
         feature, distance = self._near(pixel, descriptors, mode)
-        found = distance < _MAX_DISTANCE
+        found = distance < self._farthest
         chance = np.mean(
             [
-                (self._near(pixel + s, descriptors, mode)[1] < _MAX_DISTANCE).mean()
+                (self._near(pixel + s, descriptors, mode)[1] < self._farthest).mean()
                 for s in _SHIFTS_PX
             ]
         )
@@ -82,7 +88,7 @@ class Witness:
         """How many of the landmarks `index` (M,) are found, by chance or not."""
         index, pixel = self._seen(wTc, landmarks, index)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
-        return int((self._near(pixel, descriptors, mode)[1] < _MAX_DISTANCE).sum())
+        return int((self._near(pixel, descriptors, mode)[1] < self._farthest).sum())
 
     def _seen(self, wTc: F64, landmarks: Landmarks, index: Indices) -> tuple[Indices, F64]:
         """Those of the landmarks `index` (M,) that a pose (4, 4) should see, and their pixels."""

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ground_station.features.blobs import BORDER_PX, KERNEL_PX, LEAST, SIGMA_PX
+from ground_station.features.blobs import BORDER_PX, FLAT, KERNEL_PX, LEAST, SIGMA_PX
 
 
 def response(images: Tensor) -> Tensor:
@@ -22,7 +22,7 @@ def response(images: Tensor) -> Tensor:
     xx = x[:, 0, 1:-1, 2:] + x[:, 0, 1:-1, :-2] - 2 * middle
     yy = x[:, 0, 2:, 1:-1] + x[:, 0, :-2, 1:-1] - 2 * middle
     xy = (x[:, 0, 2:, 2:] + x[:, 0, :-2, :-2] - x[:, 0, :-2, 2:] - x[:, 0, 2:, :-2]) / 4
-    return (xx * yy - xy * xy).clamp(min=0).sqrt()
+    return 2 * (xx * yy - xy * xy).clamp(min=0) / ((xx + yy).abs() + FLAT)
 
 
 def strongest(

@@ -61,11 +61,11 @@ def test_a_right_pose_explains_more_than_chance_and_wrong_ones_do_not(room, acqu
     for k in (0, 60, 119):
         seen = seen_from(room, path[k])
         least = load_preset("default").tracking.min_significance
-        assert acquirer.matcher.significance(seen, path[k]) > 2 * least
+        assert acquirer.matcher.support(seen, path[k]).significance > 2 * least
         for other in ((k + 50) % 120, (k + 70) % 120):
-            assert acquirer.matcher.significance(seen, path[other]) < 0.7 * least
+            assert acquirer.matcher.support(seen, path[other]).significance < 0.7 * least
         aside = path[k] @ poses.exp([0.1, -0.1, 0.1, 0.3, 0.1, 0.0])
-        assert acquirer.matcher.significance(seen, aside) < 0.7 * least
+        assert acquirer.matcher.support(seen, aside).significance < 0.7 * least
 
 
 def test_a_search_near_a_wrong_and_certain_prediction_finds_nothing(room, acquirer):
