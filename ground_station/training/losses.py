@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from ground_station.features.blobs import NMS_PX
 from ground_station.training.pairs import Batch
-from ground_station.training.peaks import response, strongest
+from ground_station.training.peaks import responses, strongest
 from ground_station.training.topology import CELL_PX
 from ground_station.training.views import inside
 
@@ -126,7 +126,7 @@ def blob_losses(
     views = batch.views
     area = batch.known.repeat_interleave(CELL_PX, 1).repeat_interleave(CELL_PX, 2)
     with torch.no_grad():
-        places, heights = strongest(response(batch.images), NMS_PX, _MOST, area, batch.favour)
+        places, heights = strongest(responses(batch.images), NMS_PX, _MOST, area, batch.favour)
     vectors = sampled(outputs, places)
     odds = _at(outputs[2], places, CELL_PX, "bilinear")[:, :, 0] + heights.clamp(min=1e-9).log()
     found, worth, rights = [], [], []

@@ -6,23 +6,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ground_station.features.blobs import BORDER_PX, FLAT, KERNEL_PX, LEAST, SIGMA_PX
+from ground_station.features.blobs import BORDER_PX, FLAT, LEAST, SIGMAS_PX, kernel
 
 
-def response(images: Tensor) -> Tensor:
-    """What `features.blobs.response` is of pictures (N, 1, H, W), 0..1: (N, H, W)."""
-    step = torch.arange(KERNEL_PX, device=images.device) - KERNEL_PX // 2
-    row = (-(step**2) / (2 * SIGMA_PX**2)).exp()
-    row = row / row.sum()
-    pad = KERNEL_PX // 2
-    x = functional.pad(images, [pad] * 4, mode="reflect")
-    x = functional.conv2d(functional.conv2d(x, row.view(1, 1, 1, -1)), row.view(1, 1, -1, 1))
-    x = functional.pad(x, [1] * 4, mode="reflect")
-    middle = x[:, 0, 1:-1, 1:-1]
-    xx = x[:, 0, 1:-1, 2:] + x[:, 0, 1:-1, :-2] - 2 * middle
-    yy = x[:, 0, 2:, 1:-1] + x[:, 0, :-2, 1:-1] - 2 * middle
-    xy = (x[:, 0, 2:, 2:] + x[:, 0, :-2, :-2] - x[:, 0, :-2, 2:] - x[:, 0, 2:, :-2]) / 4
-    return 2 * (xx * yy - xy * xy).clamp(min=0) / ((xx + yy).abs() + FLAT)
+def responses(images: Tensor) -> Tensor:
+    """What `features.blobs.responses` are of pictures (N, 1, H, W), 0..1: (N, L, H, W)."""
+    made = []
+    for level, sigma in enumerate(SIGMAS_PX):
+        row = torch.from_numpy(kernel(level)).to(images.device)
+        pad = len(row) // 2
+        x = functional.pad(images, [pad] * 4, mode="reflect")
+        images = functional.conv2d(
+            functional.conv2d(x, row.view(1, 1, 1, -1)), row.view(1, 1, -1, 1)
+        )
+        x = functional.pad(images, [1] * 4, mode="reflect")
+        xx = x[:, 0, 1:-1, 2:] + x[:, 0, 1:-1, :-2] - 2 * images[:, 0]
+        yy = x[:, 0, 2:, 1:-1] + x[:, 0, :-2, 1:-1] - 2 * images[:, 0]
+        xy = (x[:, 0, 2:, 2:] + x[:, 0, :-2, :-2] - x[:, 0, :-2, 2:] - x[:, 0, 2:, :-2]) / 4
+        determinant = (xx * yy - xy * xy).clamp(min=0)
+        made.append(2 * (sigma / SIGMAS_PX[0]) ** 2 * determinant / ((xx + yy).abs() + FLAT))
+    return torch.stack(made, dim=1)
 
 
 def strongest(
@@ -30,22 +33,25 @@ def strongest(
 ) -> tuple[Tensor, Tensor]:
     """Places (N, most, 2), x then y, px, and heights (N, most), 0 where there are no more.
 
-    Of responses (N, H, W), where `where` says so, those that are highest times `favour` (N, H, W).
+    Of responses (N, L, H, W), where `where` (N, H, W) says so, those that are highest times
+    `favour` (N, H, W).
     """
-    size, pad = 2 * radius_px + 1, radius_px
-    top = functional.max_pool2d(values[:, None], size, 1, pad)[:, 0]
-    peak = (values == top) & (values > LEAST) & where
-    inner = torch.zeros_like(peak)
+    peak = values == functional.max_pool2d(values, 2 * radius_px + 1, 1, radius_px)
+    beside = functional.max_pool2d(values, 3, 1, 1)
+    peak[:, 1:] &= values[:, 1:] > beside[:, :-1]
+    peak[:, :-1] &= values[:, :-1] >= beside[:, 1:]
+    inner = torch.zeros_like(where)
     inner[:, BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
-    found = torch.where(peak & inner, values * favour, 0)
+    peak &= (values > LEAST) & (inner & where)[:, None]
+    found = torch.where(peak, values * favour[:, None], 0)
     ranks, flat = found.flatten(1).topk(min(most, found[0].numel()), dim=1)
-    columns = values.shape[2]
-    x, y = flat % columns, flat // columns
+    rows, columns = values.shape[2:]
+    level, x, y = flat // (rows * columns), flat % columns, flat // columns % rows
     around = values.flatten(1)
 
     def at(dx: int, dy: int) -> Tensor:
-        place = (y + dy).clamp(0, values.shape[1] - 1) * columns + (x + dx).clamp(0, columns - 1)
-        return around.gather(1, place)
+        place = (y + dy).clamp(0, rows - 1) * columns + (x + dx).clamp(0, columns - 1)
+        return around.gather(1, level * rows * columns + place)
 
     here = {(dx, dy): at(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)}
     c = here[0, 0]
