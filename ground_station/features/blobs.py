@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -41,57 +41,74 @@ def kernel(level: int) -> F32:
     return np.asarray(values / values.sum(), np.float32)
 
 
-def responses(image: U8) -> list[F32]:
-    """How much of a blob each pixel of a picture (H, W) is the middle of (H, W), at each scale.
+def responses(image: U8) -> F32:
+    """How much of a blob each pixel of a picture (H, W) is the middle of, at each scale (L, H, W).
 
     The harmonic mean of the two principal curvatures of the smoothed picture, 0..1 a square as wide
     as the scale is over the finest, px, where both have one sign, else nought: it is high on what
-    is round, dark or bright, and low along edges. Of the measures on the Hessian (Lindeberg, "Image Matching Using
-    Generalized Scale-Space Interest Points", JMIV 2015, section 3) this is the determinant over the
-    trace, as Brown, Szeliski and Winder (CVPR 2005, eq. 2) take it for corners.
+    is round, dark or bright, and low along edges. Of the measures on the Hessian (Lindeberg,
+    "Image Matching Using Generalized Scale-Space Interest Points", JMIV 2015, section 3) this is
+    the determinant over the trace, as Brown, Szeliski and Winder (CVPR 2005, eq. 2) take it for
+    corners.
     """
-    made = []
-    smooth = image.astype(np.float32) * np.float32(1 / 255)
+    # New arrays of this size are pages of their own: to touch each for the first time takes longer
+    # than the arithmetic.
+    smooth, other, xx, yy, xy = np.empty((5, *image.shape), np.float32)
+    np.multiply(image, np.float32(1 / 255), out=smooth)
+    made = np.empty((len(SIGMAS_PX), *image.shape), np.float32)
     for level, sigma in enumerate(SIGMAS_PX):
-        row = kernel(level)
-        smooth = np.asarray(cv2.sepFilter2D(smooth, cv2.CV_32F, row, row), np.float32)
-        xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=1)
-        yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=1)
-        xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
-        determinant = cv2.subtract(cv2.multiply(xx, yy), cv2.multiply(xy, xy))
-        trace = np.abs(cv2.add(xx, yy)) + np.float32(FLAT)
-        response = cv2.divide(
-            np.maximum(determinant, 0), trace, scale=2 * (sigma / SIGMAS_PX[0]) ** 2
-        )
-        made.append(np.asarray(response, np.float32))
+        row, response = kernel(level), made[level]
+        cv2.sepFilter2D(smooth, cv2.CV_32F, row, row, dst=other)
+        smooth, other = other, smooth
+        cv2.Sobel(smooth, cv2.CV_32F, 2, 0, dst=xx, ksize=1)
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 2, dst=yy, ksize=1)
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 1, dst=xy, ksize=3, scale=0.25)
+        np.multiply(xx, yy, out=response)
+        response -= np.multiply(xy, xy, out=xy)
+        np.maximum(response, 0, out=response)
+        np.abs(np.add(xx, yy, out=xx), out=xx)
+        xx += np.float32(FLAT)
+        cv2.divide(response, xx, dst=response, scale=2 * (sigma / SIGMAS_PX[0]) ** 2)
     return made
 
 
-def strongest(levels: Sequence[F32], radius_px: int, most: int) -> tuple[F32, F32]:
-    """Places (N, 2), x then y, px, and heights (N,) of the highest maxima of responses (H, W).
+def strongest(levels: F32, radius_px: int, most: int) -> tuple[F32, F32]:
+    """Places (N, 2), x then y, px, and heights (N,) of the highest maxima of responses (L, H, W).
 
     A maximum is the highest within `radius_px` along rows and columns, and within one pixel at the
     scales beside its own; its place is that of the parabola through it and its eight neighbours
-    (Brown and Lowe, BMVC 2002, eq. 3, in two dimensions).
+    (Brown and Lowe, BMVC 2002, eq. 3, in two dimensions). Of `most` some are none, and left out.
     """
     inner = np.s_[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
     window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
     beside = [cv2.dilate(values, np.ones((3, 3), np.uint8))[inner] for values in levels]
-    found = []
+    found, heights = [], []
     for level, values in enumerate(levels):
         own = values[inner]
-        peak = (own == cv2.dilate(values, window)[inner]) & (own > LEAST)
+        peak = own >= np.maximum(cv2.dilate(values, window)[inner], np.float32(LEAST))
         if level:
             peak &= own > beside[level - 1]
         if level + 1 < len(levels):
             peak &= own >= beside[level + 1]
-        rows, columns = np.nonzero(peak)
-        found.append(_placed(values, rows + BORDER_PX, columns + BORDER_PX))
-    places, heights = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    if len(heights) > most:
-        kept = np.sort(np.argpartition(-heights, most)[:most])
-        places, heights = places[kept], heights[kept]
-    return places, heights
+        flat = np.flatnonzero(peak)
+        rows, columns = np.divmod(flat, own.shape[1])
+        rows, columns = rows + BORDER_PX, columns + BORDER_PX
+        found.append((rows, columns))
+        heights.append(values[rows, columns])
+    least = _nth(np.concatenate(heights), most)
+    placed = [
+        _placed(values, rows[high >= least], columns[high >= least])
+        for values, (rows, columns), high in zip(levels, found, heights, strict=True)
+    ]
+    places, kept = (np.concatenate(parts) for parts in zip(*placed, strict=True))
+    return places, kept
+
+
+def _nth(heights: F32, most: int) -> float:
+    """What the `most` highest of them are at least."""
+    if len(heights) <= most:
+        return 0.0
+    return float(np.partition(heights, len(heights) - most)[len(heights) - most])
 
 
 def _placed(values: F32, rows: Indices, columns: Indices) -> tuple[F32, F32]:

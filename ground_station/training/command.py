@@ -10,10 +10,10 @@ from pathlib import Path
 from ground_station.training.errors import TrainingError
 
 _EXAMPLE = """\
-Example: blimp models train --size swift --teacher alike-n --out out/training/swift
-         blimp models train --out out/training/swift --resume
+Example: blimp models train
+         blimp models train --resume
          blimp models train --out out/training/final --decay-from \\
-             out/training/swift/checkpoints/step-0005000.safetensors
+             out/training/lark/checkpoints/step-0002000.safetensors
 
          blimp models train --device cpu --batch 8 --rate 0.0015 --fresh 1
 

@@ -97,7 +97,7 @@ blimp map build walk.mp4 --camera half.toml --out m
 blimp map build walk.mp4 --out m --features superpoint
     blimp models import FILE
 blimp map build walk.mp4 --out m --features sift9
-    known: orb, rootsift, wren
+    known: lark, orb, rootsift, wren
 blimp map build walk.mp4 --out notes.txt
     name a new one, as --out maps/NAME
 blimp map build nosuch.mp4 --out m

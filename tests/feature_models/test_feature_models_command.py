@@ -122,7 +122,7 @@ def test_what_a_person_gets_wrong_is_one_line(
     for words, says in (
         (["import", str(tmp_path / "none.pth")], "none.pth: No such file or directory"),
         (["import", str(weights)], "other.pth: neither SuperPoint nor ALIKE"),
-        (["info", "nothing"], "there is no model 'nothing' (known: made-up, wren)"),
+        (["info", "nothing"], "there is no model 'nothing' (known: lark, made-up, wren)"),
         ([*quantize, str(tmp_path / "none")], "none: No such file or directory"),
         ([*quantize, str(one)], "1 frames; at least 2 are needed"),
         ([*quantize, str(frames), "--frames", "3"], "--frames is 3; allowed: 4 to 512"),
@@ -131,7 +131,7 @@ def test_what_a_person_gets_wrong_is_one_line(
         ([*quantize, str(frames), "--name", "orb"], "name is 'orb', which is a method's"),
     ):
         assert says in _refused(words, capsys), words
-    assert catalogue.names() == ["made-up", "wren"]
+    assert catalogue.names() == ["lark", "made-up", "wren"]
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(

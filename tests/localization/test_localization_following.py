@@ -85,6 +85,54 @@ def test_a_search_near_a_wrong_and_certain_prediction_finds_nothing(room, acquir
         assert np.linalg.norm(apart[3:]) < 0.02 and np.linalg.norm(apart[:3]) < 0.005
 
 
+def test_a_frame_is_matched_around_until_its_pose_stays(room, acquirer, monkeypatch):
+    """What matches around a pose that is far off draws it nearer by a few pixels a time."""
+    _, path = room.path(120)
+    seen, turned = seen_from(room, path[0]), path[0] @ poses.exp([0, 0.08, 0, 0, 0, 0])
+    estimator = estimator_at(room, turned)
+    expected = estimator.predict(0)
+    right = acquirer.locate(seen, estimator_at(room, path[0]).predict(0), estimator, Stopwatch())
+    a_pixel = acquirer.matcher.reach_px(np.array([0, 1.0, 0, 0, 0, 0])) ** -1
+    rounds = []
+
+    def nearer(seen, around, *_):
+        left = poses.log(poses.inverse(around.wTc) @ path[0])
+        step = left * min(1.0, 6 * a_pixel / np.linalg.norm(left[:3]))
+        rounds.append(np.linalg.norm(left[:3]) / a_pixel)
+        state = dataclasses.replace(around, wTc=around.wTc @ poses.exp(step))
+        return dataclasses.replace(right, solution=dataclasses.replace(right.solution, state=state))
+
+    monkeypatch.setattr(acquirer, "_locate_once", nearer)
+    monkeypatch.setattr(acquirer, "_held_by_near", lambda seen, found, *_: found)
+    found = acquirer.locate(seen, expected, estimator, Stopwatch())
+    apart = poses.log(poses.inverse(path[0]) @ found.solution.state.wTc)
+    assert rounds[0] > 38 and np.linalg.norm(apart) < 1e-6
+    assert 7 <= len(rounds) <= 9  # 6 px each, and one that moves nothing
+
+
+def test_what_few_landmarks_speak_for_is_held_against_what_is_found_anywhere(
+    room, acquirer, monkeypatch
+):
+    _, path = room.path(120)
+    seen, estimator = seen_from(room, path[0]), estimator_at(room, path[0], sigma=3e-3)
+    right = acquirer.locate(seen, estimator.predict(0), estimator, Stopwatch())
+    near = dataclasses.replace(right, significance=9.0)
+    asked = []
+
+    def found(excess, significance):
+        monkeypatch.setattr(
+            acquirer, "_verified", lambda *_: dataclasses.replace(near, excess=excess)
+        )
+        elsewhere = dataclasses.replace(right, relocalized=True, significance=significance)
+        monkeypatch.setattr(acquirer, "_anywhere", lambda *_: asked.append(1) or elsewhere)
+        make = lambda: make_estimator(room.camera, load_preset("default"))  # noqa: E731
+        return acquirer.find(seen, 0, [estimator.predict(0)], estimator, make, Stopwatch())
+
+    assert not found(excess=0.3, significance=90).relocalized and not asked
+    assert found(excess=0.01, significance=90).relocalized and asked
+    assert not found(excess=0.01, significance=5).relocalized
+
+
 def test_a_doubtful_find_counts_only_beside_a_prediction_that_says_where(room, acquirer):
     _, path = room.path(120)
     seen = seen_from(room, path[0])

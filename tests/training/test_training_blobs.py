@@ -29,8 +29,8 @@ def test_blobs_are_those_of_extraction():
         picture = images.procedural(5, number, size)
         ours = peaks.responses(torch.from_numpy(picture)[None, None].float() / 255)
         theirs = blobs.responses(picture)
-        assert np.abs(ours[0].numpy() - np.stack(theirs)).max() < 1e-5
-        both = torch.from_numpy(np.stack(theirs))[None]
+        assert np.abs(ours[0].numpy() - theirs).max() < 1e-5
+        both = torch.from_numpy(theirs)[None]
         everywhere = torch.ones(1, *size, dtype=torch.bool)
         places, heights = peaks.strongest(both, 2, 150, everywhere, torch.ones(1, *size))
         found, _ = blobs.strongest(theirs, 2, 150)
