@@ -280,6 +280,10 @@ class Service:
         estimate = view.get("estimate") or {}
         return estimate.get("state") == "TRACKING" and "estimate" not in view["stale"]
 
+    def has(self, payload_id: str) -> bool:
+        """Whether a payload flies with it, and is localized there."""
+        return self.tracking(payload_id) and self.payload(payload_id)["payload"]["station"] == ""
+
     def record(self, *, active: bool) -> None:
         """The dashboard's button."""
         answer = self.client.post("/api/recording", json={"active": active})
@@ -318,6 +322,23 @@ class Service:
             f"telemetry.certificates={self.authority.of(f'payload.{payload_id}')}",
             *settings,
         )
+
+
+def joined(folder: Path) -> tuple[Service, Service]:
+    """Two stations of one authority, the second of which joins the first and takes its map."""
+    for name in ("first", "second"):
+        (folder / name).mkdir()
+    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    first = Service(folder / "first", f"fleet.listen={json.dumps([fleet])}")
+    second = Service(
+        folder / "second",
+        f"fleet.join={json.dumps([fleet])}",
+        f"map.shelf={folder / 'maps'}",
+        name="spare",
+        authority=first.authority,
+        map_named=False,
+    )
+    return first, second
 
 
 def _free(kind: socket.SocketKind, port: int) -> bool:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import struct
 from pathlib import Path
 from typing import Any
 
 import httpx
 from intake_stand import eventually
-from payload_process import free_port
-from standing import Service
+from standing import Service, joined
 from websockets.sync.client import connect
 
 PAYLOAD = "blimp-1"
@@ -22,28 +20,6 @@ _LIMIT_S = 90.0
 def alarms(service: Service) -> dict[str, str]:
     """What its alarms say, by id."""
     return {alarm["id"]: alarm["text"] for alarm in service.state()["alarms"]}
-
-
-def joined(folder: Path) -> tuple[Service, Service]:
-    """Two stations of one authority, the second of which joins the first and takes its map."""
-    for name in ("first", "second"):
-        (folder / name).mkdir()
-    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    first = Service(folder / "first", f"fleet.listen={json.dumps([fleet])}")
-    second = Service(
-        folder / "second",
-        f"fleet.join={json.dumps([fleet])}",
-        f"map.shelf={folder / 'maps'}",
-        name="spare",
-        authority=first.authority,
-        map_named=False,
-    )
-    return first, second
-
-
-def has(service: Service) -> bool:
-    """Whether the payload flies with it, and is localized there."""
-    return service.tracking(PAYLOAD) and service.payload(PAYLOAD)["payload"]["station"] == ""
 
 
 def listed(service: Service, station: str) -> list[dict[str, Any]]:
@@ -119,7 +95,7 @@ def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) ->
         def flies_with() -> str:
             """The station that has it, once the other knows: by load it may change at first."""
             for name, one, other in (("main", first, second), ("spare", second, first)):
-                if has(one) and other.payload(PAYLOAD)["payload"]["station"] == name:
+                if one.has(PAYLOAD) and other.payload(PAYLOAD)["payload"]["station"] == name:
                     return name
             return ""
 
@@ -130,7 +106,7 @@ def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) ->
         eventually(lambda: f"no-frames/{PAYLOAD}" not in alarms(other), _LIMIT_S)
         answer = used.client.post(f"/api/payloads/{PAYLOAD}/station", json={"name": other_name})
         assert answer.json()["done"], answer.text
-        eventually(lambda: has(other), _LIMIT_S)
+        eventually(lambda: other.has(PAYLOAD), _LIMIT_S)
         assert any("was chosen for it" in event["text"] for event in used.state()["events"])
         assert other.state()["fleet"]["pins"] == {PAYLOAD: other_name}
         used, other, name = other, used, other_name
@@ -140,7 +116,7 @@ def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) ->
         eventually(lambda: other.state()["fleet"]["stations"][0]["recording"], _LIMIT_S)
         assert not other.state()["recording"]["active"]
         used.kill()
-        eventually(lambda: has(other), _LIMIT_S)
+        eventually(lambda: other.has(PAYLOAD), _LIMIT_S)
         eventually(lambda: other.state()["recording"]["active"], _LIMIT_S)
         other.record(active=False)
         (cut,) = [path.name for path in used.recordings.iterdir()]

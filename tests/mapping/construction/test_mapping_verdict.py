@@ -125,6 +125,13 @@ def test_the_next_command_follows_from_the_verdict(built: dict[str, Any], comman
     assert next_step(verdict(map_), map_, "maps/a b").startswith(command)
 
 
+def test_a_map_in_parts_of_rootsift_names_the_features_that_join_more() -> None:
+    map_ = map_of(EVERY[:20], parts=[EVERY[:20], EVERY[20:]])
+    for features, named in (("rootsift", True), ("lark", False)):
+        map_.info.features = features
+        assert ("--features lark" in next_step(verdict(map_), map_, "maps/a")) == named
+
+
 def test_a_registered_map_is_ready_to_localize() -> None:
     map_ = map_of(EVERY)
     map_.info.frame, map_.info.units = "world", "m"
