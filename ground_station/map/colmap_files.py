@@ -42,7 +42,7 @@ def check(folder: Path) -> None:
         if not (path.is_file() or path.is_dir()):  # a pipe would be waited for without end
             raise MapError(f"{path}: neither a file nor a folder: what is a model's is a file")
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # each thread claims memory
-    child = [sys.executable, "-I", __file__, str(folder.absolute())]
+    child = [sys.executable, "-I", __file__, str(folder.absolute()), str(_SECONDS)]
     run = subprocess.run(child, capture_output=True, text=True, errors="replace", env=environment)
     fault = (run.stdout.strip().splitlines() or [""])[-1]
     if run.returncode:
@@ -51,9 +51,9 @@ def check(folder: Path) -> None:
         raise MapError(f"{folder}: not a COLMAP model: {printable(fault, 200)}")
 
 
-def _bound(folder: Path) -> None:
+def _bound(folder: Path, least_s: float) -> None:
     size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-    seconds = int(_SECONDS + _SECONDS_MB * size / 1e6)
+    seconds = int(least_s + _SECONDS_MB * size / 1e6)
     for what, limit in (
         (resource.RLIMIT_CPU, seconds),
         (resource.RLIMIT_AS, _BYTES + _TIMES * size),
@@ -119,7 +119,7 @@ def _content(path: Path) -> tuple[list[str], npt.NDArray[np.float64]]:
 
 
 if __name__ == "__main__":
-    _bound(Path(sys.argv[1]))
+    _bound(Path(sys.argv[1]), float(sys.argv[2]))
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     try:
         print(_look(Path(sys.argv[1])))
