@@ -121,9 +121,10 @@ def taken_over(folder: Path) -> list[float]:
     with first, second, first.fly(PAYLOAD, folder / "payload", *own, rate_hz=KILLED_HZ):
 
         def settled() -> tuple[Service, Service] | None:
-            """The station that has the payload and the one that shows it from there, recording."""
+            """The station that has the payload and the one that shows it from there."""
             for one, other in ((first, second), (second, first)):
-                if one.has(PAYLOAD) and other.payload(PAYLOAD)["payload"]["relayed"]:
+                shown = other.payload(PAYLOAD).get("payload", {})  # at first it is not known there
+                if one.has(PAYLOAD) and shown.get("relayed"):
                     return one, other
             return None
 
