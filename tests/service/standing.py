@@ -266,7 +266,10 @@ class Service:
         """The whole snapshot, ten times a second at most: who waits must not be the load."""
         time.sleep(max(0.0, self._asked_s + _ASK_S - time.monotonic()))
         self._asked_s = time.monotonic()
-        answer = self.client.get("/api/state")
+        try:
+            answer = self.client.get("/api/state")
+        except httpx.ReadError:  # the server ended an idle connection that very moment
+            answer = self.client.get("/api/state")
         assert answer.status_code == 200, answer.text
         return dict(answer.json())
 
