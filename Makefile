@@ -121,7 +121,7 @@ soak-stream: setup  ## One unbroken stream of HOURS=1 through the live localizer
 	@mkdir -p out
 	@.venv/bin/python tests/service/soak_stream.py --hours "$(or $(HOURS),1)" --out out/soak-stream.json
 
-fleet: setup  ## What a payload and the page cost on 1, 3 and 6 stations of two payloads each
+fleet: setup  ## What payloads and the page cost on 1, 3 and 6 stations; how soon one takes over
 	@mkdir -p out
 	@.venv/bin/python tests/service/fleet_growth.py --out out/fleet.json
 

@@ -20,14 +20,15 @@ SIGMAS_PX = (1.6, 1.6 * 2**0.5, 3.2)
 """An octave of scales: of one alone the places shift as the camera comes nearer (of made pairs a
 camera's step of 1.3 to 1.7 closer left 73 matches within half a pixel, of three 157), and of finer
 or more of them those found again are fewer."""
-REACH = 3.0
+_REACH = 3.0
 """Standard deviations of a kernel's half width."""
 BORDER_PX = 8
 """Where the picture is mirrored, blobs are none."""
 FLAT = 1e-9
-"""Added to the trace: less than any picture of 255 steps makes."""
+"""Added to the trace, so that nothing is divided by nought."""
 LEAST = 1e-5
-"""Of the response: a tenth of what noise of one step makes."""
+"""Of the response: of the maxima that noise of one step makes nearly all are over three times it,
+so that a flat picture has none and a faint one has all."""
 _MARGIN = 4
 """So many of the strongest a wanted one are judged by the network."""
 
@@ -36,7 +37,7 @@ def kernel(level: int) -> F32:
     """The Gaussian (K,) that brings a picture to a level from the one before, or from none."""
     before = SIGMAS_PX[level - 1] if level else 0.0
     sigma = (SIGMAS_PX[level] ** 2 - before**2) ** 0.5
-    reach = round(REACH * sigma)
+    reach = round(_REACH * sigma)
     values = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma**2))
     return np.asarray(values / values.sum(), np.float32)
 
@@ -100,8 +101,8 @@ def strongest(levels: F32, radius_px: int, most: int) -> tuple[F32, F32]:
         _placed(values, rows[high >= least], columns[high >= least])
         for values, (rows, columns), high in zip(levels, found, heights, strict=True)
     ]
-    places, kept = (np.concatenate(parts) for parts in zip(*placed, strict=True))
-    return places, kept
+    places, high = (np.concatenate(parts) for parts in zip(*placed, strict=True))
+    return places, high
 
 
 def _nth(heights: F32, most: int) -> float:

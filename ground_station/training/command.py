@@ -26,8 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXAMPLE
     parser.set_defaults(next="blimp models list")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--size", default="lark", help="of the network: lark (default)")
-    parser.add_argument("--out", type=Path, help="folder of the run (out/training/SIZE)")
+    parser.add_argument("--out", type=Path, help="folder of the run (out/training/lark)")
     parser.add_argument("--resume", action="store_true", help="go on where this folder stands")
     parser.add_argument(
         "--decay-from", type=Path, metavar="CHECKPOINT", help="end another run from here"
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         given["warm_up"] = min(Recipe.warm_up, args.steps // 4)
     numbers = {k: getattr(args, k) for k in ("rooms", "seed")}
     corpus = replace(CorpusSettings(), **{k: v for k, v in numbers.items() if v is not None})
-    out = args.out or Path("out/training") / args.size
+    out = args.out or Path("out/training") / Recipe.size
     machine = Machine(
         device=args.device,
         precision=args.precision,

@@ -117,20 +117,56 @@ def test_what_few_landmarks_speak_for_is_held_against_what_is_found_anywhere(
     seen, estimator = seen_from(room, path[0]), estimator_at(room, path[0], sigma=3e-3)
     right = acquirer.locate(seen, estimator.predict(0), estimator, Stopwatch())
     near = dataclasses.replace(right, significance=9.0)
+    rows = right.observations.inlier.nonzero()[0][:40]
+    feature, landmark = right.matches.feature[rows], right.matches.landmark[rows]
     asked = []
 
-    def found(excess, significance):
+    def found(excess, significance, at=path[0], near=near):
+        candidate = Relocalization(at, feature, landmark, significance, 0.001, "")
+        acquirer._relocalizer = SimpleNamespace(
+            candidates=lambda *_: asked.append(1) or [candidate], alone=lambda all_: all_[0]
+        )
         monkeypatch.setattr(
             acquirer, "_verified", lambda *_: dataclasses.replace(near, excess=excess)
         )
-        elsewhere = dataclasses.replace(right, relocalized=True, significance=significance)
-        monkeypatch.setattr(acquirer, "_anywhere", lambda *_: asked.append(1) or elsewhere)
         make = lambda: make_estimator(room.camera, load_preset("default"))  # noqa: E731
         return acquirer.find(seen, 0, [estimator.predict(0)], estimator, make, Stopwatch())
 
-    assert not found(excess=0.3, significance=90).relocalized and not asked
-    assert found(excess=0.01, significance=90).relocalized and asked
-    assert not found(excess=0.01, significance=5).relocalized
+    assert found(excess=0.3, significance=90).significance == 9 and not asked
+    assert found(excess=0.01, significance=90).significance == 90 and asked
+    assert found(excess=0.01, significance=5).significance == 9
+    # A find that cannot be solved is none, however much spoke for it.
+    monkeypatch.setattr(acquirer, "_agreed", lambda *_: None)
+    away = path[0] @ poses.exp([0, 2.0, 0, 0, 0, 0])
+    kept = found(excess=0.01, significance=90, at=away)
+    assert kept.significance == 9 and kept.solution.state is not None
+
+
+def test_a_pose_is_checked_up_to_the_models_own_distance(room, extractor):
+    """Descriptors of one point that lie farther apart than RootSIFT's speak for it as well."""
+    _, path = room.path(120)
+    plain = room.features(path[0])
+    noise = np.random.default_rng(1).normal(size=plain.descriptors.shape)
+    far = plain.descriptors + 1.3 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
+    far = (far / np.linalg.norm(far, axis=1, keepdims=True)).astype(np.float32)
+    off = np.linalg.norm(far - plain.descriptors, axis=1)
+    assert np.quantile(off, 0.05) > 0.75 and np.quantile(off, 0.95) < 1.1
+    seen = describe(dataclasses.replace(plain, descriptors=far), room.camera, Conditions())
+    settings = load_preset("default")
+
+    def acquirer(scale):
+        return Acquirer(
+            room.map, Matcher(room.map, room.camera, settings, scale), extractor, settings
+        )
+
+    def found(scale):
+        make = lambda: make_estimator(room.camera, settings)  # noqa: E731
+        return acquirer(scale).find(seen, 0, [], make(), make, Stopwatch()).solution.state
+
+    assert acquirer(1.0).matcher.support(seen, path[0]).share < 0.05
+    assert acquirer(1.6).matcher.support(seen, path[0]).significance > 10
+    assert found(1.0) is None
+    assert np.linalg.norm(poses.log(poses.inverse(path[0]) @ found(1.6).wTc)[3:]) < 0.03
 
 
 def test_a_doubtful_find_counts_only_beside_a_prediction_that_says_where(room, acquirer):

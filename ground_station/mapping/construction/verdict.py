@@ -72,7 +72,7 @@ def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
         if found.word == "in parts":
             why = "see what is there; film what joins the parts, and build with both"
             if map_.info.features == "rootsift":  # measured: `features/README.md`
-                why += "; or build with --features lark, which joins more, and read its doubts"
+                why += "; or build with --features lark, which may join them: read its doubts"
         return f"blimp map view {where} --out {page} --open    ({why})"
     if _open_lens(map_.info.built):
         return "blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
