@@ -173,7 +173,9 @@ class Service:
 
     def __exit__(self, kind: object, *_: object) -> None:
         try:
-            if self.process.poll() is None and kind is None:
+            if kind is not None:
+                print(self.written())
+            elif self.process.poll() is None:
                 self.end()
         finally:
             self._clear()
@@ -268,7 +270,8 @@ class Service:
         self._asked_s = time.monotonic()
         try:
             answer = self.client.get("/api/state")
-        except httpx.ReadError:  # the server ended an idle connection that very moment
+        except httpx.TransportError:  # an idle connection ended, or its process is restarted
+            eventually(self.answers, START_S)
             answer = self.client.get("/api/state")
         assert answer.status_code == 200, answer.text
         return dict(answer.json())
