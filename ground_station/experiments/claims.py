@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
+
+import numpy as np
 
 from ground_station.experiments.declaration import Claim
 
 NOT_MEASURED = "not measured"
 _UNITS = {"m": " m", "deg": "°", "s": " s", "95": ""}
 """By the end of a figure's name."""
+_OVER_RUNS: dict[str, Callable[..., Any]] = {
+    "mean": np.mean, "min": min, "max": max, "median": np.median,
+    "p95": lambda values: np.percentile(values, 95),
+}  # fmt: skip
 
 
 def judge(claims: Sequence[Claim], experiments: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -18,17 +24,19 @@ def judge(claims: Sequence[Claim], experiments: Sequence[dict[str, Any]]) -> lis
     A figure that runs should have and some have not, as the time of a recovery that never came,
     keeps nothing. Claims of experiments that were not wanted are left out.
     """
-    cases = {(e["name"], c["name"]): c for e in experiments for c in e["cases"]}
+    cases = {f"{e['name']}.{c['name']}": [c] for e in experiments for c in e["cases"]}
+    cases |= {e["name"]: e["cases"] for e in experiments}
     found = []
     for claim in claims:
-        named = [_key(row) for row in (claim.row, claim.against) if row]
-        if not all(key in cases for key in named):
+        named = [row for row in (claim.row, claim.against) if row]
+        if not all(row in cases for row in named):
             continue
-        values = [_value(cases[key], claim) for key in named]
+        runs = [[run for case in cases[row] for run in _runs(case, claim)] for row in named]
+        values = [_value(of, claim) for of in runs]
         value: float | None = None
         if None not in values:
             value = values[0] if len(values) == 1 else _ratio(*values)
-        measured = not any(_unmeasured(cases[key], claim) for key in named)
+        measured = all(of and not any("failed" in run for run in of) for of in runs)
         kept = value is not None and _within(value, claim) if measured else None
         unit = " times" if claim.against else _UNITS[claim.figure.rpartition("_")[2]]
         found.append({"text": claim.text, "value": value, "most": claim.most, "least": claim.least,
@@ -47,27 +55,20 @@ def line(claim: dict[str, Any]) -> str:
     return f"{claim['text']}: {word}, {told} (at {side} {bound:g}{unit})."
 
 
-def _key(row: str) -> tuple[str, str]:
-    experiment, _, case = row.partition(".")
-    return experiment, case
+def _runs(case: dict[str, Any], claim: Claim) -> list[dict[str, Any]]:
+    return list(case["presets"].get(claim.preset, {"runs": []})["runs"])
 
 
-def _value(case: dict[str, Any], claim: Claim) -> float | None:
+def _value(runs: Sequence[dict[str, Any]], claim: Claim) -> float | None:
     """None where a run has no such figure."""
-    row = case["presets"].get(claim.preset)
-    found = None if row is None else row[claim.figure]
-    if row is None or found is None or found["n"] < len(row["runs"]):
+    numbers = [run.get(claim.figure) for run in runs]
+    if not numbers or None in numbers:
         return None
-    return float(found[claim.statistic])
+    return float(_OVER_RUNS[claim.statistic](numbers))
 
 
 def _ratio(value: float | None, unit: float | None) -> float | None:
     return value / unit if value is not None and unit else None
-
-
-def _unmeasured(case: dict[str, Any], claim: Claim) -> bool:
-    row = case["presets"].get(claim.preset)
-    return row is None or bool(row["failed"])
 
 
 def _within(value: float, claim: Claim) -> bool:

@@ -17,8 +17,11 @@ PRESETS = ("thesis", "alone", "default")
 """They localize the same frames, in this order of columns; `alone` is each frame by itself."""
 
 FIGURES = ("position_m", "rotation_deg", "smoothed_m", "p95_m", "recovery_s", "first_s", "gap_s",
-           "inside_95")  # fmt: skip
+           "inside_95", "registration_m")  # fmt: skip
 """Of a run, one number each, that are averaged over the seeds."""
+
+STATISTICS = ("mean", "min", "max", "median", "p95")
+"""Of a claim's figure, over the runs that it is about."""
 
 T = TypeVar("T")
 Table = Mapping[str, Any]
@@ -39,6 +42,13 @@ class FlightDeclaration:
     draught_m_s: float | None = config.key(
         None, "deviation of the air's speed, which makes the blimp swing", unit="m/s", low=0, high=2
     )
+    lens_error: float = config.key(
+        0.0, "share by which the focal length that is known is off", low=-0.2, high=0.2
+    )
+    clicked: int = config.key(
+        0, "of a map's: points that a person clicks and measured; 0: registered by the true poses",
+        unit="points", low=0, high=18,
+    )  # fmt: skip
     folder: str = config.key("", "pictures below --data instead of a simulation")
     truth: str = config.key("", "their trajectory below --data, TUM text")
     camera: str = config.key("", "their camera below --data")
@@ -112,10 +122,10 @@ class Claim:
     """
 
     text: str = config.key("", "as shown")
-    row: str = config.key("", "EXPERIMENT.CASE that it is about")
+    row: str = config.key("", "EXPERIMENT.CASE that it is about, or EXPERIMENT: all its runs")
     preset: str = config.key("default", "of the localizer", choices=PRESETS)
     figure: str = config.key("position_m", "of the row", choices=FIGURES)
-    statistic: str = config.key("mean", "over the seeds", choices=("mean", "min", "max"))
+    statistic: str = config.key("mean", "over the runs", choices=STATISTICS)
     against: str = config.key(
         "", "EXPERIMENT.CASE whose figure is the unit; none: the figure's own"
     )
@@ -219,8 +229,9 @@ def _claims(tables: Table, declared: Table, where: str) -> list[Claim]:
             raise ConfigError(f"{at} must be a table")
         claim = config.from_mapping(table, Claim, where=at)
         for key, row in (("row", claim.row), ("against", claim.against)):
-            experiment, _, case = row.partition(".")
+            experiment, dot, case = row.partition(".")
             known = case in _table(_table(declared, experiment, where), "case", where)
+            known |= bool(row) and not dot and experiment in declared
             if (row or key == "row") and not known:
                 raise ConfigError(f"{at}: '{key}' names '{row:.60}', and there is no such row")
         if (claim.most is None) == (claim.least is None):

@@ -18,6 +18,11 @@ def file_name(flight: FlightDeclaration, seed: int) -> str:
     )
 
 
+def points_of(recording: Path) -> Path:
+    """Where the observations of surveyed points in a recording lie."""
+    return recording.with_suffix(".csv")
+
+
 def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
     """Simulates a flight into a recording, written whole or not at all."""
     settings = SimulationSettings(
@@ -30,6 +35,8 @@ def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
         rate_hz=flight.rate_hz,
         bitrate_kbps=flight.bitrate_kbps or None,
         draught_m_s=flight.draught_m_s,
+        lens_error=flight.lens_error,
+        points=points_of(path) if flight.clicked else None,
     )
     if simulate(settings).interrupted:
         path.unlink(missing_ok=True)

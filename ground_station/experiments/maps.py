@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from ground_station.arrays import F64
 from ground_station.experiments.declaration import MapSpec
+from ground_station.experiments.flights import points_of
 from ground_station.experiments.material import flown
+from ground_station.files import write_json
+from ground_station.geometry.alignment import Alignment
 from ground_station.map import store
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.cache import Cache
-from ground_station.mapping.registration.register import register_map
+from ground_station.mapping.registration.observations import PointObservations, read_pairs
+from ground_station.mapping.registration.register import find_similarity, register_map
 from ground_station.mapping.settings import MappingSettings
 
 
@@ -23,10 +32,11 @@ def build(
     folder: Path,
     cache: Path,
 ) -> store.Map:
-    """The map of a flight's frames in `folder`, registered by its true poses.
+    """The map of a flight's frames in `folder`, registered by its true poses or by clicked points.
 
-    An error against it is then the localizer's and the landmarks', not the registration's. What a
-    build that was killed has made is taken from the folder `cache`, as maps of the same frames do.
+    By true poses an error against it is the localizer's and the landmarks', not the registration's;
+    by points the registration's share is told apart (`displacement`). What a build that was killed
+    has made is taken from the folder `cache`, as maps of the same frames do.
     """
     material = flown(spec.flight, recording, data)
     total = material.frames.count()
@@ -42,7 +52,59 @@ def build(
             total=len(chosen),
             cache=kept if settings.cache_gb else None,
         )
-    return register_map(folder, trajectory=material.truth, source="truth")[0]
+    if not (recording and spec.flight.clicked):
+        return register_map(folder, trajectory=material.truth, source="truth")[0]
+    true = find_similarity(store.load(folder), trajectory=material.truth).fit
+    clicks = clicked(read_pairs(points_of(recording)), spec.flight.clicked, spec.seed)
+    registered, found = register_map(folder, observations=clicks, source="clicks")
+    write_json(folder / _DISPLACEMENT, {"true": _plain(true), "found": _plain(found.fit)})
+    return registered
+
+
+def clicked(known: PointObservations, count: int, seed: int) -> PointObservations:
+    """So many of the points, far from each other, as a person clicks and measures them."""
+    rng = np.random.default_rng([seed, count])
+    places = known.world_m
+    chosen = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
+    while len(chosen) < min(count, len(places)):
+        gaps = np.linalg.norm(places[:, None] - places[chosen][None], axis=2).min(axis=1)
+        chosen.append(int(gaps.argmax()))
+    kept = np.isin(known.point, chosen)
+    number = np.full(len(places), -1, np.int64)
+    number[chosen] = np.arange(len(chosen))
+    pixel_px = known.pixel_px[kept]
+    return PointObservations(
+        points=[known.points[k] for k in chosen],
+        world_m=places[chosen] + rng.normal(0, _MEASURED_M, (len(chosen), 3)),
+        point=number[known.point[kept]],
+        image=[name for name, keep in zip(known.image, kept.tolist(), strict=True) if keep],
+        pixel_px=pixel_px + rng.normal(0, _CLICKED_PX, pixel_px.shape),
+    )
+
+
+def displacement(map_: store.Map, places_m: F64) -> F64 | None:
+    """By how much the registration alone displaces places (N, 3), metres; None: by the truth's."""
+    path = map_.folder / _DISPLACEMENT if map_.folder else None
+    if path is None or not path.is_file():
+        return None
+    true, found = (Alignment(scale=one["scale"], rotation=np.array(one["rotation"]),
+                             translation=np.array(one["translation"]))
+                   for one in map(json.loads(path.read_text()).get, ("true", "found")))  # fmt: skip
+    model = (places_m - true.translation) @ true.rotation / true.scale
+    return np.asarray(np.linalg.norm(found.apply(model) - places_m, axis=1))
+
+
+def _plain(fit: Alignment) -> dict[str, Any]:
+    return {
+        "scale": fit.scale,
+        "rotation": fit.rotation.tolist(),
+        "translation": fit.translation.tolist(),
+    }
+
+
+_DISPLACEMENT = "displacement.json"
+_CLICKED_PX, _MEASURED_M = 1.0, 0.01
+"""Deviations, along each axis, of a person's click and of a place measured with a tape."""
 
 
 def evenly(total: int, wanted: int) -> set[int]:

@@ -14,6 +14,7 @@ from ground_station.evaluation import ate
 from ground_station.experiments.alone import FEATURES, Alone
 from ground_station.experiments.alter import altered, arrivals, scaled_camera
 from ground_station.experiments.declaration import Alteration
+from ground_station.experiments.maps import displacement
 from ground_station.experiments.material import Flown
 from ground_station.features.settings import OF_THE_MAP
 from ground_station.geometry import poses
@@ -49,7 +50,8 @@ def measure(
 
     Only the preset thesis is told its true first pose: its method has no other way to begin.
     `first_s` is the time to the first right pose of one that is not, `wrong` counts the frames that
-    are TRACKING and further off than 0.25 m or 3°. Of the frames that the camera `captured`,
+    are TRACKING and further off than 0.25 m or 3°. `registration_m` is the share of a registration
+    by clicked points. Of the frames that the camera `captured`,
     `frames` would have been seen, had none been lost. `series` has for each localized frame: time
     since the flight's first frame (s), position in the world (m), both errors. Errors are of the
     unaligned poses; None where no frame was localized.
@@ -91,6 +93,7 @@ def measure(
         "tracking": len(tracking),
         "wrong": sum(not _right(error) for _, error in off),
         "first_s": (right[0] - start_ns) / 1e9 if right and preset != "thesis" else None,
+        "registration_m": _registration_m(map_, flight.truth),
         "landmarks": len(map_.landmarks),
         "keyframes": len(map_.keyframes),
         "stage_s": _stages(estimates),
@@ -133,6 +136,13 @@ def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Traject
     if not (near <= _SAME_S * 1e9).any():
         return None
     return ate.synchronize(estimate, truth, _SAME_S)
+
+
+def _registration_m(map_: Map, truth: Trajectory) -> float | None:
+    """RMS over the flight of what the map's registration alone displaces; None: registered by the
+    truth."""
+    off_m = displacement(map_, truth.position_m)
+    return None if off_m is None else float(np.sqrt(np.mean(np.square(off_m))))
 
 
 def _aligned_m(estimate: Trajectory, truth: Trajectory) -> float | None:

@@ -25,6 +25,8 @@ _OF_CASE = ("name", "title", "thesis", "worse")
 _OF_PRESET = {
     "failed": None,
     "localized": None,
+    "wrong": None,
+    "registration_m": ("mean", "std", "n"),
     "position_m": ("mean", "std", "n"),
     "rotation_deg": ("mean", "std", "n"),
     "consistency": ("inside_95",),

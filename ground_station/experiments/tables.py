@@ -11,6 +11,7 @@ from ground_station.presentation.text import columns
 NONE = "–"
 NAMES = {"thesis": "preset thesis", "alone": "each frame alone", "default": "default"}
 
+_LEAST_INSIDE = 0.9
 _ALL = 0.995
 """A share localized that is shown as 100 %."""
 
@@ -43,6 +44,7 @@ def _further(experiment: dict[str, Any]) -> list[list[str]]:
             ("on frames of thesis and default", _both("thesis")),
             ("alone and default", _both("alone")),
             ("smoothed", _spread("default", "smoothed_m", 100.0, " cm")),
+            ("registration's share", _registration),
             ("inside 95 %", inside),
             ("wrong TRACKING, frames", wrong),
             ("found at first after", _spread("default", "first_s", 1.0, " s")),
@@ -121,7 +123,37 @@ def verdict(document: dict[str, Any]) -> str:
         )
     alone = [f"{others} more rows have one preset only."] if others else []
     broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
-    return " ".join([said, *alone, *broken])
+    return " ".join([said, *alone, *_wrong(document), *_covariance(document), *broken])
+
+
+def _default(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """The default's figures by the name of their row."""
+    rows = [(f"{e['title']}, {c['title']}", c["presets"].get("default"))
+            for e in document["experiments"] for c in e["cases"]]  # fmt: skip
+    return [(name, row) for name, row in rows if row is not None]
+
+
+def _wrong(document: dict[str, Any]) -> list[str]:
+    """In how many frames of all runs the default was sure and far off."""
+    found = _default(document)
+    if not found or any("wrong" not in row for _, row in found):
+        return []  # of a run that did not count them
+    rows = [(name, row["wrong"]) for name, row in found if row["wrong"]]
+    where = "" if not rows else f": {'; '.join(f'{name}: {count}' for name, count in rows)}"
+    total = sum(count for _, count in rows)
+    return [f"TRACKING and further off than 0.25 m or 3° in {total} frames of all runs{where}."]
+
+
+def _covariance(document: dict[str, Any]) -> list[str]:
+    """The share of poses inside their 95 % ellipsoid, the worst rows first."""
+    rows = sorted((found["inside_95"], name) for name, row in _default(document)
+                  if (found := row["consistency"]) is not None)  # fmt: skip
+    if not rows:
+        return []
+    low = [(share, name) for share, name in rows if share < _LEAST_INSIDE]
+    worst = "; ".join(f"{name}: {100 * share:.0f} %" for share, name in low or rows[:1])
+    what = f"in {len(low)} of {len(rows)} rows less than 90 %" if low else "least"
+    return [f"Of the poses lie inside their 95 % ellipsoid {what}: {worst}."]
 
 
 def printed(case: dict[str, Any]) -> str:
@@ -145,7 +177,9 @@ def figures(case: dict[str, Any], preset: str) -> str:
     if position == NONE:
         return "no map" if case["presets"][preset]["failed"] else "no frame localized"
     rotation = _spread(preset, "rotation_deg", 1.0, "°")(case)
-    return f"{position}, {rotation}, {_localized(preset)(case)} localized"
+    share = _registration(case) if preset == "default" else NONE
+    of_it = "" if share == NONE else f" ({share} registration's)"
+    return f"{position}{of_it}, {rotation}, {_localized(preset)(case)} localized"
 
 
 def in_short(case: dict[str, Any], preset: str) -> str:
@@ -167,6 +201,9 @@ def _spread(preset: str, key: str, factor: float, unit: str) -> Cell:
         return f"{mean:.2f} ± {std:.2f}{unit}" if found["n"] > 1 else f"{mean:.2f}{unit}"
 
     return cell
+
+
+_registration = _spread("default", "registration_m", 100.0, " cm")
 
 
 def _localized(preset: str) -> Cell:

@@ -26,14 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--scene",
         default="atrium",
-        help="atrium, office, corridor, hall (repeating panels), rooms (a flat), atrium-moved"
-        " (other furniture), atrium-moved-posted (and other posters) (default: atrium)",
+        help="atrium, office, corridor, hall (repeating panels), rooms (a flat), interior-1 to"
+        " interior-999 (by chance: odd halls, even offices), atrium-moved (other furniture),"
+        " atrium-moved-posted (and other posters) (default: atrium)",
     )
     add(
         "--plan",
         default="loop",
-        help="mapping, loop (default), small-circle, fast, corridor; of a person's camera: stills"
-        " (12 places, 8 headings, a wide lens), headset (a walk through --scene rooms)",
+        help="mapping, loop (default), small-circle, fast, corridor, tour (of an interior); of a"
+        " person's camera: stills (12 places, 8 headings, a wide lens), headset (a walk through"
+        " --scene rooms), walk (round an interior with a phone)",
     )
     add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")

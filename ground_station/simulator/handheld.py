@@ -8,7 +8,7 @@ looks about: the head turns against the way, slower than it steps.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,8 +43,17 @@ WEARER = Runner(
 )  # fmt: skip
 """One who walks with a camera on the head: at 0.8 m/s it turns some 8 degrees in 0.2 s (mean)."""
 
+WALKER = replace(WEARER, look_deg=(6.0, 3.0), tremble_deg=0.15, tremble_m=0.002)
+"""One who walks with a phone held in both hands, to show the rooms."""
+
 HEAD = Mount(forward_m=0.1, up_m=0.05, tilt_down_deg=8.0)
 """A camera at the brow, that looks down a little as eyes do indoors."""
+
+BEARERS: dict[str, tuple[Runner, Mount]] = {
+    "runner": (Runner(), Mount(forward_m=0.3, up_m=0.0, tilt_down_deg=2.0)),
+    "wearer": (WEARER, HEAD),
+    "walker": (WALKER, Mount(forward_m=0.35, up_m=0.0, tilt_down_deg=0.0)),
+}
 
 _STILL_M, _STILL_DEG = (0.04, 0.04, 0.02), (2.0, 1.5, 1.0)
 """Deviations from where a picture was meant to be taken: x, y, z; yaw, pitch, roll."""
@@ -66,11 +75,10 @@ def carry(
     reference: Reference,
     duration_s: float,
     rng: np.random.Generator,
-    runner: Runner | None = None,
-    mount: Mount | None = None,
+    bearer: str = "runner",
 ) -> Motion:
-    """Carries the camera along a plan; shakes grow with the speed of the run."""
-    r = runner or Runner()
+    """Carries the camera along a plan as one of `BEARERS`; shakes grow with the speed."""
+    r, mount = BEARERS[bearer]
     count = int(np.ceil((duration_s + 2.0) / _STEP_S))
     times = np.arange(count) * _STEP_S - 1.0
     position, yaw = reference.at(np.maximum(times, 0))
@@ -93,8 +101,7 @@ def carry(
     angles[:, 0] += yaw
     if any(r.look_deg):
         angles[:, :2] += np.radians(r.look_deg) * _band_noise(count, 2, r.look_Hz, rng)
-    held = mount or Mount(forward_m=0.3, up_m=0.0, tilt_down_deg=2.0)
-    return Motion(times, moved, angles, held)
+    return Motion(times, moved, angles, mount)
 
 
 def hold(plan: Plan, times_s: F64, rng: np.random.Generator) -> Motion:

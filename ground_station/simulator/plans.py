@@ -37,6 +37,11 @@ HEADSET_CAMERA = Camera(
 )
 """A headset's camera, some 75 degrees wide, with a global shutter."""
 
+PHONE_CAMERA = Camera(
+    fx_px=560.0, fy_px=560.0, cx_px=318.6, cy_px=241.3, k1=0.06, k2=-0.1, readout_s=0.02
+)
+"""A phone's camera, some 60 degrees wide, with a rolling shutter."""
+
 GRID_M, PLACES, HEADINGS = (3.8, 1.8), (4, 3), 8
 """Spacing and number of the stills' places along x and y; headings at each, evenly around."""
 
@@ -48,8 +53,8 @@ _ROUNDING_M = 0.35  # deviation of what rounds the corners of a walk
 class Plan:
     """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp.
 
-    With `stands` it is not flown: pictures are taken at as many even steps of the one turn; with
-    `is_worn` the camera is on a head. `rate_hz` and `camera` are what it is filmed with unless
+    With `stands` it is not flown: pictures are taken at as many even steps of the one turn. By hand
+    `bearer` says who carries the camera. `rate_hz` and `camera` are what it is filmed with unless
     something else is asked for.
     """
 
@@ -59,7 +64,7 @@ class Plan:
     speed_m_s: float
     by_hand: bool
     default_duration_s: float
-    is_worn: bool = False
+    bearer: str = "runner"
     stands: int = 0
     rate_hz: float = 30.0
     camera: Camera = THESIS_CAMERA
@@ -115,10 +120,12 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
         "mapping": _mapping,
         "loop": _loop,
         "small-circle": _small_circle,
-        "fast": _fast,
+        "fast": partial(_fast, scene),
         "corridor": _corridor,
         "stills": _stills,
         "headset": partial(_headset, scene),
+        "walk": partial(_walk, scene),
+        "tour": partial(_tour, scene),
     }
     if name not in plans:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
@@ -174,14 +181,17 @@ def _small_circle(centre: tuple[float, float], shift: F64) -> Plan:
     return Plan("small-circle", shape, 1.0, 0.5, False, 40.0)
 
 
-def _fast(centre: tuple[float, float], shift: F64) -> Plan:
+def _fast(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
     """Run around the hall at 4 m/s, the camera in the hand: 4 m/s over 4.75 m is 48°/s."""
+    middle, (rx, ry) = (centre[0], centre[1] - 0.15), (4.75, 4.75)
+    if scene.ring_m is not None:
+        middle, (rx, ry) = (scene.size_m[0] / 2, scene.size_m[1] / 2), scene.ring_m
 
     def shape(s: F64) -> tuple[F64, F64]:
         angle = 2 * np.pi * s
         z = np.full_like(angle, 1.65 + 0.03 * shift[0])
         yaw = angle + np.pi / 2 + 0.25 * np.sin(3 * angle + shift[1]) + 0.15
-        return _ellipse(angle, (centre[0], centre[1] - 0.15), 4.75, 4.75, z), yaw
+        return _ellipse(angle, middle, rx, ry, z), yaw
 
     return Plan("fast", shape, 1.0, 4.0, True, 30.0)
 
@@ -254,5 +264,46 @@ def _headset(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
         z = np.full(len(place), _EYE_M + 0.06 * shift[2])
         return np.column_stack([place, z]), turning(np.asarray(s))
 
-    return Plan("headset", shape, 1.0, 0.8, True, 39.0, is_worn=True, rate_hz=5.0,
+    return Plan("headset", shape, 1.0, 0.8, True, 39.0, bearer="wearer", rate_hz=5.0,
                 camera=HEADSET_CAMERA)  # fmt: skip
+
+
+def _ring(scene: Scene, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The middle and half axes of a scene's free way; raises `SimulatorError` without one."""
+    if scene.ring_m is None:
+        raise SimulatorError(
+            f"plan '{name}' goes round a scene's free way; '{scene.name}' has none: "
+            "--scene interior-1"
+        )
+    return (scene.size_m[0] / 2, scene.size_m[1] / 2), scene.ring_m
+
+
+def _walk(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
+    """Twice round on foot with a phone: a lap that looks across, then one along the way."""
+    middle, (rx, ry) = _ring(scene, "walk")
+
+    def shape(s: F64) -> tuple[F64, F64]:
+        angle = 2 * np.pi * s
+        ahead = _smooth(s, 0.9, 1.1) - _smooth(s, 1.8, 2.0)
+        yaw = angle + np.pi - 0.5 * np.pi * ahead + 0.2 * np.sin(3 * angle + shift[0])
+        z = np.full_like(angle, _EYE_M + 0.05 * shift[1])
+        return _ellipse(angle, middle, rx, ry, z), yaw
+
+    length_m = 4 * np.pi * float(np.hypot(rx, ry)) / np.sqrt(2)
+    return Plan("walk", shape, 2.0, 0.6, True, round(length_m / 0.6), bearer="walker", rate_hz=2.0,
+                camera=PHONE_CAMERA)  # fmt: skip
+
+
+def _tour(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
+    """A blimp's round between 2 m and 7 m, as high as the ceiling lets it, looking half ahead."""
+    middle, (rx, ry) = _ring(scene, "tour")
+    low, high = 2.0, max(2.05, min(7.0, scene.size_m[2] - 0.9))
+
+    def shape(s: F64) -> tuple[F64, F64]:
+        angle = 2 * np.pi * s
+        share = 0.8 + 0.15 * shift[0] + 0.1 * np.sin(3 * angle + shift[1])
+        z = (low + high) / 2 + (high - low) / 2 * np.sin(2 * angle + 3 * shift[2])
+        yaw = angle + 0.75 * np.pi + 0.5 * np.sin(2 * angle + 3 * shift[3])
+        return _ellipse(angle, middle, share * rx, share * ry, z), yaw
+
+    return Plan("tour", shape, 1.0, 0.6, False, 40.0)

@@ -52,6 +52,8 @@ class Scene:
     texture_seed: int
     walks: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Closed ways on foot by their corners (x, y), metres, through the middles of doorways."""
+    ring_m: tuple[float, float] | None = None
+    """Half axes, along x and y, of an ellipse about the middle that is kept free of things."""
     centre_m: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
 
     def __post_init__(self) -> None:

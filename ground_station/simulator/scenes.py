@@ -8,6 +8,7 @@ from functools import partial
 from ground_station.simulator.atrium import build_atrium
 from ground_station.simulator.corridor import build_corridor
 from ground_station.simulator.hall import build_hall
+from ground_station.simulator.interiors import build_interior
 from ground_station.simulator.office import build_office
 from ground_station.simulator.rooms import build_rooms
 from ground_station.simulator.scene import Scene, SimulatorError
@@ -21,17 +22,23 @@ _SCENES: dict[str, Callable[[float], Scene]] = {
     "atrium-moved": partial(build_atrium, moved=True),
     "atrium-moved-posted": partial(build_atrium, moved=True, posted=True),
 }
+_INTERIOR, _DIGITS = "interior-", 3
 
 
 def names() -> tuple[str, ...]:
-    """The scenes that can be asked for."""
+    """The scenes that have a name; interiors have a number."""
     return tuple(_SCENES)
 
 
 def build(name: str, texels_per_m: float) -> Scene:
     """The scene of that name; raises `SimulatorError` naming those there are."""
-    if name not in _SCENES:
-        raise SimulatorError(f"scene '{name}' is unknown; there are: {', '.join(_SCENES)}")
+    number = name.removeprefix(_INTERIOR)
+    is_interior = name != number and number.isdecimal() and len(number) <= _DIGITS
+    if name not in _SCENES and not is_interior:
+        known = ", ".join([*_SCENES, f"{_INTERIOR}N"])
+        raise SimulatorError(f"scene '{name}' is unknown; there are: {known}")
     if not 5 <= texels_per_m <= 400:
         raise SimulatorError(f"{texels_per_m} texels per metre; allowed: 5 to 400")
+    if is_interior:
+        return build_interior(int(number), texels_per_m)
     return _SCENES[name](texels_per_m)

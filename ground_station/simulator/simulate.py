@@ -174,8 +174,7 @@ def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
             motion = handheld.hold(plan, times_s, air)
         else:
             reference = Reference(plan, phase, _RUN_UP_S)
-            worn = (handheld.WEARER, handheld.HEAD) if plan.is_worn else (None, None)
-            motion = handheld.carry(reference, duration, air, *worn)
+            motion = handheld.carry(reference, duration, air, plan.bearer)
     else:
         blimp = dynamics.Blimp.of_build(settings.build) if settings.build else dynamics.Blimp()
         if settings.draught_m_s is not None:

@@ -310,6 +310,69 @@ def poster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     return (image * shade[..., None]).astype(np.float32)
 
 
+def carpet(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """Loops of wool, worn where people walk, with lanes of another shade."""
+    shade = _grime(b, rows, columns, rng, 0.15) + 0.12 * b.window(b.fine, rows, columns, rng)
+    lane = max(2, round(0.5 * scale))
+    shade *= np.where((np.arange(columns) // lane) % 2, 0.9, 1.05).astype(np.float32)
+    return _paint(shade, o.get("rgb", (0.20, 0.21, 0.24)))
+
+
+def tiles(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """Glazed tiles of 200 mm, all but equal, with light joints."""
+    step = 0.2 * scale
+    shade = np.ones((rows, columns), np.float32)
+    for y in range(int(rows / step) + 1):
+        for x in range(int(columns / step) + 1):
+            shade[round(y * step) : round((y + 1) * step),
+                  round(x * step) : round((x + 1) * step)] = rng.normal(1.0, 0.025)  # fmt: skip
+    _joints(shade, (step, step), max(1, round(0.006 * scale)), 1.3)
+    shade *= 1 + 0.05 * b.window(b.coarse[0], rows, columns, rng)
+    return _paint(shade, o.get("rgb", (0.60, 0.62, 0.62)))
+
+
+def wallpaper(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """One motif every 530 mm, a roll's width: nothing but dirt tells one repeat from the next."""
+    side = max(4, round(0.53 * scale))
+    motif = b.window(b.leaves, side, side, np.random.default_rng(int(rng.integers(2))))
+    repeat = np.tile(motif, (rows // side + 1, columns // side + 1))[:rows, :columns]
+    shade = (0.8 + 0.4 * repeat) * _grime(b, rows, columns, rng, 0.05)
+    return _paint(shade, o.get("rgb", (0.55, 0.50, 0.44)))
+
+
+def laminate(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """A smooth sheet, nearly blank, with a seam every 1.2 m."""
+    shade = 1 + 0.03 * b.window(b.coarse[1], rows, columns, rng)
+    shade += 0.015 * b.window(b.fine, rows, columns, rng)
+    _joints(shade, (1.2 * scale, 2.4 * scale), max(1, round(0.004 * scale)), 0.7)
+    return _paint(shade, o.get("rgb", (0.66, 0.66, 0.64)))
+
+
+def panelling(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """Acoustic boards of 600 mm, perforated in a regular grid."""
+    shade = _grime(b, rows, columns, rng, 0.08)
+    pitch, radius = 0.05 * scale, max(1, round(0.008 * scale))
+    for y in np.arange(pitch / 2, rows, pitch):
+        for x in np.arange(pitch / 2, columns, pitch):
+            cv2.circle(shade, (round(float(x)), round(float(y))), radius, 0.45, -1, cv2.LINE_AA)
+    _joints(shade, (0.6 * scale, 0.6 * scale), max(1, round(0.008 * scale)), 0.6)
+    return _paint(shade, o.get("rgb", (0.58, 0.56, 0.52)))
+
+
+def screen(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """A monitor that shows windows and lines of text, in a black rim."""
+    image = np.full((rows, columns, 3), 0.03, np.float32)
+    rim = max(1, round(0.02 * scale))
+    image[rim:-rim, rim:-rim] = rng.uniform(0.1, 0.9, 3)
+    for _ in range(4):
+        x, y = int(rng.uniform(0.05, 0.5) * columns), int(rng.uniform(0.05, 0.5) * rows)
+        w, h = int(rng.uniform(0.2, 0.45) * columns), int(rng.uniform(0.2, 0.45) * rows)
+        image[y : y + h, x : x + w] = rng.uniform(0.6, 0.95)
+        for line in range(y + 3, y + h - 2, max(3, round(0.02 * scale))):
+            image[line : line + 1, x + 2 : x + 2 + int(rng.uniform(0.3, 0.95) * w)] = 0.08
+    return image
+
+
 Material = Callable[..., F32]
 MATERIALS: dict[str, Material] = {
     "plaster": plaster,
@@ -323,4 +386,10 @@ MATERIALS: dict[str, Material] = {
     "sky": sky,
     "door": frame,
     "poster": poster,
+    "carpet": carpet,
+    "tiles": tiles,
+    "wallpaper": wallpaper,
+    "laminate": laminate,
+    "panelling": panelling,
+    "screen": screen,
 }

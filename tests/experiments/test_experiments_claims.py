@@ -70,6 +70,25 @@ def test_a_claim_of_every_seed_falls_with_the_worst(tmp_path):
     assert worst["kept"] is False and worst["value"] == pytest.approx(0.07)
 
 
+@pytest.mark.parametrize(
+    ("claim", "kept", "value"),
+    [
+        ('statistic = "median"\nmost = 0.03', True, 0.03),
+        ('statistic = "median"\nmost = 0.02', False, 0.03),
+        ('statistic = "p95"\nmost = 0.06', False, 0.064),
+        ('statistic = "max"\nmost = 0.07', True, 0.07),
+    ],
+)
+def test_a_claim_of_an_experiment_is_of_all_its_runs(tmp_path, claim, kept, value):
+    noon = [kept_runs.run([error] * 4) for error in (0.01, 0.07)]
+    claim = claim.replace("statistic", '[claim.all]\ntext = "All"\nrow = "light"\nstatistic')
+    found = document(tmp_path, f"{POSITION}\n{claim}", [kept_runs.run(SUNSET)] * 2, noon)
+    one = found["claims"][1]
+    assert one["kept"] is kept and one["value"] == pytest.approx(value)
+    found = document(tmp_path, f"{POSITION}\n{claim}", [kept_runs.run(SUNSET), {"failed": "no"}])
+    assert found["claims"][1]["kept"] is None
+
+
 def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
     claim = 'figure = "recovery_s"\nmost = 1.0'
     found = {"recovery_s": 0.4}
@@ -99,7 +118,7 @@ def test_claims_of_experiments_that_are_not_wanted_are_left_out():
     ("text", "words"),
     [
         ('row = "light.dawn"', "'row' names 'light.dawn', and there is no such row"),
-        ('row = "light"', "'row' names 'light', and there is no such row"),
+        ('row = "dark"', "'row' names 'dark', and there is no such row"),
         ("", "'row' names '', and there is no such row"),
         ('row = "light.noon"\nagainst = "a.b"', "'against' names 'a.b', and there is no such row"),
         ('row = "light.noon"\nfigure = "price"', "price"),
@@ -117,3 +136,23 @@ def test_a_claim_of_nothing_is_refused_by_name(tmp_path, text, words):
     path.write_text("claim.c = 3\n[experiment.light.case.noon]\n")
     with pytest.raises(ConfigError, match="claim 'c' must be a table"):
         declaration.load(path)
+
+
+def test_the_verdict_counts_wrong_tracking_and_names_the_worst_covariance(tmp_path):
+    sunset = kept_runs.run([0.01, 0.3, 0.5, 0.01])
+    low = {"consistency": {"nees": 9.0, "inside_95": 0.46}}
+    noon = [kept_runs.run(NOON) | low] * 2
+    said = tables.verdict(document(tmp_path, POSITION, [sunset] * 2, noon))
+    assert "further off than 0.25 m or 3° in 4 frames of all runs: light, sunset: 4." in said
+    assert "95 % ellipsoid in 1 of 2 rows less than 90 %: light, noon: 46 %." in said
+    said = tables.verdict(document(tmp_path, POSITION, [kept_runs.run(SUNSET)] * 2))
+    assert "in 0 frames of all runs." in said
+    assert "95 % ellipsoid least: light, noon: 95 %." in said
+
+
+def test_a_registrations_share_stands_beside_the_error(tmp_path):
+    runs = [kept_runs.run(SUNSET) | {"registration_m": 0.012}] * 2
+    noon, sunset = document(tmp_path, POSITION, runs)["experiments"][0]["cases"]
+    assert "3.00 ± 0.00 cm (1.20 ± 0.00 cm registration's)" in tables.figures(sunset, "default")
+    assert "registration" not in tables.figures(noon, "default")
+    assert "registration" not in tables.figures(sunset, "thesis")

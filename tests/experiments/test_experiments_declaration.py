@@ -76,7 +76,7 @@ def test_the_shipped_file_holds_every_experiment_of_the_thesis():
     assert {case.map.flight.light for case in by_name["illumination"].cases} == {"noon"}
     assert [case.map.images for case in by_name["viewpoint"].cases] == [126, 513]
     models = [case.localizer["motion"]["model"] for case in by_name["motion"].cases]
-    assert models == ["static", "constant_velocity"] * 2
+    assert models == ["static", "constant_velocity", "blimp"] * 2
     kitchen = by_name["redkitchen"].cases[0]
     assert not kitchen.flight.simulated and not kitchen.map.flight.simulated
     assert kitchen.map.flight.range == "0:500:5" and kitchen.flight.range == "500:1000"

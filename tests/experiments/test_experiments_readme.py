@@ -12,8 +12,14 @@ from ground_station.experiments import declaration, readme, summary
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
 
-NEWER = {"hallway"}
-"""Shipped, and newer than the accepted run; the next one empties this."""
+NEWER = {
+    "pillars.panels", "descriptor.lark", "motion.sparse-blimp", "motion.dense-blimp",
+    "covisibility.off", "covisibility.on", "redkitchen.lark", "hallway.rootsift", "hallway.wren",
+    "hallway.lark", "buildings.hall-1", "buildings.office-1", "buildings.hall-2",
+    "buildings.office-2", "buildings.hall-3", "buildings-fast.hall-1", "buildings-fast.hall-2",
+    "buildings-fast.hall-3",
+}  # fmt: skip
+"""Rows that are shipped, and newer than the accepted run; the next one empties this."""
 ACCEPTED = declaration.SHIPPED.with_name(readme.NAME)
 
 
@@ -89,7 +95,7 @@ def test_readme_shows_the_accepted_run_of_the_shipped_experiments_or_none():
     assert shown == readme.render(accepted)
     declared = declaration.load()
     assert accepted["seeds"] == list(declared.seeds)
-    names = [(e["name"], [c["name"] for c in e["cases"]]) for e in accepted["experiments"]]
-    flown = [e for e in declared.experiments if e.name not in NEWER]
-    assert names == [(e.name, [c.name for c in e.cases]) for e in flown]
-    assert not NEWER & {e["name"] for e in accepted["experiments"]}
+    names = [f"{e['name']}.{c['name']}" for e in accepted["experiments"] for c in e["cases"]]
+    shipped = [f"{e.name}.{c.name}" for e in declared.experiments for c in e.cases]
+    assert names == [name for name in shipped if name not in NEWER]
+    assert set(shipped) >= NEWER

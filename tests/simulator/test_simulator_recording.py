@@ -185,13 +185,13 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
         (
             {"plan": "zigzag"},
             "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor, "
-            "stills, headset",
+            "stills, headset, walk, tour",
         ),
         ({"light": "moon"}, "light 'moon' is unknown; there are: noon, cloudy, evening, sunset"),
         (
             {"scene": "cave"},
             "scene 'cave' is unknown; there are: atrium, office, corridor, hall, rooms, "
-            "atrium-moved, atrium-moved-posted",
+            "atrium-moved, atrium-moved-posted, interior-N",
         ),
         ({"rate_hz": 0.0}, "rate_hz is 0.0; allowed: 0.1 to 120"),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
