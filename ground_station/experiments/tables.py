@@ -152,8 +152,10 @@ def _covariance(document: dict[str, Any]) -> list[str]:
         return []
     low = [(share, name) for share, name in rows if share < _LEAST_INSIDE]
     worst = "; ".join(f"{name}: {100 * share:.0f} %" for share, name in low or rows[:1])
-    what = f"in {len(low)} of {len(rows)} rows less than 90 %" if low else "least"
-    return [f"Of the poses lie inside their 95 % ellipsoid {what}: {worst}."]
+    rest = "of the poses lie inside their 95 % ellipsoid"
+    if not low:
+        return [f"In every row 90 % and more {rest} (least in {worst})."]
+    return [f"In {len(low)} of {len(rows)} rows less than 90 % {rest}: {worst}."]
 
 
 def printed(case: dict[str, Any]) -> str:

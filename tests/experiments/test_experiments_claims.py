@@ -144,10 +144,13 @@ def test_the_verdict_counts_wrong_tracking_and_names_the_worst_covariance(tmp_pa
     noon = [kept_runs.run(NOON) | low] * 2
     said = tables.verdict(document(tmp_path, POSITION, [sunset] * 2, noon))
     assert "further off than 0.25 m or 3° in 4 frames of all runs: light, sunset: 4." in said
-    assert "95 % ellipsoid in 1 of 2 rows less than 90 %: light, noon: 46 %." in said
+    assert (
+        "In 1 of 2 rows less than 90 % of the poses lie inside their 95 % ellipsoid: light" in said
+    )
+    assert "light, noon: 46 %." in said
     said = tables.verdict(document(tmp_path, POSITION, [kept_runs.run(SUNSET)] * 2))
     assert "in 0 frames of all runs." in said
-    assert "95 % ellipsoid least: light, noon: 95 %." in said
+    assert "every row 90 % and more of the poses lie inside their 95 % ellipsoid (least in" in said
 
 
 def test_a_registrations_share_stands_beside_the_error(tmp_path):
