@@ -122,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
             _say(said)
     extractor = extractor_for(map_.info, settings.features)
     localizer = Localizer(map_, camera, extractor, settings, smoothing=bool(args.smoothed))
+    if localizer.camera != camera:
+        _say("the map's pictures denied this camera's lens: the one that they found is used")
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     start_s = monotonic()

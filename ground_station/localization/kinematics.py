@@ -59,7 +59,9 @@ class Solution:
     the solution: minus log-likelihood is ½ δᵀ·information·δ + gradientᵀ·δ for a tangent step δ of
     pose and twist. `innovation` is the squared Mahalanobis distance of the solution from the
     prediction by the prediction's covariance (12 degrees of freedom). `residual_px` (N,) and
-    `inlier` (N,) belong to the observations given; `reason` says why there is no state."""
+    `inlier` (N,) belong to the observations given; `reason` says why there is no state.
+    `pose_by_focal` (6,) is by how much the pose (right tangent) that the observations alone say
+    follows the share by which the focal length is longer; None by solvers that do not tell."""
 
     state: Kinematics | None
     information: F64
@@ -69,6 +71,7 @@ class Solution:
     innovation: float = float("nan")
     iterations: int = 0
     reason: str = ""
+    pose_by_focal: F64 | None = None
 
 
 def no_solution(count: int, reason: str, iterations: int = 0) -> Solution:

@@ -71,7 +71,8 @@ class Linear:
     (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
     image (uu, uv, vv), and `reach` (2, 3, N) what moves them: their covariance by each coordinate.
     `rows` (2, 3, N) are ∂pixel/∂landmark once these are moved along. `excess` (N,) is the variance,
-    px², that reweighting adds beyond Huber's reach.
+    px², that reweighting adds beyond Huber's reach. `by_focal` (D,) is the steps' mixed second
+    derivative with the share by which the focal length is longer.
     """
 
     information: F64
@@ -82,6 +83,7 @@ class Linear:
     reach: F64
     rows: F64 | None
     excess: F64
+    by_focal: F64
 
 
 @dataclass(frozen=True)
@@ -181,11 +183,15 @@ class Reprojection:
         J[:, 0] += factor[1] * J[:, 1]
         J[:, 1] *= factor[2]
         flat = J.reshape(len(J), -1)
+        # A longer focal length puts an observation nearer to the middle, by its distance.
+        off = self.offset_px
+        longer = np.concatenate([factor[0] * off[0] + factor[1] * off[1], factor[2] * off[1]])
         best = reach[0] * y[0]
         best += reach[1] * y[1]
         return Linear(
-            flat @ flat.T, gradient, cost, -best, spread, reach, rows if move else None, excess
-        )
+            flat @ flat.T, gradient, cost, -best, spread, reach, rows if move else None, excess,
+            flat @ longer,
+        )  # fmt: skip
 
     def _whiten(self, r: F64, spread: F64, excess: F64 | None, sharp: bool) -> tuple[F64, F64, F64]:
         """y (2, N) of the module's text, (t − 1)·sigma² (N,), and L's uu, vu, vv (3, N).

@@ -16,7 +16,14 @@ from ground_station.localization.kinematics import (
     Solution,
     no_solution,
 )
-from ground_station.localization.pose_newton import Prior, Reprojection, View, descend, solve2
+from ground_station.localization.pose_newton import (
+    Linear,
+    Prior,
+    Reprojection,
+    View,
+    descend,
+    solve2,
+)
 from ground_station.localization.settings import PoseSettings
 
 _WIDENING = 9.0
@@ -107,6 +114,7 @@ def solve_rolling(
         inlier,
         float(apart @ prior.information @ apart),
         iterations,
+        pose_by_focal=_pose_by_focal(linear, prior),
     )
 
 
@@ -158,6 +166,21 @@ def _inverse(information: F64) -> F64 | None:
     except np.linalg.LinAlgError:
         return None
     return 0.5 * (result + result.T) if np.isfinite(result).all() else None
+
+
+def _pose_by_focal(linear: Linear, prior: Prior) -> F64 | None:
+    """How the observations' own pose (6,) follows the focal length; None where they leave it open.
+
+    The twist is held by the prediction: of a global shutter no frame tells it.
+    """
+    free = linear.information.copy()
+    free[6:, 6:] += prior.information[6:, 6:]
+    scale = 1.0 / np.sqrt(np.diag(free))
+    try:
+        follows = scale * np.linalg.solve(free * scale * scale[:, None], scale * linear.by_focal)
+    except np.linalg.LinAlgError:
+        return None
+    return -follows[:6] if np.isfinite(follows).all() else None
 
 
 def _scale(inliers: Reprojection, residual_px: F64, spread_px2: F64) -> float:

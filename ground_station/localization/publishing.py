@@ -15,18 +15,27 @@ from ground_station.localization.settings import CovarianceSettings
 from ground_station.map.accuracy import Accuracy
 
 
-def covariance_in_map(covariance: F64, information: F64, settings: CovarianceSettings) -> F64:
+def covariance_in_map(
+    covariance: F64, solution: Solution, settings: CovarianceSettings, focal_sigma: float
+) -> F64:
     """The pose's covariance (6, 6) in the map: scaled, and with what frames share added.
 
     A filter takes the errors of two frames for independent; the errors of the landmarks they both
     see are not. Those move the pose as the observations of one frame alone would: by the inverse of
-    their `information` (12, 12) about the pose, with a share that was calibrated against truth."""
+    their information about the pose, with a share that was calibrated against truth.
+
+    Nor does a filter know of a focal length that is off by a share of `focal_sigma`: the pose
+    follows it as the `solution` says (considered, not estimated: Schmidt 1966)."""
     published = settings.scale**2 * covariance[:6, :6]
     if settings.shared > 0:
         try:
-            published = published + settings.shared**2 * np.linalg.inv(information[:6, :6])
+            published = published + settings.shared**2 * np.linalg.inv(solution.information[:6, :6])
         except np.linalg.LinAlgError:
             return np.full((6, 6), np.inf)
+    if focal_sigma > 0 and solution.pose_by_focal is not None:
+        published = published + focal_sigma**2 * np.outer(
+            solution.pose_by_focal, solution.pose_by_focal
+        )
     return np.asarray(published)
 
 

@@ -162,6 +162,7 @@ class CovarianceSettings:
     scale: float = config.key(1.0, low=0.01, high=100)
     shared: float = config.key(0.0, low=0, high=10)
     map: float = config.key(0.0, low=0, high=10)
+    focal: float = config.key(0.0, low=0, high=0.1)
 
 
 @dataclass(frozen=True)

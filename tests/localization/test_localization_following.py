@@ -307,13 +307,19 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
 def test_what_frames_share_is_added_to_what_is_published():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(12, 12))
-    covariance, information = A @ A.T, np.diag(np.arange(1.0, 13.0))
-    plain = covariance_in_map(covariance, information, CovarianceSettings())
+    covariance, moves = A @ A.T, np.arange(6.0)
+    told = dataclasses.replace(
+        no_solution(0, ""), information=np.diag(np.arange(1.0, 13.0)), pose_by_focal=moves
+    )
+    plain = covariance_in_map(covariance, told, CovarianceSettings(), 0.0)
     assert np.array_equal(plain, covariance[:6, :6])
-    more = covariance_in_map(covariance, information, CovarianceSettings(scale=2.0, shared=0.5))
+    more = covariance_in_map(covariance, told, CovarianceSettings(scale=2.0, shared=0.5), 0.0)
     assert np.allclose(more, 4 * plain + 0.25 * np.diag(1 / np.arange(1.0, 7.0)))
-    singular = covariance_in_map(covariance, np.zeros((12, 12)), CovarianceSettings(shared=0.5))
-    assert np.isinf(singular).all()
+    lens = covariance_in_map(covariance, told, CovarianceSettings(), 0.1)
+    assert np.allclose(lens, plain + 0.01 * np.outer(moves, moves))
+    nothing = no_solution(0, "")
+    assert np.isinf(covariance_in_map(covariance, nothing, CovarianceSettings(shared=0.5), 0)).all()
+    assert np.array_equal(covariance_in_map(covariance, nothing, CovarianceSettings(), 0.1), plain)
 
 
 def test_the_maps_own_errors_are_added_by_their_share():

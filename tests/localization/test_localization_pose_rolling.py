@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import L, X
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA as CAMERA
 from ground_station.localization import pose_rolling
-from ground_station.localization.kinematics import Kinematics, LandmarkObservations
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_newton import Prior, Reprojection
 from ground_station.localization.pose_rolling import solve_rolling
@@ -368,3 +368,24 @@ def test_no_cycle_where_half_of_few_observations_are_wrong():
         )
         solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
         assert "converged" not in solution.reason, seed
+
+
+def test_it_says_how_the_pose_follows_the_focal_length():
+    rng = np.random.default_rng(5)
+    predicted, seen, _ = _scene(rng, noise_px=0.3)
+    loose = np.r_[np.full(6, 1e4), np.ones(6)]  # of the pose the observations alone shall say
+    predicted = dataclasses.replace(predicted, covariance=predicted.covariance * np.diag(loose))
+    centre, share = np.array([CAMERA.cx_px, CAMERA.cy_px]), 1e-3
+
+    def solved(by: float) -> Solution:
+        longer = centre + (seen.pinhole_px - centre) / (1 + by)
+        observations = dataclasses.replace(seen, pinhole_px=longer)
+        found = solve_rolling(predicted, observations, CAMERA, SETTINGS)
+        assert found.state is not None
+        return found
+
+    a, b, middle = solved(-share), solved(share), solved(0.0)
+    assert a.state is not None and b.state is not None and middle.pose_by_focal is not None
+    moved = poses.log(poses.inverse(a.state.wTc) @ b.state.wTc) / (2 * share)
+    assert np.linalg.norm(moved[3:]) > 1  # metres for the whole of a focal length
+    assert np.allclose(middle.pose_by_focal, moved, atol=0.05 * np.abs(moved).max())
