@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Flies, maps, localizes, reports; 1 where the default is not better, or a claim not kept.
+    """Flies, maps, localizes, reports; 1 where the default is worse, or a claim not kept.
 
     Raises `BlimpError` for what a person can fix. Real video that is not there is left out with
     a line, unless it was asked for by name.

@@ -24,6 +24,8 @@ RIVALS = {"thesis": "the thesis's method", "alone": "each frame alone"}
 """What the default is held against, and how it is called in a sentence."""
 _SHARE = 0.005
 """A smaller share localized by more than this is worse."""
+AS_GOOD = 0.02
+"""An error that is larger by no more than this share is as good: one registration moves both."""
 
 
 def summarise(
@@ -173,7 +175,7 @@ def _shares(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str,
 
 
 def worse(presets: dict[str, Any], common: dict[str, Any]) -> list[str]:
-    """In what the default is not better than each rival, in words; empty: in nothing."""
+    """In what the default is worse than each rival, in words; empty: in nothing."""
     rivals = {name: presets[name] for name in RIVALS if name in presets}
     ours = presets.get("default")
     if ours is None or not rivals:
@@ -198,7 +200,7 @@ def worse(presets: dict[str, Any], common: dict[str, Any]) -> list[str]:
             a, b = pair["ours"], pair["theirs"]
             if a is None or b is None:
                 a, b = ours.get(key), theirs.get(key)
-            if b is not None and (a is None or not a["mean"] < b["mean"]):
+            if b is not None and (a is None or not a["mean"] <= (1 + AS_GOOD) * b["mean"]):
                 told = "none" if a is None else f"{factor * a['mean']:.3f}{unit}"
                 what = key.split("_")[0]
                 reasons.append(f"{what} error {told}, {said} {factor * b['mean']:.3f}{unit}")

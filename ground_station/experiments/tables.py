@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ground_station.experiments import claims
+from ground_station.experiments.summary import AS_GOOD
 from ground_station.presentation.text import columns
 
 NONE = "–"
@@ -113,13 +114,14 @@ def verdict(document: dict[str, Any]) -> str:
         said = "Nothing was compared."
     elif not not_better:
         said = (
-            f"In all {len(compared)} rows the default is better than {rivals} in position "
-            "and rotation, and localizes no smaller share of the frames."
+            f"In all {len(compared)} rows the default is better than {rivals} or as good (within "
+            f"{100 * AS_GOOD:g} %) in position and rotation, and localizes no smaller share of the "
+            "frames."
         )
     else:
         said = (
-            f"In {len(not_better)} of {len(compared)} rows the default is not better than "
-            f"{rivals}: {'; '.join(document['worse'])}."
+            f"In {len(not_better)} of {len(compared)} rows the default is worse than {rivals} (by "
+            f"more than {100 * AS_GOOD:g} %): {'; '.join(document['worse'])}."
         )
     alone = [f"{others} more rows have one preset only."] if others else []
     broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
