@@ -17,7 +17,7 @@ from ground_station.experiments.tables import NAMES
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import Theme, sheet, themed
 
-_MOST_PATHS = 4
+_MOST_PATHS = 6
 _LEAST_M, _MOST_M = 0.002, 0.5
 """Ends of the error's colours, which are logarithmic: a run's errors span two powers of ten."""
 _MARKS_M = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
