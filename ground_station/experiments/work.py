@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
+import threading
 from pathlib import Path
 
 from ground_station.errors import MapError
@@ -13,12 +15,22 @@ from ground_station.experiments.store import Store
 
 
 def prepare() -> None:
-    """Makes a process a worker: one thread, and Ctrl-C is the schedule's to see to."""
+    """Makes a process a worker: one thread, Ctrl-C is the schedule's to see to, and none outlives
+    it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     import cv2
 
     cv2.setNumThreads(1)
+
+
+def _end_with_parent() -> None:
+    """A pool that is killed leaves its workers waiting for jobs, each with a map in memory."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def work(job: Job, folder: Path, data: Path) -> None:

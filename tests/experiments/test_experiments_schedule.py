@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -16,6 +17,7 @@ from ground_station.experiments.schedule import carry_out
 from ground_station.experiments.store import Store
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.settings import MappingSettings
+from tests.waiting import eventually
 
 
 def a_plan(runs=3):
@@ -150,3 +152,36 @@ def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):
     finally:
         signal.signal(signal.SIGINT, before)
     assert done(tmp_path) == ["f", "m"]
+
+
+def linger(job, folder: Path, data: Path) -> None:
+    """Says its process and never ends."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "pid.part").write_text(str(os.getpid()))
+    (folder / "pid.part").replace(folder / "pid")
+    time.sleep(600)
+
+
+def flown_by_a_process(folder: Path) -> None:
+    carry_out(a_plan(), Store(folder), folder, 1, linger)
+
+
+def test_a_worker_does_not_outlive_a_schedule_that_is_killed(tmp_path):
+    schedule = multiprocessing.get_context("spawn").Process(
+        target=flown_by_a_process, args=(tmp_path,)
+    )
+    schedule.start()
+    eventually((tmp_path / "pid").is_file, what="the worker")
+    worker = int((tmp_path / "pid").read_text())
+    assert Path(f"/proc/{worker}").exists()
+    schedule.kill()
+    schedule.join()
+
+    def gone() -> bool:
+        try:
+            stat = Path(f"/proc/{worker}/stat").read_text()
+        except OSError:
+            return True
+        return stat.rpartition(")")[2].split()[0] == "Z"
+
+    eventually(gone, what="its end")
