@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import CAMERA, FakeExtractor, Room
 
 from ground_station.experiments.alter import scaled_camera
 from ground_station.geometry import poses
@@ -16,6 +15,7 @@ from ground_station.localization.lens import against_map
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
 from ground_station.map.store import MapInfo
+from tests.localization.conftest import CAMERA, FakeExtractor, Room
 
 NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
