@@ -14,7 +14,7 @@ ROOMS = {
     "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
             "geometry", "recording"),
     "run": ("experiments/measure.py", "experiments/alone.py", "experiments/alter.py",
-            "experiments/material.py",
+            "experiments/maps.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
             "map/accuracy.py", "map/uncertainty.py", "experiments/thinning.py",
             "features", "geometry", "recording"),

@@ -37,7 +37,10 @@ class Store:
     def done(self, job: Job) -> bool:
         """Whether a job's result is there, a lasting failure included."""
         if isinstance(job, FlightJob):
-            return self.flight(job.name).is_file()
+            from ground_station.experiments.flights import points_of
+
+            path = self.flight(job.name)
+            return path.is_file() and (not job.flight.clicked or points_of(path).is_file())
         if isinstance(job, MapJob) and (self.map(job.key) / "map.toml").is_file():
             return True
         return self.read(job.key) is not None

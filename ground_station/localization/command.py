@@ -124,6 +124,7 @@ def run(args: argparse.Namespace) -> int:
     localizer = Localizer(map_, camera, extractor, settings, smoothing=bool(args.smoothed))
     if localizer.camera != camera:
         _say("the map's pictures denied this camera's lens: the one that they found is used")
+        camera = localizer.camera
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     start_s = monotonic()

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from ground_station.experiments import declaration, maps, quick
+from ground_station.experiments.declaration import FlightDeclaration
+from ground_station.experiments.plan import FlightJob
+from ground_station.experiments.store import Store
 from ground_station.files import write_json
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
@@ -44,6 +47,17 @@ def test_a_building_is_mapped_on_foot_and_registered_by_clicks_of_its_own() -> N
     short = {e.name: e.cases for e in quick.shortened(declared).experiments}
     assert len(short["buildings"]) == 1 and short["buildings"][0].map == of["buildings"][0].map
     assert short["fast"][0].map.images == quick.IMAGES
+
+
+def test_a_walk_that_was_cut_before_its_points_were_written_is_walked_again(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    walk = FlightJob("w", "walk.mcap", FlightDeclaration(clicked=6), 1)
+    store.flight("walk.mcap").parent.mkdir()
+    store.flight("walk.mcap").touch()
+    assert not store.done(walk)
+    assert store.done(replace(walk, flight=FlightDeclaration()))
+    store.flight("walk.csv").touch()
+    assert store.done(walk)
 
 
 def known(count: int = 12) -> PointObservations:

@@ -43,6 +43,15 @@ def test_a_lens_that_the_maps_pictures_denied_is_put_right() -> None:
         assert against_map(info, other) == (other, False)
 
 
+def test_the_localizer_sees_by_the_lens_that_was_found(
+    room: Room, extractor: FakeExtractor
+) -> None:
+    given = longer(CAMERA, 0.05)
+    denied = replace(room.map, info=replace(room.map.info, built=map_info("found", given).built))
+    assert Localizer(denied, given, extractor, load_preset("default")).camera == CAMERA
+    assert Localizer(room.map, given, extractor, load_preset("default")).camera == given
+
+
 def test_the_maps_own_lens_is_known_at_any_size() -> None:
     info = map_info("given", CAMERA)
     for flight in (CAMERA, replace(CAMERA, readout_s=0.01), scaled_camera(CAMERA, 0.5)):

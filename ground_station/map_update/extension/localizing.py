@@ -66,6 +66,7 @@ def localize(
     _check_size(path, (camera.width_px, camera.height_px), map_)
     extractor = extractor_for(map_.info, settings.features)
     localizer = Localizer(map_, camera, extractor, settings)
+    camera = localizer.camera  # the map's, where its pictures denied this one
     estimates: list[PoseEstimate] = []
     try:
         with Progress(f"localizing {path.name}, frames", source.count()) as progress:
