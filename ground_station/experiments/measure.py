@@ -27,8 +27,8 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
 
-_ALONE_EVERY = 3
-"""Without motion or time every third frame of a simulated flight says what all would, and each
+_ALONE_EVERY = 5
+"""Without motion or time every fifth frame of a simulated flight says what all would, and each
 takes a quarter of a second."""
 _SAME_S = 0.005
 """A frame is judged by a true pose within this time of its own."""

@@ -16,7 +16,7 @@ from ground_station.experiments.store import Store
 
 CONDITIONS = (
     "Simulated flights, seeds {}, unless real video is named; all localize the same frames (alone "
-    "every third of a simulated flight, which says as much), and only the preset thesis is told "
+    "every fifth of a simulated flight, which says as much), and only the preset thesis is told "
     "where it starts; errors are unaligned RMSE over the frames that were localized, mean ± "
     "standard deviation over the seeds."
 )

@@ -329,14 +329,11 @@ class Localizer:
             or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
         ):
             state = self._estimator.predict(attempt.time_ns) or followed.solution.state
-            hurried = self._judge.doubtful or followed.moved_px > settings.hurry_px_s * age_s
-            lag_s = settings.hurried_lag_s if hurried else None
             self._worker.submit(
                 self._acquirer.promote(
                     attempt.time_ns, image, state, self._estimator, attempt.taken
                 ),
                 attempt.time_ns,
-                lag_s,
             )
 
     def _search(self, attempt: Attempt, image: U8) -> None:
@@ -349,7 +346,6 @@ class Localizer:
         self._worker.submit(
             self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
             attempt.time_ns,
-            self.settings.tracking.search_lag_s,
         )
 
     def _land(self, attempt: Attempt) -> bool:

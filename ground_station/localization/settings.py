@@ -110,10 +110,7 @@ class TrackingSettings:
     keyframe_interval_s: float = config.key(0.2, unit="s", low=0, high=10)
     keyframe_min_share: float = config.key(0.6, low=0, high=1)
     describe_gap_s: float = config.key(0.09, unit="s", low=0, high=1000)
-    features_lag_s: float = config.key(0.19, unit="s", low=0, high=10)
-    hurry_px_s: float = config.key(150.0, unit="px/s", low=0, high=1e5)
-    hurried_lag_s: float = config.key(0.12, unit="s", low=0, high=10)
-    search_lag_s: float = config.key(0.19, unit="s", low=0, high=10)
+    features_lag_s: float = config.key(0.16, unit="s", low=0, high=10)
 
 
 @dataclass(frozen=True)

@@ -38,18 +38,14 @@ class Worker(Generic[Result]):
         """How long before a frame's time the job was given whose result has not landed; else 0."""
         return (time_ns - self._given_ns) / 1e9 if self.busy else 0.0
 
-    def submit(self, job: Callable[[], Result], time_ns: int, lag_s: float | None = None) -> None:
-        """Starts a frame's job; one that has not landed is forgotten. It may have its own lag.
-
-        A lag of its own is no more than the worker's, so that with 0 nothing is ever waited for.
-        """
+    def submit(self, job: Callable[[], Result], time_ns: int) -> None:
+        """Starts a frame's job; one that has not landed is forgotten."""
         if self._executor is None:
             self._executor = ThreadPoolExecutor(
                 1, thread_name_prefix="keyframes", initializer=_step_aside
             )
         self.drop()
-        lag_s = self.lag_s if lag_s is None else min(lag_s, self.lag_s)
-        self._given_ns, self._due_ns = time_ns, time_ns + int(1e9 * lag_s)
+        self._given_ns, self._due_ns = time_ns, time_ns + int(1e9 * self.lag_s)
         self._job = self._executor.submit(job)
 
     def collect(self, time_ns: int) -> Result | None:

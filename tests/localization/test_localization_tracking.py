@@ -190,6 +190,34 @@ def test_points_are_found_where_the_wall_says_they_are(wall):
     assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.5
 
 
+@pytest.mark.parametrize(
+    "moved",
+    [[0, 0, 0, 0, 0, 1.2], [0, 0, 0, 0, 0, -1.2], [0, 0, 0.3, 0, 0, 0], [0, 0.3, 0, -1.2, 0, 0.8]],
+    ids=["nearer", "farther", "rolled", "aslant"],
+)
+def test_points_are_followed_where_the_wall_looks_otherwise(wall, moved):
+    keyframe, wTc = wall.keyframe(np.eye(4)), poses.exp(moved)
+    tracks = track(keyframe, wall.picture(wTc), wTc, wall.camera, TrackingSettings())
+    truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
+    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
+    assert len(tracks.point) > 0.95 * tracks.sought > 80
+    assert np.median(off) < 0.06 and np.percentile(off, 95) < 0.3
+
+
+def test_what_tells_no_view_leaves_the_keyframe_as_it_is(wall):
+    image = wall.picture(np.eye(4))
+    line = np.linspace([60, 240], [580, 240], 20, dtype=np.float32)
+    rng = np.random.default_rng(3)
+    for start, aim in [
+        (line[:4], line[:4] + 5),  # too few
+        (line, line + np.float32([0, 5])),  # one line
+        (line, np.full_like(line, 7)),  # one place
+        (line, rng.uniform(0, 480, line.shape).astype(np.float32)),  # anywhere
+    ]:
+        template, there = tracking._bent(image, start, aim, 21)
+        assert template is image and there is start
+
+
 def test_points_of_what_is_no_longer_there_are_dropped(wall):
     keyframe = wall.keyframe(np.eye(4))
     other = Wall(seed=6).picture(np.eye(4))
