@@ -132,6 +132,7 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
         np.full(_OBSERVATIONS, settings.sigma_px),
         np.tile(settings.landmark_sigma_m**2 * np.eye(3), (_OBSERVATIONS, 1, 1)),
         np.ones(_OBSERVATIONS),
+        np.zeros((_OBSERVATIONS, 3)),
     )
     sigma = np.repeat([0.05, 0.1, 0.5, 0.5], 3)
     predicted = Kinematics(0, guess, np.zeros(6), np.diag(sigma**2))

@@ -36,7 +36,8 @@ class LandmarkObservations:
     `points_m` (N, 3) in the world; `pinhole_px` (N, 2), undistorted pixels; `row_s` (N,), when each
     one's row was exposed after the frame's time (0 for a global shutter); `sigma_px` (N,), standard
     deviation of a pixel coordinate; `covariance_m2` (N, 3, 3) of the points' positions; `stretch`
-    (N,), how many undistorted pixels one of the picture's is there, by which residuals are judged.
+    (N,), how many undistorted pixels one of the picture's is there, by which residuals are judged;
+    `by_focal_m` (N, 3), how the points follow the map's focal length.
     """
 
     points_m: F64
@@ -45,6 +46,7 @@ class LandmarkObservations:
     sigma_px: F64
     covariance_m2: F64
     stretch: F64
+    by_focal_m: F64
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -60,8 +62,9 @@ class Solution:
     pose and twist. `innovation` is the squared Mahalanobis distance of the solution from the
     prediction by the prediction's covariance (12 degrees of freedom). `residual_px` (N,) and
     `inlier` (N,) belong to the observations given; `reason` says why there is no state.
-    `pose_by_focal` (6,) is by how much the pose (right tangent) that the observations alone say
-    follows the share by which the focal length is longer; None by solvers that do not tell."""
+    `pose_by_focal` (6, 2) is by how much the pose (right tangent) that the observations alone say
+    follows the share by which the focal length is longer, the frame's and the map's; None by
+    solvers that do not tell."""
 
     state: Kinematics | None
     information: F64

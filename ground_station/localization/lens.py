@@ -8,7 +8,8 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
-from ground_station.map.store import MapInfo
+from ground_station.map.accuracy import accuracy
+from ground_station.map.store import Map, MapInfo
 
 _SAME = 1e-6
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
@@ -30,6 +31,21 @@ def against_map(info: MapInfo, camera: Camera) -> tuple[Camera, bool]:
         if camera.model == mine.model and _alike(_lens(camera), _lens(known)):
             return replace(camera, **{name: getattr(mine, name) for name in _LENS}), True
     return camera, False
+
+
+def considered(map_: Map, is_maps: bool, sigma: float) -> F64:
+    """Covariance (2, 2) of the shares by which a flight's and its map's focal lengths are off.
+
+    `sigma` is of one lens against another, each by its own calibration. A wrong lens bends the map:
+    where that is registered by a trajectory, its scatter about that has been measured, and a few
+    points say nothing of it.
+    """
+    of_one = sigma**2 / 2
+    measured = accuracy(map_.info).sigma_rad > 0
+    bends = map_.info.registered and not measured and bool(map_.landmarks.by_focal_m.any())
+    if is_maps:
+        return np.full((2, 2), of_one if bends else 0.0)
+    return np.diag([sigma**2, of_one if bends else 0.0])
 
 
 def _lens(camera: Camera) -> F64:

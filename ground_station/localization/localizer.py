@@ -23,7 +23,7 @@ from ground_station.localization.estimator import Estimator, make_estimator
 from ground_station.localization.following import Followed
 from ground_station.localization.judge import Judge
 from ground_station.localization.kinematics import Kinematics, Solution
-from ground_station.localization.lens import against_map
+from ground_station.localization.lens import against_map, considered
 from ground_station.localization.matching import Described, Matcher, describe
 from ground_station.localization.publishing import (
     covariance_in_map,
@@ -73,7 +73,7 @@ class Localizer:
         """Set by who must skip frames for lack of processor: keyframes are then renewed only where
         they run out, or where a pose waits for one to be confirmed."""
         camera, is_maps = against_map(map_.info, camera)
-        self._focal_sigma = 0.0 if is_maps else settings.covariance.focal
+        self._of_focal = considered(map_, is_maps, settings.covariance.focal)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
         self._matcher = Matcher(map_, camera, settings, extractor.distance_scale)
         self._acquirer = Acquirer(map_, self._matcher, extractor, settings)
@@ -420,7 +420,7 @@ class Localizer:
         assert state is not None
         self._seen = attempt.observations.landmark[solution.inlier]
         settings = self.settings.covariance
-        in_map = covariance_in_map(state.covariance, solution, settings, self._focal_sigma)
+        in_map = covariance_in_map(state.covariance, solution, settings, self._of_focal)
         support_ns = followed.support_ns if followed else attempt.time_ns
         evidence = evidence_of(
             attempt, solution, in_map, self.camera, support_ns, self._denied if followed else 0

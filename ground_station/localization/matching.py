@@ -254,6 +254,7 @@ class Matcher:
             sigma * stretch,
             self.landmarks.covariance_m2[landmark].astype(np.float64) + floor,
             stretch,
+            self.landmarks.by_focal_m[landmark].astype(np.float64),
         )
 
     def row_s(self, pixel_px: F64) -> F64:

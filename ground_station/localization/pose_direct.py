@@ -28,6 +28,7 @@ def solve_direct(
         row_s=None,
         camera=camera,
         huber_k=settings.huber_k,
+        by_focal_m=np.zeros((3, count)),
     )
     inlier, iterations, still = np.ones(count, bool), 0, np.zeros(6)
     with np.errstate(all="ignore"):  # what is not finite is a failure

@@ -71,8 +71,9 @@ class Linear:
     (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
     image (uu, uv, vv), and `reach` (2, 3, N) what moves them: their covariance by each coordinate.
     `rows` (2, 3, N) are ∂pixel/∂landmark once these are moved along. `excess` (N,) is the variance,
-    px², that reweighting adds beyond Huber's reach. `by_focal` (D,) is the steps' mixed second
-    derivative with the share by which the focal length is longer.
+    px², that reweighting adds beyond Huber's reach. `bent_px` (2, N) is how the landmarks' pixels
+    follow the share by which the map's focal length is longer, and `by_focal` (D, 2) the steps'
+    mixed second derivative with that share of the frame's and of the map's.
     """
 
     information: F64
@@ -83,6 +84,7 @@ class Linear:
     reach: F64
     rows: F64 | None
     excess: F64
+    bent_px: F64
     by_focal: F64
 
 
@@ -91,7 +93,8 @@ class Reprojection:
     """The robust reprojection cost of N landmarks in one frame; arrays with N last.
 
     `offset_px` (2, N) is from the principal point to the undistorted pixel of each observation.
-    `row_s` (N,) is None for a global shutter: then the pose is all that is asked for.
+    `row_s` (N,) is None for a global shutter: then the pose is all that is asked for. `by_focal_m`
+    (3, N) is how landmarks follow the map's focal length.
     """
 
     points_m: F64
@@ -101,6 +104,7 @@ class Reprojection:
     row_s: F64 | None
     camera: Camera
     huber_k: float
+    by_focal_m: F64
 
     @property
     def count(self) -> int:
@@ -116,6 +120,7 @@ class Reprojection:
             covariance_m2=self.covariance_m2[:, :, keep],
             variance_px2=self.variance_px2[keep],
             row_s=None if self.row_s is None else self.row_s[keep],
+            by_focal_m=self.by_focal_m[:, keep],
         )
 
     def view(self, wTc: F64, twist: F64, moved_m: F64 | None = None) -> View:
@@ -135,15 +140,15 @@ class Reprojection:
         residual -= self.offset_px
         return View(camera, wTc[:3, :3], motion, uv, inverse_z, residual, front, all_front)
 
-    def reach(self, view: View) -> tuple[F64, F64, F64]:
+    def reach(self, view: View) -> tuple[F64, F64, F64, F64]:
         """Rows ∂pixel/∂landmark in world axes (2, 3, N), their products with the landmarks'
-        covariances (2, 3, N), and these in the image, px² (3, N): uu, uv, vv."""
+        covariances (2, 3, N), these in the image, px² (3, N): uu, uv, vv; and `bent_px` (2, N)."""
         rows = view.rows()
         reach = np.einsum("ijn,ajn->ain", self.covariance_m2, rows)
         spread = np.empty((3, self.count))
         for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
             np.einsum("in,in->n", rows[i], reach[j], out=spread[k])
-        return rows, reach, spread
+        return rows, reach, spread, np.einsum("ain,in->an", rows, self.by_focal_m)
 
     def linearize(
         self,
@@ -166,9 +171,9 @@ class Reprojection:
         r = view.residual_px
         rows = None
         if last is None or (move and last.rows is None):
-            rows, reach, spread = self.reach(view)
+            rows, reach, spread, bent = self.reach(view)
         else:  # so near another step hardly turns them
-            rows, reach, spread = last.rows, last.reach, last.spread_px2
+            rows, reach, spread, bent = last.rows, last.reach, last.spread_px2, last.bent_px
         if moved is not None and rows is not None:
             r = r - np.einsum("ain,in->an", rows, moved)
         y, excess, factor = self._whiten(r, spread, None if last is None else last.excess, sharp)
@@ -184,13 +189,13 @@ class Reprojection:
         J[:, 1] *= factor[2]
         flat = J.reshape(len(J), -1)
         # A longer focal length puts an observation nearer to the middle, by its distance.
-        off = self.offset_px
-        longer = np.concatenate([factor[0] * off[0] + factor[1] * off[1], factor[2] * off[1]])
+        u, v = np.stack([self.offset_px, bent], axis=1)  # (2, N) each
+        longer = np.concatenate([factor[0] * u + factor[1] * v, factor[2] * v], axis=1)
         best = reach[0] * y[0]
         best += reach[1] * y[1]
         return Linear(
             flat @ flat.T, gradient, cost, -best, spread, reach, rows if move else None, excess,
-            flat @ longer,
+            bent, flat @ longer.T,
         )  # fmt: skip
 
     def _whiten(self, r: F64, spread: F64, excess: F64 | None, sharp: bool) -> tuple[F64, F64, F64]:

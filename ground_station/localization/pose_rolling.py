@@ -75,6 +75,7 @@ def solve_rolling(
         row_s=np.asarray(observations.row_s, np.float64),
         camera=camera,
         huber_k=settings.huber_k,
+        by_focal_m=observations.by_focal_m.T,
     )
     chosen, inlier, iterations = every, np.ones(count, bool), 0
     wTc, twist = np.asarray(predicted.wTc, np.float64), np.asarray(predicted.twist, np.float64)
@@ -128,6 +129,7 @@ def _refused(predicted: Kinematics, observations: LandmarkObservations) -> str:
         "sigma_px": (count,),
         "covariance_m2": (count, 3, 3),
         "stretch": (count,),
+        "by_focal_m": (count, 3),
     }
     for name, shape in shapes.items():
         values = getattr(observations, name)
@@ -169,7 +171,8 @@ def _inverse(information: F64) -> F64 | None:
 
 
 def _pose_by_focal(linear: Linear, prior: Prior) -> F64 | None:
-    """How the observations' own pose (6,) follows the focal length; None where they leave it open.
+    """How the observations' own pose (6, 2) follows the focal length, the frame's and the map's;
+    None where they leave it open.
 
     The twist is held by the prediction: of a global shutter no frame tells it.
     """
@@ -177,7 +180,8 @@ def _pose_by_focal(linear: Linear, prior: Prior) -> F64 | None:
     free[6:, 6:] += prior.information[6:, 6:]
     scale = 1.0 / np.sqrt(np.diag(free))
     try:
-        follows = scale * np.linalg.solve(free * scale * scale[:, None], scale * linear.by_focal)
+        whitened = scale[:, None] * linear.by_focal
+        follows = scale[:, None] * np.linalg.solve(free * scale * scale[:, None], whitened)
     except np.linalg.LinAlgError:
         return None
     return -follows[:6] if np.isfinite(follows).all() else None

@@ -16,7 +16,7 @@ from ground_station.map.accuracy import Accuracy
 
 
 def covariance_in_map(
-    covariance: F64, solution: Solution, settings: CovarianceSettings, focal_sigma: float
+    covariance: F64, solution: Solution, settings: CovarianceSettings, of_focal: F64
 ) -> F64:
     """The pose's covariance (6, 6) in the map: scaled, and with what frames share added.
 
@@ -24,18 +24,17 @@ def covariance_in_map(
     see are not. Those move the pose as the observations of one frame alone would: by the inverse of
     their information about the pose, with a share that was calibrated against truth.
 
-    Nor does a filter know of a focal length that is off by a share of `focal_sigma`: the pose
-    follows it as the `solution` says (considered, not estimated: Schmidt 1966)."""
+    Nor does a filter know of focal lengths, the frames' and the map's, that are off by shares of
+    the covariance `of_focal` (2, 2): the pose follows them as the `solution` says (considered, not
+    estimated: Schmidt 1966)."""
     published = settings.scale**2 * covariance[:6, :6]
     if settings.shared > 0:
         try:
             published = published + settings.shared**2 * np.linalg.inv(solution.information[:6, :6])
         except np.linalg.LinAlgError:
             return np.full((6, 6), np.inf)
-    if focal_sigma > 0 and solution.pose_by_focal is not None:
-        published = published + focal_sigma**2 * np.outer(
-            solution.pose_by_focal, solution.pose_by_focal
-        )
+    if of_focal.any() and solution.pose_by_focal is not None:
+        published = published + solution.pose_by_focal @ of_focal @ solution.pose_by_focal.T
     return np.asarray(published)
 
 

@@ -150,8 +150,9 @@ def track(
     """The keyframe's points in an image (H, W) taken near the pose `predicted` (4, 4).
 
     Each is first looked for where the predicted pose puts it, moved by what it was off in the
-    keyframe, whose picture is warped as that pose sees it. Those that do not come back to where they started when followed back are dropped, and
-    those that fall into what the image, as it was `taken`, does not show.
+    keyframe, whose picture is warped as that pose sees it. Those that do not come back to where
+    they started when followed back are dropped, and those that fall into what the image, as it was
+    `taken`, does not show.
     `doubt_px` is how far off the prediction may put them: they are looked for with no more levels
     of the pyramid than that needs, as each costs as much as the finest; with all where that finds
     fewer than half of them.

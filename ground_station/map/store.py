@@ -40,7 +40,9 @@ class Landmarks:
     array or, from a file, `Descriptors` that are read when they are asked for; `spread` (M,), their
     RMS distance from that mean; `view_direction` (M, 3), the unit mean direction from the point to
     the cameras that saw it; `view_cos` (M,), the cosine of the angle that holds them all;
-    `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,).
+    `distance_m` (M, 2), the nearest and farthest of them; `observations` (M,). `by_focal_m` (M, 3)
+    is how the position follows the share by which the map's focal length is longer, the map as a
+    whole staying where it is: a wrong lens bends it. Zero where the map does not say.
     """
 
     id: I64
@@ -52,6 +54,11 @@ class Landmarks:
     view_cos: F32
     distance_m: F32
     observations: I32
+    by_focal_m: F32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
+
+    def __post_init__(self) -> None:
+        if len(self.by_focal_m) == 0:
+            self.by_focal_m = np.zeros((len(self.id), 3), np.float32)
 
     def __len__(self) -> int:
         return len(self.id)
@@ -148,6 +155,8 @@ _LANDMARKS: _Layout = {
     "distance_m": ("float32", (2,)),
     "observations": ("int32", ()),
 }
+_BENDING: _Layout = {"by_focal_m": ("float32", (3,))}
+"""Maps of before have none."""
 _MODES: _Layout = {"mode_landmark": ("int32", ())}
 _OF_MODES = "mode_"
 """Stands before the names of the modes' descriptors, which are called as the landmarks' own."""
@@ -168,6 +177,8 @@ def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
     lm, kf, info = map_.landmarks, map_.keyframes, map_.info
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
     observations: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}
+    if lm.by_focal_m.any():
+        arrays["by_focal_m"] = lm.by_focal_m
     if quantise:
         arrays |= quantised(lm.descriptor)
     else:
@@ -264,7 +275,7 @@ def load(folder: str | Path) -> Map:
     m = len(arrays["id"])
     descriptor = open_descriptors(path, m, info.dimension)
     modes = _modes(path, m, info.dimension)
-    landmarks = Landmarks(descriptor=descriptor, **{name: arrays[name] for name in _LANDMARKS})
+    landmarks = Landmarks(descriptor=descriptor, **arrays)
     path = folder / "keyframes.safetensors"
     arrays, metadata = _read(path, _KEYFRAMES)
     names = metadata.get("names", "").split("\n") if metadata.get("names") else []
@@ -307,8 +318,8 @@ def load_positions(folder: str | Path) -> F64:
 
 
 def _landmarks(path: Path) -> _Arrays:
-    """The arrays of `_LANDMARKS`, of as many rows each."""
-    arrays, _ = _read(path, _LANDMARKS)
+    """The arrays of `_LANDMARKS` and `_BENDING`, of as many rows each."""
+    arrays, _ = _read(path, _LANDMARKS, _BENDING)
     if len({len(array) for array in arrays.values()}) > 1:
         raise MapError(f"{path}: its arrays differ in length")
     return arrays

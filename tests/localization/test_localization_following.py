@@ -307,19 +307,22 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
 def test_what_frames_share_is_added_to_what_is_published():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(12, 12))
-    covariance, moves = A @ A.T, np.arange(6.0)
+    covariance, moves, none = A @ A.T, rng.normal(size=(6, 2)), np.zeros((2, 2))
     told = dataclasses.replace(
         no_solution(0, ""), information=np.diag(np.arange(1.0, 13.0)), pose_by_focal=moves
     )
-    plain = covariance_in_map(covariance, told, CovarianceSettings(), 0.0)
+    plain = covariance_in_map(covariance, told, CovarianceSettings(), none)
     assert np.array_equal(plain, covariance[:6, :6])
-    more = covariance_in_map(covariance, told, CovarianceSettings(scale=2.0, shared=0.5), 0.0)
+    more = covariance_in_map(covariance, told, CovarianceSettings(scale=2.0, shared=0.5), none)
     assert np.allclose(more, 4 * plain + 0.25 * np.diag(1 / np.arange(1.0, 7.0)))
-    lens = covariance_in_map(covariance, told, CovarianceSettings(), 0.1)
-    assert np.allclose(lens, plain + 0.01 * np.outer(moves, moves))
+    lenses = np.array([[0.01, 0.002], [0.002, 0.03]])
+    more = covariance_in_map(covariance, told, CovarianceSettings(), lenses)
+    assert np.allclose(more, plain + moves @ lenses @ moves.T)
     nothing = no_solution(0, "")
-    assert np.isinf(covariance_in_map(covariance, nothing, CovarianceSettings(shared=0.5), 0)).all()
-    assert np.array_equal(covariance_in_map(covariance, nothing, CovarianceSettings(), 0.1), plain)
+    shared = covariance_in_map(covariance, nothing, CovarianceSettings(shared=0.5), none)
+    assert np.isinf(shared).all()
+    same = covariance_in_map(covariance, nothing, CovarianceSettings(), lenses)
+    assert np.array_equal(same, plain)
 
 
 def test_the_maps_own_errors_are_added_by_their_share():

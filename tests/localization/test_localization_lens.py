@@ -11,10 +11,10 @@ import pytest
 from ground_station.experiments.alter import scaled_camera
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.localization.lens import against_map
+from ground_station.localization.lens import against_map, considered
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
-from ground_station.map.store import MapInfo
+from ground_station.map.store import Landmarks, MapInfo
 from tests.localization.conftest import CAMERA, FakeExtractor, Room
 
 NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
@@ -57,6 +57,25 @@ def test_the_maps_own_lens_is_known_at_any_size() -> None:
     for flight in (CAMERA, replace(CAMERA, readout_s=0.01), scaled_camera(CAMERA, 0.5)):
         assert against_map(info, flight) == (flight, True)
     assert not against_map(info, longer(CAMERA, 1e-3))[1]
+
+
+def test_a_bend_that_no_trajectory_measured_is_reckoned_with(room: Room) -> None:
+    bent = replace(room.map.landmarks, by_focal_m=np.ones((len(room.map.landmarks), 3), np.float32))
+    by_points = {"method": "observations", "point_sigma_m": 0.01}
+
+    def of(registration: dict[str, Any], landmarks: Landmarks, is_maps: bool) -> list[list[float]]:
+        info = replace(room.map.info, registration=registration)
+        told = replace(room.map, info=info, landmarks=landmarks)
+        return np.round(considered(told, is_maps, 0.002) * 1e6, 9).tolist()
+
+    assert of(by_points, bent, True) == [[2, 2], [2, 2]]  # one lens: the same error
+    assert of(by_points, bent, False) == [[4, 0], [0, 2]]
+    for registration, landmarks in (
+        ({"method": "trajectory", "sigma_deg": 0.1}, bent),
+        (by_points, room.map.landmarks),  # a map of before
+    ):
+        assert of(registration, landmarks, True) == [[0, 0], [0, 0]]
+        assert of(registration, landmarks, False) == [[4, 0], [0, 0]]
 
 
 @pytest.mark.parametrize("share", [-0.005, 0.005])

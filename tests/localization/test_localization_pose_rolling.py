@@ -67,7 +67,9 @@ def _scene(
         5, TRUE @ poses.inverse(poses.exp(error[:6])), twist - error[6:], np.diag(sigma**2)
     )
     sigma, even = np.full(count, noise_px), np.ones(count)
-    return predicted, LandmarkObservations(points, pixels, row_s, sigma, root @ root, even), wrong
+    still = np.zeros_like(points)
+    seen = LandmarkObservations(points, pixels, row_s, sigma, root @ root, even, still)
+    return predicted, seen, wrong
 
 
 def _error(state: Kinematics, twist: np.ndarray = TWIST) -> np.ndarray:
@@ -84,6 +86,7 @@ def _reprojection(observations: LandmarkObservations, huber_k: float = 1.345) ->
         observations.row_s,
         CAMERA,
         huber_k,
+        observations.by_focal_m.T,
     )
 
 
@@ -377,15 +380,26 @@ def test_it_says_how_the_pose_follows_the_focal_length():
     predicted = dataclasses.replace(predicted, covariance=predicted.covariance * np.diag(loose))
     centre, share = np.array([CAMERA.cx_px, CAMERA.cy_px]), 1e-3
 
-    def solved(by: float) -> Solution:
-        longer = centre + (seen.pinhole_px - centre) / (1 + by)
-        observations = dataclasses.replace(seen, pinhole_px=longer)
+    # A map that its lens bends: along, and round a corner.
+    x, y, z = seen.points_m.T
+    bend = np.stack([2 + 0.1 * z * z, 0 * y, 1.5 * x], axis=1)
+
+    def solved(frames: float, maps: float) -> Solution:
+        observations = dataclasses.replace(
+            seen,
+            pinhole_px=centre + (seen.pinhole_px - centre) / (1 + frames),
+            points_m=seen.points_m + maps * bend,
+            by_focal_m=bend,
+        )
         found = solve_rolling(predicted, observations, CAMERA, SETTINGS)
         assert found.state is not None
         return found
 
-    a, b, middle = solved(-share), solved(share), solved(0.0)
-    assert a.state is not None and b.state is not None and middle.pose_by_focal is not None
-    moved = poses.log(poses.inverse(a.state.wTc) @ b.state.wTc) / (2 * share)
-    assert np.linalg.norm(moved[3:]) > 1  # metres for the whole of a focal length
-    assert np.allclose(middle.pose_by_focal, moved, atol=0.05 * np.abs(moved).max())
+    told = solved(0, 0).pose_by_focal
+    assert told is not None
+    for follows, step in zip(told.T, np.diag([share, share]), strict=True):
+        a, b = solved(*-step).state, solved(*step).state
+        assert a is not None and b is not None
+        moved = poses.log(poses.inverse(a.wTc) @ b.wTc) / (2 * share)
+        assert np.linalg.norm(moved[3:]) > 1  # metres for the whole of a focal length
+        assert np.allclose(follows, moved, atol=0.05 * np.abs(moved).max())

@@ -7,9 +7,13 @@ import shutil
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 
+from ground_station.errors import MapError
+from ground_station.geometry.alignment import Alignment
 from ground_station.map import store
 from ground_station.map.descriptors import Descriptors, quantised
+from ground_station.mapping.registration.register import transform_map
 
 
 @pytest.fixture
@@ -63,6 +67,28 @@ def test_a_map_is_replaced_while_another_still_reads_it(built, tmp_path):
     store.save_tables(folder, loaded)
     assert np.array_equal(loaded.landmarks.descriptor[:], before)
     assert np.array_equal(store.load(folder).landmarks.descriptor[:], before)
+
+
+def test_a_map_says_how_it_bends_or_nothing(built, tmp_path):
+    plain = store.load(built.folder)
+    landmarks = plain.landmarks
+    count = len(landmarks)
+    follows = np.random.default_rng(1).normal(size=(count, 3)).astype(np.float32)
+    bent = dataclasses.replace(plain, landmarks=dataclasses.replace(landmarks, by_focal_m=follows))
+    store.save_tables(tmp_path, bent)
+    assert np.array_equal(store.load(tmp_path).landmarks.by_focal_m, follows)
+    turned = Alignment(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.ones(3), 2.0)
+    moved = transform_map(bent, turned).landmarks.by_focal_m
+    assert np.allclose(moved, 2 * np.c_[-follows[:, 1], follows[:, 0], follows[:, 2]])
+    none = dataclasses.replace(landmarks, by_focal_m=np.zeros((count, 3), np.float32))
+    store.save_tables(tmp_path, dataclasses.replace(plain, landmarks=none))
+    assert not store.load(tmp_path).landmarks.by_focal_m.any()
+    with safe_open(tmp_path / "landmarks.safetensors", framework="numpy") as file:
+        assert "by_focal_m" not in file.keys()  # noqa: SIM118
+    wrong = dataclasses.replace(landmarks, by_focal_m=follows[: count - 1])
+    store.save_tables(tmp_path, dataclasses.replace(plain, landmarks=wrong))
+    with pytest.raises(MapError, match="differ in length"):
+        store.load(tmp_path)
 
 
 def test_a_map_without_landmarks_has_no_descriptors(built, tmp_path):

@@ -17,7 +17,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files, landmarks, store
 from ground_station.map.folder import replacing
-from ground_station.mapping.construction import noise
+from ground_station.mapping.construction import bending, noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.content import structure_key
@@ -127,6 +127,10 @@ def build_map(
             "settings": asdict(settings),
         }
         map_, sparse = _straightened(map_, structure.reconstruction, limits)
+        if len(model.names) <= limits.sfm.part_images:  # of more it takes long, and says less
+            map_.landmarks.by_focal_m = bending.by_focal(
+                sparse, map_.landmarks.id, loss_px=limits.sfm.loss_px, threads=threads
+            )
         colmap.write(sparse, folder / "sparse")
         colmap_files.check(folder / "sparse")  # COLMAP does not say when the disk is full
         store.save_tables(folder, map_, quantise=settings.quantise)

@@ -202,6 +202,7 @@ def _assemble(map_: store.Map, graph: Graph) -> store.Map:
         covariance_m2=covariance.astype(np.float32),
         descriptor=_those(old.descriptor, kept),
         spread=old.spread[kept],
+        by_focal_m=old.by_focal_m[kept],
     )
     camera = map_.info.camera
     order = np.argsort(model.image, kind="stable")

@@ -222,6 +222,7 @@ def transform_map(map_: store.Map, fit: Alignment) -> store.Map:
             view_cos=lm.view_cos,
             distance_m=(s * lm.distance_m).astype(np.float32),
             observations=lm.observations,
+            by_focal_m=(s * lm.by_focal_m @ R.T).astype(np.float32),
         ),
         keyframes=store.Keyframes(
             names=kf.names,
