@@ -41,7 +41,7 @@ _FEWEST = 8
 
 _STRAIGHT_PX = 0.5
 """So far a window's corners may be from where they were, in the median, before it is warped: at
-0.8 px nothing is gained of a blimp's own flight (0.51 cm, 0.47 with 0.5, 0.3 or 0)."""
+0.8 px nothing is gained of a simulated small circle (0.51 cm, 0.47 with 0.5, 0.3 or 0)."""
 
 _CELL_PX = 32
 """Side of the cells over which points are spread."""

@@ -127,7 +127,7 @@ def build_map(
             "settings": asdict(settings),
         }
         map_, sparse = _straightened(map_, structure.reconstruction, limits)
-        if len(model.names) <= limits.sfm.part_images:  # of more it takes long, and says less
+        if len(model.names) <= limits.sfm.part_images:  # of more its cost is not measured
             map_.landmarks.by_focal_m = bending.by_focal(
                 sparse, map_.landmarks.id, loss_px=limits.sfm.loss_px, threads=threads
             )
