@@ -13,7 +13,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, Literal, Protocol, TypeVar
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
@@ -271,6 +271,15 @@ class RecordingWriter:
             )
 
 
+class Readable(Protocol):
+    """Where a recording lies: a path, or whatever else opens as a file that can be sought in."""
+
+    @property
+    def name(self) -> str: ...
+
+    def open(self, mode: Literal["rb"], /) -> IO[bytes]: ...
+
+
 class RecordingReader:
     """Reads a recording in file order, whole or cut.
 
@@ -278,8 +287,8 @@ class RecordingReader:
     is damaged, and `cut_reason` where and why, in words. What was read before that is whole.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Readable) -> None:
+        self.path = Path(path) if isinstance(path, str) else path
         self.cut = False
         self.cut_reason = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -345,7 +354,7 @@ class RecordingReader:
                     yield channel, message
             return
         with self.path.open("rb") as file:
-            reader = SeekingReader(Clamped.of(file, self.path.stat().st_size))
+            reader = SeekingReader(Clamped.of(file, _size(file)))
             reader._summary = summary  # of an hour's recording it takes a second to read
             try:
                 for _, channel, message in reader.iter_messages(topics, start_time=from_ns):
@@ -358,8 +367,7 @@ class RecordingReader:
         """The index at the end of the file; None when it is cut off or damaged."""
         with self.path.open("rb") as file:
             try:
-                size = file.seek(0, io.SEEK_END)
-                file.seek(0)
+                size = _size(file)
                 return SeekingReader(Clamped.of(file, size), record_size_limit=size).get_summary()
             except (*PARSE_ERRORS, OSError):
                 return None
@@ -415,6 +423,12 @@ class RecordingReader:
         except DecodeError:
             name = kind.DESCRIPTOR.full_name
             raise RecordingError(f"{self.path}: a message is not a {name}") from None
+
+
+def _size(file: IO[bytes]) -> int:
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return size
 
 
 def _refuse(constant: str) -> None:

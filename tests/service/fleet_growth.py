@@ -1,12 +1,14 @@
-"""What a payload and the page cost as a fleet grows: 1, 3 and 6 stations with two payloads each.
+"""What joining and growing cost a fleet of stations, and how soon one takes over from another.
 
     python tests/service/fleet_growth.py --out out/fleet.json
 
-Whole services on one machine, joined over mutual TLS, each with two payloads of its own that fly
-the sample's simulated flight at a tenth of its pace, so that two cores bear twelve of them. Prints
-the processor time of each, and of the first station's page with a viewer on it. Then one of two
-stations is killed, again and again, with a payload at ten frames a second that finds its station
-itself. Ends with status 1 when a bound is missed. pytest does not collect it.
+Whole services on one machine, joined over mutual TLS, whose payloads fly the sample's simulated
+flight. First a payload at 15 frames a second on one station alone, on each of two that know nothing
+of each other, and on each of two that joined, with a viewer on the first page: latencies and errors
+of each. Then 1, 3 and 6 stations with two payloads each at a tenth of the flight's pace, so that
+two cores bear twelve: the processor time of each, and of the first page. Then one of two stations
+is killed, again and again, with a payload at ten frames a second that finds its station itself.
+Ends with status 1 when a bound is missed. pytest does not collect it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import socket
 import statistics
 import sys
@@ -25,11 +28,19 @@ from pathlib import Path
 
 from intake_stand import eventually
 from payload_process import free_port
+from scenarios.camera import FLIGHT, Truth
 from soaking.table import Row, show
 from standing import ATRIUM, Service, Viewer, joined
 
 from ground_station.files import write_json
+from ground_station.service import bus_messages
+from ground_station.service.bus_messages import EstimateMessage
 
+ALONE, APART, JOINED = "one alone", "two apart", "two joined"
+SIDE_HZ, LATER, WORSE = 15.0, 1.2, 1.2
+"""A payload's rate there, and how much later and further off poses of joined stations may be than
+those of two apart on the same processors.
+"""
 STATIONS = 1, 3, 6
 EACH = 2
 """Payloads of a station."""
@@ -43,6 +54,67 @@ LOCALIZED = 0.95
 KILLS, KILLED_HZ, TAKEN_S = 6, 10.0, 5.0
 """How often a station is killed, with a payload of that rate, and how soon the other is to have it.
 """
+
+
+@dataclass(frozen=True)
+class Flown:
+    """The payloads of some stations together: medians, frames a second of each, share localized."""
+
+    stations: str
+    latency_ms: float
+    error_cm: float
+    frames_hz: float
+    tracking: float
+
+
+def flown(stations: str, there: Sequence[Service], folder: Path) -> Flown:
+    """A payload with each station; the first one's page is looked at."""
+    truth = Truth(FLIGHT)
+    notes: list[EstimateMessage] = []
+    with contextlib.ExitStack() as flying:
+        for service in there:
+            flying.enter_context(service)
+        names = [f"blimp-{k}" for k in range(1, len(there) + 1)]
+        for service, name in zip(there, names, strict=True):
+            flying.enter_context(service.fly(name, folder / f"payload-{name}", rate_hz=SIDE_HZ))
+        flying.enter_context(Viewer(there[0], names[0]))
+        for service, name in zip(there, names, strict=True):
+            eventually(lambda service=service, name=name: service.has(name), LIMIT_S)
+        if stations == JOINED:
+            eventually(lambda: all(there[0].tracking(name) for name in names), LIMIT_S)
+        time.sleep(SETTLE_S)
+        for service in there:
+            bus = flying.enter_context(service.bus())
+            bus.subscribe(
+                bus_messages.ESTIMATE, EstimateMessage, lambda _, note: notes.append(note)
+            )
+        time.sleep(MEASURE_S)
+        told = list(notes)
+    return Flown(
+        stations,
+        statistics.median(1e-6 * (one.done_ns - one.capture_ns) for one in told if one.capture_ns),
+        statistics.median(
+            100 * math.dist(one.position_m, truth.at(one.time_ns)) for one in told if one.position_m
+        ),
+        len(told) / len(there) / MEASURE_S,
+        sum(one.state == "TRACKING" for one in told) / len(told),
+    )
+
+
+def side_by_side(folder: Path) -> list[Flown]:
+    """One station, two that know nothing of each other, two that joined."""
+    found = []
+    for stations in (ALONE, APART, JOINED):
+        own = folder / stations
+        own.mkdir()
+        there = list(joined(own))
+        if stations != JOINED:
+            for k in range(len(there)):
+                (own / f"{k}").mkdir()
+            there = [Service(own / f"{k}") for k in range(1 if stations == ALONE else 2)]
+        found.append(flown(stations, there, own))
+        print(found[-1], flush=True)
+    return found
 
 
 @dataclass(frozen=True)
@@ -159,9 +231,27 @@ def _counts(there: Sequence[Service]) -> tuple[int, int]:
     return sum(note["processed"] for note in told), sum(note["skipped"] for note in told)
 
 
-def rows(costs: Sequence[Cost], took_s: Sequence[float]) -> list[Row]:
-    """The table: each fleet, what grew, and what was taken over."""
-    table = []
+def rows(sides: Sequence[Flown], costs: Sequence[Cost], took_s: Sequence[float]) -> list[Row]:
+    """The table: side by side, each fleet, what grew, and what was taken over."""
+    table = [
+        Row(
+            f"{one.stations}: latency, error, localized",
+            f"{one.latency_ms:.1f} ms, {one.error_cm:.2f} cm, {100 * one.tracking:.1f} %"
+            f" at {one.frames_hz:.1f} Hz",
+        )
+        for one in sides
+    ]
+    _, apart, both = sides
+    table += [
+        Row(
+            "joined beside apart: latency", f"{both.latency_ms / apart.latency_ms:.2f}",
+            f"<= {LATER:g}", both.latency_ms <= LATER * apart.latency_ms,
+        ),
+        Row(
+            "joined beside apart: error", f"{both.error_cm / apart.error_cm:.2f}",
+            f"<= {WORSE:g}", both.error_cm <= WORSE * apart.error_cm,
+        ),
+    ]  # fmt: skip
     for cost in costs:
         name = f"{cost.stations} stations, {cost.payloads} payloads"
         table += [
@@ -202,14 +292,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     costs = []
     with tempfile.TemporaryDirectory() as folder:
+        sides = side_by_side(Path(folder))
         for stations in STATIONS:
             costs.append(measured(stations, Path(folder) / str(stations)))
             print(costs[-1], flush=True)
         took_s = taken_over(Path(folder))
-    table = rows(costs, took_s)
+    table = rows(sides, costs, took_s)
     show(table)
     if options.out:
-        write_json(options.out, {"costs": [asdict(cost) for cost in costs], "taken_over_s": took_s})
+        figures = {"side_by_side": sides, "costs": costs}
+        document = {name: [asdict(one) for one in these] for name, these in figures.items()}
+        write_json(options.out, {**document, "taken_over_s": took_s})
     return int(not all(row.holds for row in table))
 
 

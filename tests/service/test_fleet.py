@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tape_stand
 from intake_stand import eventually
 from scenarios.tcp_wire import TcpWire
 
@@ -32,6 +33,8 @@ from ground_station.service.fleet import maps
 from ground_station.service.fleet.fleet import FRESH_S, Fleet
 from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.settings import SAMPLE
+from ground_station.service.web.recordings import Recordings
+from ground_station.service.web.tape import Tape
 
 BLIMP = "blimp-1"
 HERE = PayloadMessage(alive=True, seen_ns=1, ssrc=4, rate_hz=10.0)
@@ -219,6 +222,35 @@ def test_recordings_are_read_where_they_lie(stations: Any) -> None:
     hall.stack.close()
     with pytest.raises(GroundStationError, match="station 'hall' did not answer"):
         shelf.list()
+
+
+def test_a_recording_is_played_where_it_does_not_lie(stations: Any, tmp_path: Path) -> None:
+    hall = stations("hall")
+    attic = stations("attic", hall.endpoint)
+    eventually(lambda: acquainted(hall, attic), 20.0)
+    path = tape_stand.write(tmp_path / "flight.mcap")
+    hall.fleet.shelf = Recordings(tmp_path, lambda: "")
+    shelf = attic.fleet.shelf_of("hall")
+    there, here = Tape(shelf.file("flight.mcap"), attic.fleet.named), Tape(path)
+    assert (there.payloads, there.marks, there.map) == (here.payloads, here.marks, "atrium")
+    from_ns = here.begin_ns + 10**10
+    assert list(there.since(from_ns)) == list(here.since(from_ns)) != []
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-40_000])
+    assert list(Tape(shelf.file("cut.mcap")).since(from_ns)) == list(Tape(cut).since(from_ns)) != []
+    hall.stack.close()
+    with pytest.raises(GroundStationError, match="station 'hall' did not answer"):
+        list(there.since(from_ns))
+
+
+def test_a_pose_recorded_elsewhere_has_this_station_s_name_of_the_map(stations: Any) -> None:
+    hall = stations("hall")
+    hall.tell()
+    ours = hall.fleet._maps[0]
+    said = replace(POSE, map="theirs", coordinates=ours.coordinates)
+    assert hall.fleet.named(said).map == ours.name != "theirs"
+    for note in (replace(said, coordinates="other"), replace(said, coordinates="")):
+        assert hall.fleet.named(note) == note
 
 
 def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations: Any) -> None:

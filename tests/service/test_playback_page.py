@@ -113,6 +113,21 @@ def test_the_way_back_to_live_is_always_there_and_leaves_nothing(page: Any) -> N
     until(page, "!document.querySelector('#act-record').disabled")
 
 
+def test_one_that_lies_at_another_station_is_played_from_there(page: Any) -> None:
+    file = {"file": "there.mcap", "size_MB": 1.0, "modified_ns": 9e18, "started_ns": 9e18}
+    file |= {"duration_s": 9.0, "maps": [], "lacks": None, "after": "", "active": False}
+    page.route("**/api/stations/attic/recordings", lambda route: route.fulfill(json=[file]))
+    page.evaluate(
+        "import('/static/js/store.js').then(({ Store }) => {"
+        " Store.prototype.otherStations = () => ['attic']; })"
+    )
+    with page.expect_websocket() as opened:
+        play(page, "there.mcap")
+    assert opened.value.url.endswith("/api/stations/attic/recordings/there.mcap/play")
+    until(page, "document.querySelector('#link').dataset.phase === 'open'")
+    assert "no station 'attic' flies beside this one" in page.text_content("#outcome")
+
+
 def test_one_that_cannot_be_played_is_said_and_the_live_page_is_back(
     page: Any, folder: Path
 ) -> None:

@@ -41,6 +41,15 @@ def picture_of(service: Service, payload_id: str) -> dict[str, Any]:
                 return dict(json.loads(message[4 : 4 + length]))
 
 
+def played(service: Service, path: str) -> dict[str, Any]:
+    """How the playback of a recording begins."""
+    with connect(f"{service.url.replace('http', 'ws')}{path}/play") as socket:
+        while True:
+            message = json.loads(socket.recv(_LIMIT_S))
+            if message["type"] != "reading":
+                return dict(message)
+
+
 def test_stations_that_joined_show_each_others_payloads(tmp_path: Path) -> None:
     first, second = joined(tmp_path)
     with (
@@ -129,4 +138,6 @@ def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) ->
         assert listed(used, station)[0]["file"] == file["file"]
         url = f"/api/stations/{station}/recordings/{file['file']}"
         assert used.client.get(url).content == (other.recordings / file["file"]).read_bytes()
+        hello = played(used, url)
+        assert hello["payload"] == PAYLOAD and hello["tape"]["length_s"] == file["duration_s"]
         assert used.client.get("/api/stations/nobody/recordings").status_code == 404

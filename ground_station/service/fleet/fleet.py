@@ -192,7 +192,7 @@ class Fleet:
         with self._lock:
             return station in self._others
 
-    def shelf_of(self, station: str) -> Shelf:
+    def shelf_of(self, station: str) -> Elsewhere:
         """The recordings of another station, read from there."""
         return Elsewhere(lambda request: self._ask(station, _RECORDINGS, request), station)
 
@@ -484,10 +484,7 @@ class Fleet:
             elif self._told_of(payload_id) != station or not self._in_our_map(station, note):
                 return
             else:
-                ours = self._maps[0]
-                note = dataclasses.replace(
-                    note, map=note.map and ours.name, coordinates=ours.coordinates
-                )
+                note = self._named(note)
                 self._bus.publish(bus_messages.ELSEWHERE, payload_id, note)
             for take in self._takes[kind]:
                 take(payload_id, note)
@@ -519,6 +516,15 @@ class Fleet:
         if note.coordinates:
             return note.coordinates == self._maps[0].coordinates
         return self._is_ours(other.said) and note.map[:WORD] in ("", other.said.map)
+
+    def named(self, note: EstimateMessage) -> EstimateMessage:
+        """A pose told elsewhere, with this station's name of the map where that is its own."""
+        is_ours = note.coordinates == self._maps[0].coordinates
+        return self._named(note) if note.coordinates and is_ours else note
+
+    def _named(self, note: EstimateMessage) -> EstimateMessage:
+        ours = self._maps[0]
+        return dataclasses.replace(note, map=note.map and ours.name, coordinates=ours.coordinates)
 
     def _is_ours(self, said: StationMessage) -> bool:
         """Whether another station's map has the coordinates of this one's; an older one tells the

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+from typing import IO, Any, Literal, Protocol
 
 from ground_station.errors import GroundStationError
 from ground_station.service.fleet.messages import ROOT
@@ -67,6 +68,9 @@ class Elsewhere:
             begin += len(piece)
             yield piece
 
+    def file(self, name: str) -> ElsewhereFile:
+        return ElsewhereFile(self, name)
+
     def _json(self, request: Mapping[str, Any]) -> Any:
         try:
             found = json.loads(self._ask(request))
@@ -75,6 +79,46 @@ class Elsewhere:
         if found is None:
             raise GroundStationError(f"station '{self._station}' has no such file")
         return found
+
+
+class ElsewhereFile:
+    """A file of another station's, read there as it is sought; `open` raises as the shelf does."""
+
+    def __init__(self, shelf: Elsewhere, name: str) -> None:
+        self.name, self._shelf = name, shelf
+
+    def __str__(self) -> str:
+        return self.name
+
+    def open(self, _: Literal["rb"], /) -> IO[bytes]:
+        return io.BufferedReader(_Pieces(self._shelf, self.name), PIECE_BYTES)
+
+
+class _Pieces(io.RawIOBase):
+    def __init__(self, shelf: Elsewhere, name: str) -> None:
+        self._shelf, self._name, self._at, self._size = shelf, name, 0, shelf.size(name)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        self._at = max(0, start + offset)
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        end = min(self._size, self._at + len(buffer))
+        piece = next(self._shelf.pieces(self._name, self._at, end), b"")
+        piece = piece[: end - self._at]
+        buffer[: len(piece)] = piece
+        self._at += len(piece)
+        return len(piece)
 
 
 def read(shelf: Shelf, request: Mapping[str, Any]) -> bytes:

@@ -21,7 +21,7 @@ from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.fleet.fleet import Fleet
-from ground_station.service.fleet.shelf import Shelf
+from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.settings import Run
 from ground_station.service.web import (
     control,
@@ -56,7 +56,8 @@ alarm, recording, gone, selected or pong, …}; binary ones are pictures: a head
 big-endian), the header in JSON, a JPEG. It takes {"type": "select", "payload"}, {"type": "video",
 "on"}, {"type": "shown", "sequence", "shown_ms"} and {"type": "ping", "sent_ms"}.
 
-A recording is played back by the same messages over /api/recordings/FILE/play. Its hello has `tape`
+A recording is played back by the same messages over /api/recordings/FILE/play, another
+station's over /api/stations/STATION/recordings/FILE/play. Its hello has `tape`
 (begin_ns, length_s, marks), its state `playback` (at_s, playing, rate); it also takes
 {"type": "play", "on"}, {"type": "seek", "at_s"} and {"type": "rate", "rate"}.
 """
@@ -162,10 +163,14 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     app.include_router(recordings.router(recorded))
     if fleet is not None:
         fleet.shelf = recorded
-    app.include_router(recordings.elsewhere(_elsewhere(fleet)))
+    elsewhere = _elsewhere(fleet)
+    named = fleet.named if fleet else lambda note: note
+    app.include_router(recordings.elsewhere(elsewhere))
     app.include_router(jobs.router(guide.Guide(settings, shelf, recorded), job, snapshot))
     app.include_router(live.router(viewers, access.sessions.holds))
-    app.include_router(playback.router(recorded, run, __version__, access.sessions.holds))
+    app.include_router(
+        playback.router(recorded, elsewhere, named, run, __version__, access.sessions.holds)
+    )
     app.include_router(pages.router(access, settings.name))
     app.include_router(pages.docs_router(app))
     _serve_dashboard(app, static)
@@ -173,8 +178,8 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     return Web(app, guarded, viewers, snapshot, metrics, access, video, loops)
 
 
-def _elsewhere(fleet: Fleet | None) -> Callable[[str], Shelf]:
-    def shelf(station: str) -> Shelf:
+def _elsewhere(fleet: Fleet | None) -> Callable[[str], Elsewhere]:
+    def shelf(station: str) -> Elsewhere:
         if fleet is None or not fleet.knows(station):
             raise NotFound(f"no station {station!r} flies beside this one")
         return fleet.shelf_of(station)

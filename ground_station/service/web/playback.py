@@ -27,6 +27,7 @@ from ground_station.service.bus_messages import (
     FrameMessage,
     PayloadMessage,
 )
+from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.settings import Run
 from ground_station.service.web import video
 from ground_station.service.web.live import STATE_S
@@ -283,19 +284,37 @@ async def _breathe(viewer: Viewer) -> None:
         await asyncio.sleep(_BREATH_S)
 
 
-def router(recorded: Recordings, run: Run, version: str, holds: Callable[[str], bool]) -> APIRouter:
-    """The WebSocket of a recording; `holds` as for the live one."""
+def router(
+    recorded: Recordings,
+    elsewhere: Callable[[str], Elsewhere],
+    named: Callable[[EstimateMessage], EstimateMessage],
+    run: Run,
+    version: str,
+    holds: Callable[[str], bool],
+) -> APIRouter:
+    """The WebSockets of recordings; `holds` as for the live one.
+
+    `elsewhere` is the shelf of another station, by its name, and `named` a pose of it as this
+    station names its map.
+    """
     result = APIRouter()
     places = asyncio.Semaphore(AT_ONCE)
 
     @result.websocket("/api/recordings/{file}/play")
     async def play(socket: WebSocket, file: str) -> None:
+        await _play(socket, lambda: Tape(recorded.path(file)))
+
+    @result.websocket("/api/stations/{station}/recordings/{file}/play")
+    async def play_elsewhere(socket: WebSocket, station: str, file: str) -> None:
+        await _play(socket, lambda: Tape(elsewhere(station).file(file), named))
+
+    async def _play(socket: WebSocket, tape_of: Callable[[], Tape]) -> None:
         await socket.accept()
         if places.locked():
             await close(socket, TRY_LATER, f"{AT_ONCE} recordings are played back already")
             return
         async with places:
-            reading = asyncio.create_task(asyncio.to_thread(lambda: Tape(recorded.path(file))))
+            reading = asyncio.create_task(asyncio.to_thread(tape_of))
             try:
                 while not (await asyncio.wait({reading}, timeout=_BREATH_S))[0]:
                     await socket.send_text(said("reading"))

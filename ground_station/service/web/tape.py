@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ground_station.errors import InputError
@@ -18,7 +17,7 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.intake.files import ESTIMATE_STATE_TOPIC, MAP_TABLE, STATION_TOPIC
 from pi_firmware.wire.errors import BlimpError
-from pi_firmware.wire.recording import VIDEO_TOPIC, RecordingReader
+from pi_firmware.wire.recording import VIDEO_TOPIC, Readable, RecordingReader
 
 _MARKS = 500
 _NOTES: dict[str, type[Message]] = {
@@ -42,10 +41,16 @@ class Tape:
     """What lies in a recording, and when; raises a `BlimpError` for what cannot be played.
 
     `begin_ns` and `end_ns` are this machine's clock. `marks` are the alarms and warnings that the
-    station raised then. A recording without an index, as after a cut, is read through once.
+    station raised then. A recording without an index, as after a cut, is read through once. Poses
+    are told as `named` names their map.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self,
+        path: Readable,
+        named: Callable[[EstimateMessage], EstimateMessage] = lambda note: note,
+    ) -> None:
+        self._named = named
         self._reader = reader = RecordingReader(path)
         summary = reader.summary
         figures = summary.statistics if summary else None
@@ -88,6 +93,7 @@ class Tape:
                 continue
             with contextlib.suppress(BlimpError):  # as is what an older station said otherwise
                 note = bus_messages.decode(_NOTES.get(kind, EstimateMessage), message.data)
+                note = self._named(note) if isinstance(note, EstimateMessage) else note
                 yield Heard(message.log_time, payload_id, kind, note)
 
     def _marks(self) -> Iterator[dict[str, Any]]:

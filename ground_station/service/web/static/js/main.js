@@ -65,7 +65,7 @@ const playback = new Playback(store, send, () => {
   connection.reopen();
 });
 const recordings = new RecordingsDialog(
-  (file) => playback.open(file),
+  (file, station) => playback.open(file, station),
   () => store.otherStations(),
 );
 const steps = new Steps(store, loop);

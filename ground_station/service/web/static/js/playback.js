@@ -20,7 +20,7 @@ export class Playback {
     this.store = store;
     this.send = send;
     this.turned = turned;
-    this.file = "";
+    this.file = this.station = "";
     this.begin_ms = NaN;
     this.sought_ms = 0;
     this.is_held = false; // the time line, by a finger
@@ -40,12 +40,13 @@ export class Playback {
 
   /** Where its messages come from; empty: the live ones. */
   get path() {
-    return this.file && `${api.recordingPath(this.file)}/play`;
+    return this.file && `${api.recordingPath(this.file, this.station)}/play`;
   }
 
-  /** @param {string} file */
-  open(file) {
+  /** @param {string} file @param {string} station where it lies; empty: here */
+  open(file, station) {
     this.file = file;
+    this.station = station;
     show(this.bar, true);
     setText(this.f.file, `Reading ${file}…`);
     setText(this.f.live, "Back to live");

@@ -8,7 +8,7 @@ import { dateTime, size, stopwatch } from "./format.js";
 const SURE_MS = 4000; // a second press within deletes
 
 export class RecordingsDialog {
-  /** @param {(file: string) => void} play @param {() => string[]} stations the others that are there */
+  /** @param {(file: string, station: string) => void} play @param {() => string[]} stations the others that are there */
   constructor(play, stations) {
     this.play = play;
     this.stations = stations;
@@ -61,18 +61,16 @@ export class RecordingsDialog {
     const [path, name] = [api.recordingPath(file.file, file.station), make("b", "", dateTime(began_ms))];
     name.title = file.file;
     const row = make("li", "", make("div", "", name, make("small", "", facts), make("small", "", file.file)));
-    if (file.station) {
-      row.append(link("Download", path, file.file));
-      return row;
-    }
     const player = make("button", "", "Play");
     player.setAttribute("type", "button");
     player.addEventListener("click", () => {
       this.dialog.close();
-      this.play(file.file);
+      this.play(file.file, file.station ?? "");
     });
     if (!file.active) row.append(player);
-    row.append(link("Download", path, file.file), link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
+    row.append(link("Download", path, file.file));
+    if (file.station) return row;
+    row.append(link("Trajectory", `${path}/trajectory.txt`, file.file.replace(/mcap$/, "txt")));
     if (!file.active) row.append(this.deleter(file.file));
     return row;
   }
