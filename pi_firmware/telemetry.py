@@ -220,9 +220,7 @@ class Telemetry:
         """
         if self._session is None or self._held is None:
             return []
-        # A link is made with whoever our authority signed; who is not listed says nothing over it.
-        linked = {str(link.auth_identifier) for link in self._session.zenoh.info.links()}
-        if linked & set(self._held.peers):
+        if self._session.linked() & set(self._held.peers):
             return []
         until_s = time.monotonic() + _REFUSALS_LIMIT_S
         found = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import hashlib
 import itertools
 import os
@@ -92,34 +93,57 @@ def replacing(folder: Path, keep: Path | None = None) -> Iterator[Path]:
     Files in `folder` that are not part of a map (recordings, the floor plan) stay. What was there
     is kept as `keep`, a free name beside it, where given. Where the system can, the two change
     places at once, so that a program killed at any moment leaves a whole map. Raises `MapError` as
-    `check_target` does, and when the disk refuses.
+    `check_target` does, while another program writes this map, and when the disk refuses.
     """
     folder = Path(folder).absolute()
     check_target(folder)
     part = folder.with_name(folder.name + ".part")
     old = keep.absolute() if keep is not None else folder.with_name(folder.name + ".old")
     try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-        yield part
-        files.sync_all(part)
-        if folder.exists():
-            for entry in folder.iterdir():
-                if entry.name not in (*_OURS, PICTURE) and not (part / entry.name).exists():
-                    _keep(entry, part / entry.name)
-            files.sync(part)
-            if keep is None:
-                shutil.rmtree(old, ignore_errors=True)
-            _swap(part, folder, old)
-            if keep is None:
-                shutil.rmtree(old, ignore_errors=True)
-        else:
-            part.rename(folder)
-        files.sync(folder.parent)
+        with _alone(part, folder):
+            yield part
+            files.sync_all(part)
+            if folder.exists():
+                for entry in folder.iterdir():
+                    if entry.name not in (*_OURS, PICTURE) and not (part / entry.name).exists():
+                        _keep(entry, part / entry.name)
+                files.sync(part)
+                if keep is None:
+                    shutil.rmtree(old, ignore_errors=True)
+                _swap(part, folder, old)
+                if keep is None:
+                    shutil.rmtree(old, ignore_errors=True)
+            else:
+                part.rename(folder)
+            files.sync(folder.parent)
     except OSError as error:
         raise MapError(f"{error.filename or folder}: {error.strerror or error}") from None
+
+
+@contextlib.contextmanager
+def _alone(part: Path, folder: Path) -> Iterator[None]:
+    """Keeps other programs out of `part`, which is empty then, and gone afterwards."""
+    part.mkdir(parents=True, exist_ok=True)
+    lock = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise MapError(
+                f"{folder}: another command is writing this map: wait for it, or choose another"
+                " folder"
+            ) from None
+        for entry in part.iterdir():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
+        try:
+            yield
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        os.close(lock)
 
 
 def _swap(part: Path, folder: Path, old: Path) -> None:

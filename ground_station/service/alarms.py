@@ -36,6 +36,8 @@ HOT_C, NO_MORE_HOT_C = 80.0, 76.0
 MAP_REFUSED, NO_MAP = "map-refused", "no map:"
 """A localizer's event, and how its reason begins, where a map does not fit its features, say."""
 MAP_REFUSED_S = 20.0
+UNLISTED = "unlisted"
+"""The intake's event where somebody's certificate is not on the list, and where that is over."""
 
 _RANK = {INFO: 0, WARNING: 1, ALARM: 2}
 
@@ -107,6 +109,7 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
     yield from _of_recording(state, standing)
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
+    yield from _of_unlisted(state)
     yield from _of_stations(_table(state, "fleet"))
     yield from _of_neighbours(state, standing)
     for payload_id, view in _table(state, "payloads").items():
@@ -265,6 +268,13 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
         if reason.startswith(NO_MAP) and isinstance(view, dict) and view.get("alive"):
             refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
     yield from refused.values()
+
+
+def _of_unlisted(state: Mapping[str, Any]) -> Iterator[Alarm]:
+    said = [event for event in state.get("events") or () if event.get("name") == UNLISTED]
+    newest = max(said, key=lambda event: _number(event.get("time_ns")) or 0.0, default=None)
+    if newest is not None and newest.get("level") == WARNING:
+        yield Alarm(UNLISTED, WARNING, STATION, str(newest.get("text")))
 
 
 def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:

@@ -111,7 +111,8 @@ class TelemetryListener:
         self._states: dict[str, PayloadState] = {}
         self._changed = threading.Condition()
         self._on_event = on_event
-        self.name = credentials.load(certificates).member if str(certificates) else LOCAL_NAME
+        self._held = credentials.load(certificates) if str(certificates) else None
+        self.name = self._held.member if self._held else LOCAL_NAME
         self.session = open_session(
             listen=listen, connect=connect, certificates=certificates, discoverable=discoverable
         )
@@ -154,6 +155,10 @@ class TelemetryListener:
         """The ids of the payloads that are alive now, sorted."""
         with self._changed:
             return sorted(name for name, state in self._states.items() if state.alive)
+
+    def unlisted(self) -> list[str]:
+        """Certificates' names that reach this station and that it does not hear, sorted."""
+        return sorted(self.session.linked() - set(self._held.peers)) if self._held else []
 
     def state(self, payload_id: str) -> PayloadState | None:
         """A snapshot of one payload; None when nothing was heard of it."""

@@ -52,6 +52,15 @@ class Session:
         address = scouting.interface_address(self.interface) if self.interface else None
         return address is not None and address != self.scouting
 
+    def linked(self) -> set[str]:
+        """The names in the certificates of all that are connected.
+
+        A link is made with whoever the authority signed; who is not on the list says nothing over
+        it, and Zenoh does not tell.
+        """
+        links = self.zenoh.info.links()
+        return {str(link.auth_identifier) for link in links if link.auth_identifier}
+
     def close(self) -> None:
         """Sends what is queued and closes; a second call does nothing.
 

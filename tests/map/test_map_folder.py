@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from ground_station.errors import MapError
 from ground_station.map import folder as folders
 
 
@@ -41,3 +42,28 @@ def test_all_of_a_map_is_on_the_disk_before_it_takes_the_old_one_s_place(
     assert (target / "map.toml").read_text() == "new"
     assert (target / "flight.mcap").read_text() == (target / "notes/day.txt").read_text() == "old"
     assert (target / "gone").is_symlink()
+
+
+def test_two_programs_do_not_write_one_map(tmp_path: Path) -> None:
+    target = tmp_path / "hall"
+    part = tmp_path / "hall.part"
+    (part / "sparse").mkdir(parents=True)  # of a program that was killed
+    (part / "map.toml").write_text("half")
+    with folders.replacing(target) as first:
+        assert list(first.iterdir()) == []
+        (first / "map.toml").write_text("first")
+        with (
+            pytest.raises(MapError, match="hall: another command is writing this map"),
+            folders.replacing(target),
+        ):
+            pass
+    assert (target / "map.toml").read_text() == "first" and not part.exists()
+
+
+def test_what_lies_behind_a_link_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "letter").touch()
+    (tmp_path / "hall.part").symlink_to(tmp_path / "home")
+    with pytest.raises(MapError), folders.replacing(tmp_path / "hall"):
+        pass
+    assert (tmp_path / "home" / "letter").exists()

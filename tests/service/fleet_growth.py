@@ -37,10 +37,9 @@ from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage
 
 ALONE, APART, JOINED = "one alone", "two apart", "two joined"
-SIDE_HZ, LATER, WORSE = 15.0, 1.2, 1.2
-"""A payload's rate there, and how much later and further off poses of joined stations may be than
-those of two apart on the same processors.
-"""
+SIDE_HZ, SIDE_S, TURNS = 15.0, 40.0, 2
+LATER, WORSE = 1.2, 1.2
+"""How much later and further off poses of joined stations may be than those of two apart."""
 STATIONS = 1, 3, 6
 EACH = 2
 """Payloads of a station."""
@@ -67,9 +66,8 @@ class Flown:
     tracking: float
 
 
-def flown(stations: str, there: Sequence[Service], folder: Path) -> Flown:
-    """A payload with each station; the first one's page is looked at."""
-    truth = Truth(FLIGHT)
+def flown(stations: str, there: Sequence[Service], folder: Path) -> list[EstimateMessage]:
+    """What is told of a payload with each station; the first one's page is looked at."""
     notes: list[EstimateMessage] = []
     with contextlib.ExitStack() as flying:
         for service in there:
@@ -88,32 +86,36 @@ def flown(stations: str, there: Sequence[Service], folder: Path) -> Flown:
             bus.subscribe(
                 bus_messages.ESTIMATE, EstimateMessage, lambda _, note: notes.append(note)
             )
-        time.sleep(MEASURE_S)
-        told = list(notes)
-    return Flown(
-        stations,
-        statistics.median(1e-6 * (one.done_ns - one.capture_ns) for one in told if one.capture_ns),
-        statistics.median(
-            100 * math.dist(one.position_m, truth.at(one.time_ns)) for one in told if one.position_m
-        ),
-        len(told) / len(there) / MEASURE_S,
-        sum(one.state == "TRACKING" for one in told) / len(told),
-    )
+        time.sleep(SIDE_S)
+        return list(notes)
 
 
 def side_by_side(folder: Path) -> list[Flown]:
-    """One station, two that know nothing of each other, two that joined."""
-    found = []
-    for stations in (ALONE, APART, JOINED):
-        own = folder / stations
+    """One station, two that know nothing of each other, two that joined: by turns."""
+    truth = Truth(FLIGHT)
+    told: dict[str, list[EstimateMessage]] = {ALONE: [], APART: [], JOINED: []}
+    for turn, stations in enumerate([*told] * TURNS):
+        own = folder / f"{turn} {stations}"
         own.mkdir()
         there = list(joined(own))
         if stations != JOINED:
             for k in range(len(there)):
                 (own / f"{k}").mkdir()
             there = [Service(own / f"{k}") for k in range(1 if stations == ALONE else 2)]
-        found.append(flown(stations, there, own))
-        print(found[-1], flush=True)
+        told[stations] += flown(stations, there, own)
+    found = [
+        Flown(
+            stations,
+            statistics.median(1e-6 * (n.done_ns - n.capture_ns) for n in notes if n.capture_ns),
+            statistics.median(
+                100 * math.dist(n.position_m, truth.at(n.time_ns)) for n in notes if n.position_m
+            ),
+            len(notes) / (TURNS * SIDE_S * (1 if stations == ALONE else 2)),
+            sum(n.state == "TRACKING" for n in notes) / len(notes),
+        )
+        for stations, notes in told.items()
+    ]
+    print(*found, sep="\n", flush=True)
     return found
 
 

@@ -356,6 +356,15 @@ def test_a_map_of_other_features(told):
     assert alarms.judge(snapshot.document(), later_ns, {})[f"map/{P}"].alarm.level == "alarm"
 
 
+def test_a_payload_that_is_not_on_the_list(told):
+    snapshot, _ = told
+    for k, level in enumerate(("warning", "info")):
+        text = "payload.blimp-7 reaches this station" if level == "warning" else "is over"
+        event = station.event(name="unlisted", level=level, text=text, time_ns=time.time_ns() + k)
+        snapshot.event("-", event)
+        assert ids(snapshot) == ({"unlisted": "warning"} if level == "warning" else {})
+
+
 def test_what_flickers_stands_and_keeps_its_beginning(told):
     snapshot, _ = told
     good = snapshot.document()

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -253,21 +252,13 @@ def test_a_file_ends_at_its_age(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             made.frame("blimp-1", frame(k), log_ns(k))
         run = made._run
         assert run is not None
-        wait_for(lambda: not run.queue._items)  # noqa: B023
+        eventually(lambda: not run.queue._items)  # noqa: B023
         now_s[0] += 4.5
     assert made.file != name
     made.close()
     paths = recorded(tmp_path)
     assert len(paths) == 2 and [n for path in paths for n in sequences(path)] == [*range(60)]
     assert sequences(paths[1])[0] == 3 * GOP  # the first IDR after 10 s, of one each 4.5 s
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    for _ in range(6000):
-        if condition():
-            return
-        time.sleep(0.01)
-    raise AssertionError("waited in vain")
 
 
 def test_a_disk_without_room_is_a_reason_and_an_alarm(tmp_path: Path) -> None:
@@ -281,9 +272,9 @@ def test_a_disk_without_room_is_a_reason_and_an_alarm(tmp_path: Path) -> None:
     made.frame("blimp-1", frame(0), log_ns(0))
     path = tmp_path / made.file
     path.unlink()  # a file that somebody deletes is no place for more
-    wait_for(lambda: not made.file)
+    eventually(lambda: not made.file)
     assert "deleted" in made.state().problem
-    wait_for(lambda: events.told[-1][0] == "recording-ended")
+    eventually(lambda: events.told[-1][0] == "recording-ended")
     assert events.told[-1][1] == bus_messages.ALARM
     assert made.start() and made.state().problem == ""
     made.close()

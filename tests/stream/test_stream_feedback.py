@@ -3,12 +3,13 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 from numbered_flight import encoded, packets, stamped
+from waiting import eventually
 
 from ground_station.stream.arrivals import Flow
 from ground_station.stream.counters import Counters
@@ -106,13 +107,6 @@ def listener() -> Iterator[TelemetryListener]:
         yield opened
 
 
-def until(condition: Callable[[], object]) -> bool:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    return bool(condition())
-
-
 class Ear:
     """A payload with its telemetry, and what it is told of its link."""
 
@@ -192,8 +186,8 @@ def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_men
         # An older payload says nothing of it.
         assert video.told[0] is None and video.correction_ssrc is None
         ear.telemetry.publish(messages.Health(1, 1.0, rtx_ssrc=4711, correction_ssrc=4712))
-        assert until(lambda: video.told[0] == 4711 and video.correction_ssrc == 4712)
-        assert until(lambda: video.told[1] is not None)
+        eventually(lambda: video.told[0] == 4711 and video.correction_ssrc == 4712)
+        eventually(lambda: video.told[1] is not None)
         video.ssrc = 12  # a stream that is not the payload's own
         video.told = (None, None)
         time.sleep(0.2)
@@ -281,7 +275,7 @@ def test_frames_that_cannot_be_shown_ask_for_an_idr_at_once(listener: TelemetryL
         time.sleep(0.3)
         assert len(ear.reports) == 1  # nothing more was withheld since
         video.counters = Counters(packets=21, packets_lost=1, withheld=1, damaged=1)
-        assert until(lambda: len(ear.reports) == 2)
+        eventually(lambda: len(ear.reports) == 2)
         for withheld in range(2, 60):
             video.counters = Counters(packets=20 + withheld, packets_lost=1, withheld=withheld)
             time.sleep(0.01)
@@ -327,8 +321,8 @@ def test_an_idr_is_asked_for_when_mending_failed_and_not_before(
         whole = len(packets([stamped(encoded(12)[0], 0)]))
         for number, datagram in enumerate(datagrams[: whole + 2]):
             sender.sendto(datagram, ("127.0.0.1", receiver.port))
-            assert number == 0 or until(lambda: receiver.streams())
-        assert until(lambda: (stream := receiver.stream_of("one")) and stream.rtx_ssrc == 99)
+            assert number == 0 or eventually(lambda: receiver.streams())
+        eventually(lambda: (stream := receiver.stream_of("one")) and stream.rtx_ssrc == 99)
         missed_s = time.monotonic()
         for datagram in datagrams[whole + 3 :]:
             sender.sendto(datagram, ("127.0.0.1", receiver.port))
@@ -338,7 +332,7 @@ def test_an_idr_is_asked_for_when_mending_failed_and_not_before(
         assert asked is not None and waited_s > 0.1 and stream is not None
         # All of it was withheld at once, when the one packet was given up.
         assert stream.counters.packets_asked == stream.counters.packets_lost == 1
-        assert until(lambda: len(shown) + stream.counters.withheld == 12)
+        eventually(lambda: len(shown) + stream.counters.withheld == 12)
         assert stream.counters.withheld >= 10
         assert sum(report.wants_idr for report in ear.reports) == 1
     ear.close()

@@ -6,11 +6,12 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import pytest
 from numbered_flight import GOP, encoded, number_in, packets, stamped
 from srtp_sender import SrtpSender
+from waiting import eventually
 
 from ground_station.stream import multi_stream
 from ground_station.stream.assembly import ReceivedFrame
@@ -23,13 +24,6 @@ LIMIT_S = 30.0
 
 def units() -> list[bytes]:
     return [stamped(unit, index) for index, unit in enumerate(encoded(FRAMES))]
-
-
-def until(condition: Callable[[], object]) -> bool:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    return bool(condition())
 
 
 class Port:
@@ -90,11 +84,11 @@ def test_two_streams_are_told_apart_and_each_counts_its_own(one_and_two: Port) -
     one_and_two.send(
         datagram for pair in zip(one, [*two, two[-1]], strict=True) for datagram in pair
     )
-    assert until(lambda: len(one_and_two.shown("one")) == FRAMES)
+    eventually(lambda: len(one_and_two.shown("one")) == FRAMES)
     receiver = one_and_two.receiver
     first, second = receiver.stream_of("one"), receiver.stream_of("two")
     assert first is not None and second is not None
-    assert until(lambda: second.counters.packets == len(two) + 1)
+    eventually(lambda: second.counters.packets == len(two) + 1)
     assert (first.ssrc, second.ssrc) == (1, 2)
     assert first.counters.packets == len(one) and first.counters.packets_lost == 0
     assert second.counters.packets_lost == 1 and second.counters.withheld > 0
@@ -116,16 +110,16 @@ def test_one_that_is_not_taken_does_not_hold_up_another(
             return known.counters.packets if known is not None else 0
 
         for number, datagram in enumerate(two):
-            assert until(lambda: taken() > number - 20)  # noqa: B023  # no more than fits
+            eventually(lambda: taken() > number - 20)  # noqa: B023  # no more than fits
             port.send([datagram])
-        assert until(lambda: port.shown("two") == [*range(FRAMES)])
+        eventually(lambda: port.shown("two") == [*range(FRAMES)])
         stream = port.receiver.stream_of("slow")
         assert stream is not None
         # What does not fit is thrown away and counted, and no memory grows with it.
         counters = stream.counters
         assert counters.overrun > 0
         port.held.set()
-        assert until(lambda: stream.counters.packets + stream.counters.overrun == len(slow))
+        eventually(lambda: stream.counters.packets + stream.counters.overrun == len(slow))
         port.shown("slow")
 
 
@@ -136,7 +130,7 @@ def test_a_stream_is_held_until_somebody_vouches_for_it() -> None:
         assert port.frames == {} and port.receiver.streams() == []
         port.names[9] = "late"
         port.send(packets(units(), ssrc=9)[len(packets(units()[:20], ssrc=9)) :])
-        assert until(lambda: port.shown("late") == [*range(FRAMES)])
+        eventually(lambda: port.shown("late") == [*range(FRAMES)])
 
 
 @pytest.mark.parametrize("age", [3, 1])
@@ -160,7 +154,7 @@ def test_what_was_sent_before_the_receiver_was_there_is_not_shown_once_more(age:
         time.sleep(0.3)
         port.names[9] = "one"
         port.send([*recorded, *now[len(now) // 2 :]])
-        assert until(lambda: port.shown("one") == [*range(began, 5 * GOP)])
+        eventually(lambda: port.shown("one") == [*range(began, 5 * GOP)])
         port.send(recorded)
         time.sleep(0.3)
         assert port.shown("one") == [*range(began, 5 * GOP)]
@@ -171,11 +165,11 @@ def test_a_stream_taken_for_nobodys_goes_on_as_whose_it_is() -> None:
     with Port({9: "nobody"}) as port:
         sent = packets(units(), ssrc=9)
         port.send(sent[:100])
-        assert until(lambda: port.shown("nobody"))
+        eventually(lambda: port.shown("nobody"))
         port.names[9] = "one"
-        assert until(lambda: port.receiver.stream_of("one"))
+        eventually(lambda: port.receiver.stream_of("one"))
         port.send(sent[100:])
-        assert until(lambda: len(port.shown("nobody")) + len(port.frames.get("one", [])) == FRAMES)
+        eventually(lambda: len(port.shown("nobody")) + len(port.frames.get("one", [])) == FRAMES)
         assert port.shown("nobody") + port.shown("one") == [*range(FRAMES)]
 
 
@@ -192,14 +186,14 @@ def test_strangers_and_garbage_are_counted_and_bounded(one_and_two: Port) -> Non
         for k in range(max(len(mixed), len(genuine)))
         for datagram in (*mixed[k : k + 1], *genuine[k : k + 1])
     )
-    assert until(lambda: one_and_two.shown("one") == [*range(FRAMES)])
+    eventually(lambda: one_and_two.shown("one") == [*range(FRAMES)])
     held = lambda: sum(len(c.packets) for c in receiver._candidates.values())  # noqa: E731
 
     def told() -> int:
         counted = receiver.counters
         return counted.garbage + counted.other_streams + held()
 
-    assert until(lambda: told() == len(mixed))
+    eventually(lambda: told() == len(mixed))
     assert len(receiver._candidates) <= 8 and held() <= 8 * 512
     assert [stream.payload_id for stream in receiver.streams()] == ["one"]
 
@@ -212,11 +206,11 @@ def test_a_payload_has_one_stream_and_the_next_when_that_is_silent() -> None:
         port.send(
             datagram for pair in zip(earlier[half:], later, strict=False) for datagram in pair
         )
-        assert until(lambda: len(port.shown("one")) == FRAMES)
+        eventually(lambda: len(port.shown("one")) == FRAMES)
         assert {frame.ssrc for frame in port.frames["one"]} == {1}
         time.sleep(0.6)
         port.send(later[len(earlier) - half :])
-        assert until(lambda: len(port.frames["one"]) == 2 * FRAMES)
+        eventually(lambda: len(port.frames["one"]) == 2 * FRAMES)
         assert port.shown("one") == [*range(FRAMES)] * 2
         (stream,) = port.receiver.streams()
         assert stream.ssrc == 2 and stream.counters.packets == len(later)
@@ -232,9 +226,9 @@ def test_with_keys_each_payload_is_its_own_and_nobody_elses() -> None:
     # `two` announces the stream 3, which was made with the key of `one`.
     with Port({1: "one", 2: "two", 3: "two"}, srtp_keys=keys) as port:
         port.send(d for four in zip(one, two, plain[1], stolen, strict=True) for d in four)
-        assert until(lambda: port.shown("one") == [*range(FRAMES)] == port.shown("two"))
+        eventually(lambda: port.shown("one") == [*range(FRAMES)] == port.shown("two"))
         assert {frame.ssrc for frame in port.frames["two"]} == {2}
-        assert until(lambda: port.receiver.counters.refused == len(plain[1]))
+        eventually(lambda: port.receiver.counters.refused == len(plain[1]))
         assert port.receiver.encrypted and len(port.receiver.streams()) == 2
 
 
@@ -247,7 +241,7 @@ def test_a_payload_that_sends_with_anothers_ssrc_does_not_shut_it_out() -> None:
     for before in (0, len(own) // 2):  # the owner's own first, or in the middle of them
         with Port({2: "two"}, srtp_keys=keys) as port:
             port.send([*own[:before], *squatting, *own[before:]])
-            assert until(lambda: port.shown("two") == [*range(FRAMES)])
+            eventually(lambda: port.shown("two") == [*range(FRAMES)])
             (stream,) = port.receiver.streams()
             assert stream.counters.packets == len(own) and "one" not in port.frames
 
@@ -256,8 +250,8 @@ def test_there_are_only_so_many_streams_and_a_silent_one_gives_way() -> None:
     with Port({1: "one", 2: "two"}, max_streams=1) as port:
         port.send(packets(units(), ssrc=1))
         port.send(packets(units()[:2], ssrc=2))
-        assert until(lambda: port.shown("one") == [*range(FRAMES)])
-        assert until(lambda: port.shown("two") == [0, 1])  # once `one` was silent for 0.5 s
+        eventually(lambda: port.shown("one") == [*range(FRAMES)])
+        eventually(lambda: port.shown("two") == [0, 1])  # once `one` was silent for 0.5 s
         assert [stream.payload_id for stream in port.receiver.streams()] == ["two"]
 
 
@@ -274,7 +268,7 @@ def test_what_fails_with_a_frame_ends_neither_stream() -> None:
                 sender.sendto(datagram, ("127.0.0.1", receiver.port))
                 if number % 40 == 0:
                     time.sleep(0.02)
-        assert until(lambda: seen[-1:] == [FRAMES - 1])
+        eventually(lambda: seen[-1:] == [FRAMES - 1])
         assert seen == [*range(20, FRAMES)] and receiver.failure == ""
 
 

@@ -3,7 +3,7 @@
 import random
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import pytest
 from numbered_flight import capture_ns, encoded, number_in, packets, stamped
 from receiving import Receiver
 from srtp_sender import SrtpSender
+from waiting import eventually
 
 from ground_station.stream import rtp
 from ground_station.stream.assembly import SETS_TIMEOUT_S, Assembly, ReceivedFrame
@@ -36,13 +37,6 @@ def without_loss() -> list[np.ndarray]:
     return [frame.to_ndarray(format="gray") for frame in [*decoded, *codec.decode(None)]]
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    return condition()
-
-
 def send(datagrams: Iterable[bytes], receiver: Receiver) -> None:
     """Sends datagrams no faster than the receiver takes them: the socket's buffer may be small."""
 
@@ -54,7 +48,7 @@ def send(datagrams: Iterable[bytes], receiver: Receiver) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for number, datagram in enumerate(datagrams, start=1):
             sender.sendto(datagram, ("127.0.0.1", receiver.port))
-            assert until(lambda: number - (taken() - before) < 60)  # noqa: B023
+            eventually(lambda: number - (taken() - before) < 60)  # noqa: B023
 
 
 def all_frames(receiver: Receiver) -> list[ReceivedFrame]:
@@ -161,7 +155,7 @@ def test_hostile_access_units_of_the_own_stream_do_not_end_it() -> None:
     noise += [units[0][:40] + rng.randbytes(400) for _ in range(10)]
     with Receiver(0, queue_frames=2 * FRAMES) as receiver:
         send(packets([*units[:5], *noise, *units]), receiver)
-        assert until(lambda: receiver.counters.access_units == 25 + FRAMES)
+        eventually(lambda: receiver.counters.access_units == 25 + FRAMES)
         frames = all_frames(receiver)
         assert [frame.sequence for frame in frames[-FRAMES:]] == list(range(FRAMES))
         assert accounted(receiver)
@@ -170,7 +164,7 @@ def test_hostile_access_units_of_the_own_stream_do_not_end_it() -> None:
 def test_frames_without_capture_time_are_not_handed_out_but_counted() -> None:
     with Receiver(0, queue_frames=FRAMES) as receiver:
         send(packets(list(encoded(FRAMES))), receiver)
-        assert until(lambda: receiver.counters.unstamped == FRAMES)
+        eventually(lambda: receiver.counters.unstamped == FRAMES)
         assert receiver.get(0.01) is None
         assert accounted(receiver)
 
@@ -183,7 +177,7 @@ def test_with_keys_a_known_payloads_stream_is_taken_and_no_other() -> None:
         protected, strange = own.protect(plain), stranger.protect(plain)
     with Receiver(0, queue_frames=2 * FRAMES, srtp_keys=keys) as receiver:
         send([plain[0], strange[0], plain[1], strange[1]], receiver)
-        assert until(lambda: receiver.counters.refused == 4)
+        eventually(lambda: receiver.counters.refused == 4)
         assert receiver.ssrc is None and receiver.payload_id is None
         mixed = zip(protected, protected, plain, strange, strict=True)
         send([datagram for four in mixed for datagram in four], receiver)
@@ -242,11 +236,11 @@ def test_a_stream_without_parameter_sets_is_said_in_one_line() -> None:
         send(datagrams[:100], receiver)
         time.sleep(SETS_TIMEOUT_S)
         send(datagrams[100:200], receiver)
-        assert until(lambda: bool(receiver.problem))
+        eventually(lambda: bool(receiver.problem))
         assert "no parameter sets" in receiver.problem and "\n" not in receiver.problem
         # And it recovers: a stream that has them is shown.
         send(packets(flight_units(), first=20_000), receiver)
-        assert until(lambda: not receiver.problem)
+        eventually(lambda: not receiver.problem)
         assert receiver.get(1.0) is not None
 
 
@@ -275,7 +269,7 @@ def test_an_exposure_that_cannot_be_is_not_passed_on() -> None:
     ]
     with Receiver(port=0, queue_frames=FRAMES) as receiver:
         send(packets(units), receiver)
-        assert until(lambda: receiver.counters.decoded == len(told))
+        eventually(lambda: receiver.counters.decoded == len(told))
         frames = all_frames(receiver)
     assert [frame.sequence for frame in frames] == list(range(len(told)))
     assert [frame.exposure_s for frame in frames] == [

@@ -8,7 +8,7 @@ import random
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -24,6 +24,7 @@ from numbered_flight import (
     stamped,
     start_payload,
 )
+from waiting import eventually
 
 from ground_station.stream import rtp
 from ground_station.stream.assembly import ReceivedFrame
@@ -95,13 +96,6 @@ def send(flown: Flown, count: int, first: int = 0) -> None:
         time.sleep(1 / 60)
 
 
-def until(condition: Callable[[], object]) -> bool:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    return bool(condition())
-
-
 def numbers(frames: Sequence[ReceivedFrame]) -> list[int]:
     sequences = [frame.sequence for frame in frames]
     assert [number_in(frame.image) for frame in frames] == sequences
@@ -112,14 +106,14 @@ def numbers(frames: Sequence[ReceivedFrame]) -> list[int]:
 def test_the_payloads_own_link_sends_again_what_was_lost(key: bytes | None) -> None:
     with flying(key=key) as flown:
         send(flown, 5)
-        assert until(lambda: len(flown.frames) == 5)
+        eventually(lambda: len(flown.frames) == 5)
         flown.stream.retransmits(flown.link.rtx_ssrc, 0.001)
         flown.air.impair(Impairment(loss=0.05, delay_s=0.005))
         send(flown, 70, first=5)
-        assert until(lambda: flown.air.idle)
+        eventually(lambda: flown.air.idle)
         flown.air.impair(CLEAN)
         send(flown, 20, first=75)  # in which there is an IDR
-        assert until(lambda: flown.frames[-1].sequence == 94)
+        eventually(lambda: flown.frames[-1].sequence == 94)
         counters = flown.stream.counters
         # A machine that is busy with other things answers some of it too late.
         assert counters.packets_mended >= 0.7 * flown.air.counts.lost > 10
@@ -147,17 +141,17 @@ def test_the_payloads_own_link_corrects_what_was_lost_and_a_clean_one_carries_no
         flown.air._tap = tap
         flown.link.report(replace(LOSSY, dropped=0.0), 0.0)
         send(flown, 5)
-        assert until(lambda: len(flown.frames) == 5)
+        eventually(lambda: len(flown.frames) == 5)
         assert set(kinds) == {96}
         flown.stream.corrects(flown.link.correction_ssrc)
         flown.link.report(LOSSY, 100.0)
         flown.air.impair(Impairment(loss=0.05))
         send(flown, 55, first=5)
-        assert until(lambda: flown.air.idle)
+        eventually(lambda: flown.air.idle)
         flown.air.impair(CLEAN)
         assert 0.1 < flown.link.report(LOSSY, 100.0) < 1.1
         send(flown, 20, first=60)
-        assert until(lambda: flown.frames[-1].sequence == 79)
+        eventually(lambda: flown.frames[-1].sequence == 79)
         counters, link = flown.stream.counters, flown.air.counts
         assert len(numbers(flown.frames)) == 80 - counters.withheld >= 50
         assert counters.withheld == 0 or counters.packets_lost > 0
@@ -171,7 +165,7 @@ def test_the_payloads_own_link_corrects_what_was_lost_and_a_clean_one_carries_no
         flown.link.report(replace(LOSSY, dropped=0.0), 200.0)
         kinds.clear()
         send(flown, 3, first=80)
-        assert until(lambda: flown.frames[-1].sequence == 82)
+        eventually(lambda: flown.frames[-1].sequence == 82)
         assert set(kinds) == {96}
 
 
@@ -179,18 +173,18 @@ def test_an_older_payload_is_asked_for_nothing() -> None:
     with flying(history_s=0.0) as flown:
         assert flown.link.rtx_ssrc is None
         send(flown, 5)
-        assert until(lambda: len(flown.frames) == 5)
+        eventually(lambda: len(flown.frames) == 5)
         flown.stream.retransmits(flown.link.rtx_ssrc, 0.001)
         flown.air.impair(Impairment(loss=0.1))
         send(flown, 30, first=5)
-        assert until(lambda: flown.stream.counters.packets_lost > 0)
+        eventually(lambda: flown.stream.counters.packets_lost > 0)
         assert flown.air.returned == 0 and flown.stream.counters.retransmissions == 0
 
 
 def test_a_nack_without_the_key_costs_nothing_and_with_it_no_more_than_the_budget() -> None:
     with flying(key=KEY) as flown:
         send(flown, 20)
-        assert until(lambda: len(flown.frames) == 20)
+        eventually(lambda: len(flown.frames) == 20)
         came = flown.air.counts.received
         retransmission = flown.link._retransmission
         assert retransmission is not None
@@ -206,7 +200,7 @@ def test_a_nack_without_the_key_costs_nothing_and_with_it_no_more_than_the_budge
             protector = SrtcpProtector("one", KEY)
             for _ in range(40):
                 stranger.sendto(protector.protect(asked), address)
-            assert until(lambda: flown.air.counts.received > came)
+            eventually(lambda: flown.air.counts.received > came)
             time.sleep(0.5)
         assert flown.air.counts.received - came <= 2 * (64 << 10) // 600
 
@@ -224,7 +218,7 @@ def test_a_flood_at_the_payloads_port_is_read_slowly_and_what_is_asked_for_after
     monkeypatch.setattr(payloads.Retransmission, "take", counted)
     with flying() as flown:
         send(flown, 5)
-        assert until(lambda: len(flown.frames) == 5)
+        eventually(lambda: len(flown.frames) == 5)
         retransmission = flown.link._retransmission
         assert retransmission is not None
         address = ("127.0.0.1", retransmission._sockets[0].getsockname()[1])
@@ -241,7 +235,7 @@ def test_a_flood_at_the_payloads_port_is_read_slowly_and_what_is_asked_for_after
                 time.sleep(0.02)
                 return 1 in taken
 
-            assert until(asked_and_sent)
+            eventually(asked_and_sent)
 
 
 def _heard(flown: Flown) -> list[rtp.Packet]:
@@ -261,11 +255,11 @@ def test_all_packets_fit_the_mtu() -> None:
     with flying(key=KEY) as flown:
         flown.air._tap = lambda datagram, lost: sizes.append(len(datagram))
         send(flown, 5)
-        assert until(lambda: len(flown.frames) == 5)
+        eventually(lambda: len(flown.frames) == 5)
         flown.stream.retransmits(flown.link.rtx_ssrc, 0.001)
         flown.air.impair(Impairment(loss=0.2))
         send(flown, 40, first=5)
-        assert until(lambda: flown.stream.counters.packets_mended > 10)
+        eventually(lambda: flown.stream.counters.packets_mended > 10)
     assert max(sizes) == 600
 
 
@@ -284,7 +278,7 @@ def test_what_was_packed_by_another_is_asked_for_in_its_own_numbers() -> None:
         to = ("127.0.0.1", receiver.port)
         sender.sendto(datagrams[0], to)
         sender.sendto(datagrams[1], to)
-        assert until(lambda: receiver.stream_of("one"))
+        eventually(lambda: receiver.stream_of("one"))
         stream = receiver.stream_of("one")
         assert stream is not None
         stream.retransmits(99, 0.001)
@@ -293,7 +287,7 @@ def test_what_was_packed_by_another_is_asked_for_in_its_own_numbers() -> None:
         assert rtcp.asked_for(sender.recv(1500), 77) == [0]
         sender.sendto(sent_again(datagrams[3], ssrc=98), to)  # another's
         sender.sendto(sent_again(datagrams[3]), to)
-        assert until(lambda: len(frames) == 6)
+        eventually(lambda: len(frames) == 6)
         assert receiver.counters.other_streams == 1
 
 
@@ -325,10 +319,10 @@ def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames(way: str) -> 
         finally:
             process.kill()
         assert process.returncode == 0, err
-        assert until(lambda: air.idle)
+        eventually(lambda: air.idle)
         stream = receiver.stream_of("blimp-1")
         assert stream is not None
-        assert until(lambda: _datagrams(stream) == air.counts.passed)
+        eventually(lambda: _datagrams(stream) == air.counts.passed)
         state = listener.state("blimp-1")
         counters, link = stream.counters, air.counts
     assert state is not None and state.health is not None

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from short_certificates import certify
+from waiting import eventually
 
 from ground_station.keys.authority import Authority
 from ground_station.stream.telemetry import TelemetryListener
@@ -122,8 +123,10 @@ def test_a_revoked_payload_is_refused(tmp_path: Path) -> None:
     stolen = made.folder / "revoked" / "payload.blimp-1"
     with TelemetryListener([FREE], certificates=folder(made, "ground.main")) as listener:
         session = open_session(connect=listener.endpoints, certificates=stolen)
+        eventually(lambda: listener.unlisted() == ["payload.blimp-1"])
         assert not heard(listener, session, "blimp-1", PATIENCE_S)
         assert listener.payloads() == []
+        eventually(lambda: not listener.unlisted())
 
 
 @pytest.mark.parametrize("expired", ["payload.blimp-1", "ground.main"])

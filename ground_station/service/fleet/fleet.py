@@ -567,8 +567,8 @@ class Fleet:
         while not self._closing.wait(_LOOK_S):
             refused = {}
             try:
-                linked = {str(link.auth_identifier) for link in self._session.zenoh.info.links()}
-                for name in linked - set(self._held.stations) - {"None", ""}:
+                linked = self._session.linked()
+                for name in linked - set(self._held.stations):
                     refused[name] = (
                         f"{name} wants to join and is not on this station's list: revoked, or newer"
                         " than these keys"

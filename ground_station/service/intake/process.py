@@ -13,6 +13,7 @@ from typing import Any
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
+from ground_station.service.alarms import UNLISTED
 from ground_station.service.bus_messages import (
     EstimateMessage,
     EventMessage,
@@ -310,6 +311,12 @@ class Intake:
         refused = ", ".join(sorted(self._roster.refused))
         text = f"no place for {refused[:100]}: payloads.most" if refused else ""
         self._tell(bus_messages.STATION, "payloads-too-many", text)
+        unlisted = ", ".join(self._listener.unlisted())
+        text = (
+            f"{unlisted[:100]} reaches this station and is not on its list: revoked, or newer than"
+            " these keys, whose folder blimp keys has written anew"
+        )
+        self._tell(bus_messages.STATION, UNLISTED, text if unlisted else "")
 
     def _elsewhere(self, payload_id: str) -> str:
         """Another station that a payload says it sends its video to; "" for none."""
