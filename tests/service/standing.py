@@ -330,15 +330,18 @@ class Service:
         )
 
 
-def joined(folder: Path) -> tuple[Service, Service]:
-    """Two stations of one authority, the second of which joins the first and takes its map."""
+def joined(folder: Path, port: int = 0, through: int = 0) -> tuple[Service, Service]:
+    """Two stations of one authority, the second of which joins the first and takes its map.
+
+    The first listens at `port`, where the second finds it, or else at the port `through`.
+    """
     for name in ("first", "second"):
         (folder / name).mkdir()
-    fleet = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    first = Service(folder / "first", f"fleet.listen={json.dumps([fleet])}")
+    port = port or free_port(socket.SOCK_STREAM)
+    first = Service(folder / "first", f'fleet.listen=["tls/127.0.0.1:{port}"]')
     second = Service(
         folder / "second",
-        f"fleet.join={json.dumps([fleet])}",
+        f'fleet.join=["tls/127.0.0.1:{through or port}"]',
         f"map.shelf={folder / 'maps'}",
         name="spare",
         authority=first.authority,

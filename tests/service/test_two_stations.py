@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import struct
 from pathlib import Path
 from typing import Any
 
 import httpx
 from intake_stand import eventually
+from payload_process import free_port
+from scenarios.tcp_wire import TcpWire
 from standing import Service, joined
 from websockets.sync.client import connect
 
@@ -86,6 +89,39 @@ def test_stations_that_joined_show_each_others_payloads(tmp_path: Path) -> None:
         first.start()
         eventually(lambda: second.tracking("blimp-1"), _LIMIT_S)
         eventually(lambda: "station/main" not in alarms(second), _LIMIT_S)
+
+
+def test_stations_whose_network_is_cut_fly_on_and_are_one_again(tmp_path: Path) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    with TcpWire(port) as wire:
+        first, second = joined(tmp_path, port, through=wire.port)
+        with (
+            first,
+            second,
+            first.fly("blimp-1", tmp_path / "one", rate_hz=10.0),
+            second.fly("blimp-2", tmp_path / "two", rate_hz=10.0),
+        ):
+            pages, names = (first, second), ("blimp-1", "blimp-2")
+
+            def whole() -> bool:
+                return all(page.tracking(name) for page in pages for name in names)
+
+            eventually(whole, _LIMIT_S)
+            second.record(active=True)
+            wire.block()
+            eventually(lambda: "station/main" in alarms(second), _LIMIT_S)
+            eventually(lambda: "station/spare" in alarms(first), _LIMIT_S)
+            for page, own, other in ((first, *names), (second, *reversed(names))):
+                eventually(lambda page=page, own=own: page.has(own), _LIMIT_S)
+                assert not page.tracking(other)
+            assert second.state()["recording"]["active"]
+            wire.fix()
+            eventually(whole, _LIMIT_S)
+            for page, other in ((first, "spare"), (second, "main")):
+                state = page.state()
+                assert [one["name"] for one in state["fleet"]["stations"]] == [other]
+                told = [(e["time_ns"], e["payload"], e["name"]) for e in state["events"]]
+                assert len(set(told)) == len(told) and set(state["payloads"]) == set(names)
 
 
 def test_a_payload_whose_station_dies_flies_on_with_the_other(tmp_path: Path) -> None:
