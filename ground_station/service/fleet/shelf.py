@@ -69,6 +69,7 @@ class Elsewhere:
             yield piece
 
     def file(self, name: str) -> ElsewhereFile:
+        """A file to open as one that lies here."""
         return ElsewhereFile(self, name)
 
     def _json(self, request: Mapping[str, Any]) -> Any:

@@ -313,8 +313,8 @@ class Intake:
         self._tell(bus_messages.STATION, "payloads-too-many", text)
         unlisted = ", ".join(self._listener.unlisted())
         text = (
-            f"{unlisted[:100]} reaches this station and is not on its list: revoked, or newer than"
-            " these keys, whose folder blimp keys has written anew"
+            f"{unlisted[:100]} reaches this station and is not on its list: revoked, or made since"
+            " the station's keys were copied here; then copy their folder anew"
         )
         self._tell(bus_messages.STATION, UNLISTED, text if unlisted else "")
 
