@@ -466,6 +466,15 @@ def test_another_station_s_payload_says_with_whom_it_flies_and_is_sent_elsewhere
     shown.until("!document.querySelector('#station-name').textContent.includes('attic')")
 
 
+def test_the_bar_tells_of_all_payloads_where_each_is_and_for_how_long_yet(
+    shown: Watched, station: FlownStation
+) -> None:
+    facts = "[...document.querySelectorAll('.payload small')].map((one) => one.textContent).join()"
+    shown.until(f"{facts} === '1.5 m · 80 %,1.5 m · 80 %'")
+    station.payloads["blimp-2"].state = "LOST"
+    shown.until(f"{facts} === '1.5 m · 80 %,– m · 80 %'")
+
+
 def test_a_map_that_grew_at_another_station_is_fetched_and_chosen(
     shown: Watched, station: FlownStation, monkeypatch: pytest.MonkeyPatch
 ) -> None:

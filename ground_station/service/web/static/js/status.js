@@ -1,7 +1,7 @@
 // @ts-check
 /** The bar and the banners: payloads to choose from, connection, clock, demo. */
 import { byId, fields, icon, make, setAttribute, setIcon, setText, show } from "./dom.js";
-import { clockTime, duration } from "./format.js";
+import { clockTime, duration, number, percent } from "./format.js";
 import { lookOf } from "./states.js";
 
 const PATIENCE_MS = 1200; // a connection that is back sooner is not worth a banner
@@ -16,7 +16,7 @@ export class Status {
     this.offline = byId("offline");
     this.offlineFields = fields(this.offline);
     this.list = byId("payloads");
-    /** @type {Map<string, {node: HTMLElement, icon: Element, name: Element, word: Element}>} */
+    /** @type {Map<string, {node: HTMLElement, icon: Element, name: Element, word: Element, facts: HTMLElement}>} */
     this.choices = new Map();
     this.list.addEventListener("keydown", (event) => this.step(event));
     loop.add(["connection", "tick", "station"], () => this.drawConnection(), 200);
@@ -66,6 +66,11 @@ export class Status {
       setIcon(choice.icon, look.icon);
       setText(choice.name, at ? `${payload.id} · ${at}` : payload.id);
       setText(choice.word, look.word);
+      show(choice.facts, store.payloads.size > 1);
+      const battery = payload.stale.includes("battery") ? null : payload.note?.battery;
+      const height_m = look.key === "tracking" || look.key === "degraded" ? payload.estimate?.height_m : null;
+      setText(choice.facts, `${number(height_m, 1)} m · ${percent(battery?.percentage)}`);
+      setAttribute(choice.facts, "data-bad", battery?.alarm ? "" : null);
     }
     for (const [id, choice] of this.choices) {
       if (store.payloads.has(id)) continue;
@@ -79,12 +84,13 @@ export class Status {
     const symbol = icon("none");
     const name = make("span", "", id);
     const word = make("i", "", "");
-    const node = make("button", "payload", symbol, name, word);
+    const facts = make("small");
+    const node = make("button", "payload", symbol, make("span", "who", name, facts), word);
     node.setAttribute("type", "button");
     node.setAttribute("role", "radio");
     node.addEventListener("click", () => this.choose(id));
     this.list.append(node);
-    const choice = { node, icon: symbol, name, word };
+    const choice = { node, icon: symbol, name, word, facts };
     this.choices.set(id, choice);
     return choice;
   }
