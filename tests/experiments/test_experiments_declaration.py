@@ -69,7 +69,7 @@ def test_the_shipped_file_holds_every_experiment_of_the_thesis():
     declared = declaration.load()
     names = [experiment.name for experiment in declared.experiments]
     assert names[:6] == ["pillars", "descriptor", "illumination", "viewpoint", "motion", "fast"]
-    assert len(declared.seeds) >= 5
+    assert len(declared.seeds) >= 3
     by_name = {e.name: e for e in declared.experiments}
     lights = [case.flight.light for case in by_name["illumination"].cases]
     assert lights == ["noon", "cloudy", "evening", "sunset"]
