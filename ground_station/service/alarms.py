@@ -109,7 +109,7 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
     yield from _of_recording(state, standing)
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
-    yield from _of_unlisted(state)
+    yield from _of_unlisted(state, now_ns)
     yield from _of_stations(_table(state, "fleet"))
     yield from _of_neighbours(state, standing)
     for payload_id, view in _table(state, "payloads").items():
@@ -270,8 +270,18 @@ def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     yield from refused.values()
 
 
-def _of_unlisted(state: Mapping[str, Any]) -> Iterator[Alarm]:
-    said = [event for event in state.get("events") or () if event.get("name") == UNLISTED]
+def _of_unlisted(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
+    # An intake that is started again says it again, where that is still so.
+    of_intake: Iterator[Mapping[str, Any]] = (
+        one for one in state.get("processes") or () if one.get("name") == "intake"
+    )
+    restarted_s = _number(next(of_intake, {}).get("restarted_s"))
+    since_ns = now_ns - 1e9 * (math.inf if restarted_s is None else restarted_s)
+    said = [
+        event
+        for event in state.get("events") or ()
+        if event.get("name") == UNLISTED and (_number(event.get("time_ns")) or 0.0) >= since_ns
+    ]
     newest = max(said, key=lambda event: _number(event.get("time_ns")) or 0.0, default=None)
     if newest is not None and newest.get("level") == WARNING:
         yield Alarm(UNLISTED, WARNING, STATION, str(newest.get("text")))

@@ -97,11 +97,13 @@ def side_by_side(folder: Path) -> list[Flown]:
     for turn, stations in enumerate([*told] * TURNS):
         own = folder / f"{turn} {stations}"
         own.mkdir()
-        there = list(joined(own))
-        if stations != JOINED:
-            for k in range(len(there)):
-                (own / f"{k}").mkdir()
-            there = [Service(own / f"{k}") for k in range(1 if stations == ALONE else 2)]
+        if stations == JOINED:
+            there = list(joined(own))
+        else:
+            folders = [own / f"{k}" for k in range(1 if stations == ALONE else 2)]
+            for one in folders:
+                one.mkdir()
+            there = [Service(one) for one in folders]
         told[stations] += flown(stations, there, own)
     found = [
         Flown(

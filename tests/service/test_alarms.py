@@ -363,6 +363,12 @@ def test_a_payload_that_is_not_on_the_list(told):
         event = station.event(name="unlisted", level=level, text=text, time_ns=time.time_ns() + k)
         snapshot.event("-", event)
         assert ids(snapshot) == ({"unlisted": "warning"} if level == "warning" else {})
+    state = snapshot.document()
+    state["events"] = [event for event in state["events"] if event["level"] == "warning"]
+    later_ns = time.time_ns() + 60 * S
+    assert set(alarms.judge(state, later_ns, {})) == {"unlisted"}
+    state["processes"] = [{"name": "intake", "age_s": 0.1, "restarted_s": 40.0}]  # it says it anew
+    assert alarms.judge(state, later_ns, {}) == {}
 
 
 def test_what_flickers_stands_and_keeps_its_beginning(told):

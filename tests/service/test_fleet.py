@@ -235,6 +235,9 @@ def test_a_recording_is_played_where_it_does_not_lie(stations: Any, tmp_path: Pa
     assert (there.payloads, there.marks, there.map) == (here.payloads, here.marks, "atrium")
     from_ns = here.begin_ns + 10**10
     assert list(there.since(from_ns)) == list(here.since(from_ns)) != []
+    ours = Tape(shelf.file("flight.mcap"), lambda note: replace(note, map="ours"))
+    maps = {one.note.map for one in ours.since(from_ns) if isinstance(one.note, EstimateMessage)}
+    assert maps == {"ours"}
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-40_000])
     assert list(Tape(shelf.file("cut.mcap")).since(from_ns)) == list(Tape(cut).since(from_ns)) != []
