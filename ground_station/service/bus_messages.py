@@ -8,6 +8,7 @@ Times are nanoseconds; `capture_ns`, `arrival_ns` and `done_ns` are this machine
 from __future__ import annotations
 
 import functools
+import threading
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -201,9 +202,15 @@ def encode(message: Message) -> bytes:
     return msgspec.json.encode(message)
 
 
+_BUILDING = threading.Lock()
+
+
 @functools.cache
 def _decoder(kind: type[N]) -> msgspec.json.Decoder[N]:
-    return msgspec.json.Decoder(kind)
+    # msgspec shows a class to other threads before it knows all its fields: two that hear their
+    # first message of a kind at once ended the process (0.22.0).
+    with _BUILDING:
+        return msgspec.json.Decoder(kind)
 
 
 def decode(kind: type[N], data: bytes) -> N:

@@ -148,7 +148,15 @@ class Child:
         return False
 
     def _start(self) -> None:
-        command = [sys.executable, "-m", self.spec.module, *self.spec.arguments]
+        # One that crashes writes where each of its threads was.
+        command = [
+            sys.executable,
+            "-X",
+            "faulthandler",
+            "-m",
+            self.spec.module,
+            *self.spec.arguments,
+        ]
         # A parent that is killed takes its children with it, whoever started it.
         if setpriv := shutil.which("setpriv"):
             command = [setpriv, "--pdeathsig", "KILL", "--", *command]

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,11 @@ STOP_S = 10.0
 """From SIGTERM until all are gone."""
 _ASK_S = 0.1
 _ACCIDENTS = ("Traceback", "panicked", "CRITICAL", "Exception ignored", "Segmentation")
+
+
+def _tracking(view: Mapping[str, Any]) -> bool:
+    estimate = view.get("estimate") or {}
+    return estimate.get("state") == "TRACKING" and "estimate" not in view["stale"]
 
 
 @dataclass(frozen=True)
@@ -282,13 +287,12 @@ class Service:
 
     def tracking(self, payload_id: str) -> bool:
         """Whether it is localized now."""
-        view = self.payload(payload_id)
-        estimate = view.get("estimate") or {}
-        return estimate.get("state") == "TRACKING" and "estimate" not in view["stale"]
+        return _tracking(self.payload(payload_id))
 
     def has(self, payload_id: str) -> bool:
         """Whether a payload flies with it, and is localized there."""
-        return self.tracking(payload_id) and self.payload(payload_id)["payload"]["station"] == ""
+        view = self.payload(payload_id)
+        return _tracking(view) and bool(view["payload"]) and not view["payload"]["station"]
 
     def record(self, *, active: bool) -> None:
         """The dashboard's button."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -53,6 +55,34 @@ def test_what_cannot_be_is_no_message(message: bus_messages.Message, name: str, 
     text = json.dumps(bus_messages.as_document(message) | {name: value}).encode()
     with pytest.raises(MessageError, match=type(message).__name__):
         bus_messages.decode(type(message), text)
+
+
+_AT_ONCE = """
+import sys, threading
+from dataclasses import make_dataclass
+from ground_station.service.bus_messages import decode
+
+sys.setswitchinterval(1e-6)
+for n in range(20):
+    parts = [make_dataclass(f"Part{n}_{k}", [("x", float, 0.0)]) for k in range(20)]
+    kind = make_dataclass(f"Kind{n}", [(f"f{k}", one | None, None) for k, one in enumerate(parts)])
+    gate = threading.Barrier(8)
+
+    def hear():
+        gate.wait()
+        decode(kind, b'{"f19": {"x": 1.0}, "f3": {"x": 2.0}}')
+
+    threads = [threading.Thread(target=hear) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+"""
+
+
+def test_threads_may_hear_their_first_message_of_a_kind_at_once() -> None:
+    ended = subprocess.run([sys.executable, "-c", _AT_ONCE], timeout=120, check=False)
+    assert ended.returncode == 0
 
 
 @pytest.mark.parametrize("depth", [40, 900, 100_000])
