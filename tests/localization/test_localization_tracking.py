@@ -156,7 +156,8 @@ def test_the_pyramid_is_as_high_as_the_predictions_doubt(doubt_px, levels, monke
     keyframe = wall.keyframe(np.eye(4))
     image = wall.picture(poses.pose(np.eye(3), [0.02, 0.0, 0.0]))  # 2.5 px
     found = track(keyframe, image, np.eye(4), wall.camera, TrackingSettings(), doubt_px)
-    assert used == [levels, 1]  # back from where it was found, 0.7 px are guessed aside
+    # Back from where it was found, 0.7 px are guessed aside; closer, there and back.
+    assert used == [levels, 1, 1, 1]
     assert len(found.point) > 0.95 * found.sought
 
 
@@ -202,6 +203,20 @@ def test_points_are_followed_where_the_wall_looks_otherwise(wall, moved):
     off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
     assert len(tracks.point) > 0.95 * tracks.sought > 80
     assert np.median(off) < 0.06 and np.percentile(off, 95) < 0.3
+
+
+def test_a_point_before_a_wall_farther_away_stays_where_it_is(wall):
+    edge = 400  # the wall ends here: to the right of it another one, which moves by 3 px, is seen
+    before, after = wall.picture(np.eye(4)), wall.picture(np.eye(4))
+    behind = Wall(seed=6).picture(np.eye(4))
+    before[:, edge:], after[:, edge:] = behind[:, edge:], behind[:, edge - 3 : -3]
+    pixel = np.array([[edge - 5, y] for y in range(40, 440, 20)], np.float32)
+    points = wall.on_wall(np.c_[wall.camera.undistort(pixel), np.ones(len(pixel))], np.eye(4))
+    ones = np.ones(len(pixel))
+    keyframe = Keyframe(0, before, np.eye(4), pixel, np.arange(len(pixel)), points, ones)
+    tracks = track(keyframe, after, np.eye(4), wall.camera, TrackingSettings())
+    off = np.linalg.norm(tracks.pixel_px - pixel[tracks.point], axis=1)
+    assert len(off) == len(pixel) and np.median(off) < 0.1  # 0.7 px by KLT's window alone
 
 
 def test_what_tells_no_view_leaves_the_keyframe_as_it_is(wall):
