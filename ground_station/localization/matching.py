@@ -19,14 +19,11 @@ from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
 from ground_station.localization.chance import count_beyond_chance
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.projection import project
-from ground_station.localization.settings import LocalizerSettings
+from ground_station.localization.settings import WIDTH_PX, LocalizerSettings
 from ground_station.localization.verification import APART, Support, Witness
 from ground_station.localization.visibility import Covisibility, LandmarkIndex
 from ground_station.map.modes import described
 from ground_station.map.store import Map
-
-_WIDTH_PX = 640.0
-"""Of the pictures for which the settings name a search radius."""
 
 _DESCRIBED_PX = 10
 """A SIFT descriptor looks further than this around its key point, but with little weight."""
@@ -111,7 +108,7 @@ class Matcher:
             if settings.projection.covisibility and len(keyframes)
             else None
         )
-        self.radius_px = settings.association.radius_px * camera.width_px / _WIDTH_PX
+        self.radius_px = settings.association.radius_px * camera.width_px / WIDTH_PX
         """How far a landmark is looked for at most: what a prediction misses is an angle."""
         self._rolling = settings.pose.solver == "rolling"
         self._readout_s = camera.readout_s if settings.pose.rolling_shutter else 0.0

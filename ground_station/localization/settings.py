@@ -15,6 +15,8 @@ from pi_firmware.wire.errors import ConfigError
 _FOLDER = Path(__file__).with_name("presets")
 PRESETS = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 """By name; each is a file of its own."""
+WIDTH_PX = 640
+"""Of the pictures for which pixels are named; radii and windows are as large a part of others."""
 
 
 @dataclass(frozen=True)

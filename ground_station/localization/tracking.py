@@ -19,7 +19,7 @@ from ground_station.arrays import F32, F64, U8, Bools, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.attempt import Conditions
-from ground_station.localization.settings import TrackingSettings
+from ground_station.localization.settings import WIDTH_PX, TrackingSettings
 
 _EPSILON_PX = 0.02
 """A step shorter than this ends KLT's iteration: well below its noise."""
@@ -39,9 +39,6 @@ px: 0.42 and 0.37 cm, 0.48 and 0.41 without. Alone it would lose points at 4 m/s
 _MORE_ALIKE = 0.7
 """Of the larger window's difference: the smaller one's must be less, or nothing in the larger moves
 otherwise, and it has less noise."""
-
-_WIDTH_PX = 640
-"""Of the pictures for which the settings name a window; in a narrower one it is as wide a part."""
 
 _FEW = 0.5
 """Of the points sought: with fewer the prediction was off, as after a bump, or the view is covered.
@@ -168,7 +165,7 @@ def track(
     of the pyramid than that needs, as each costs as much as the finest; with all where that finds
     fewer than half of them.
     """
-    wide_px = round(settings.window_px * min(1.0, camera.width_px / _WIDTH_PX))
+    wide_px = round(settings.window_px * min(1.0, camera.width_px / WIDTH_PX))
     settings = replace(settings, window_px=max(wide_px, min(_FINE_PX, settings.window_px)))
     few = _levels(settings, doubt_px)
     tracks = _track(keyframe, image, predicted, camera, few, taken)
@@ -287,5 +284,6 @@ def _follow(
     )
     # In noise a point stays where it was looked for and comes back from there: only what is around
     # it tells that it is another.
-    alike = difference.ravel() <= settings.max_difference * _CONTRAST
-    return np.asarray(found, np.float32), (status.ravel() == 1) & alike, difference.ravel()
+    unlike = np.asarray(difference, np.float32).ravel()
+    alike = unlike <= settings.max_difference * _CONTRAST
+    return np.asarray(found, np.float32), (status.ravel() == 1) & alike, unlike

@@ -12,12 +12,14 @@ from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.projection import in_cone
-from ground_station.localization.settings import ProjectionSettings
+from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
 
 RADIUS_PX = 5.0
-"""A feature this near to where a landmark should be may be it."""
+"""A feature this near to where a landmark should be may be it, in a picture of `WIDTH_PX`."""
+_LEAST = 0.5
+"""Of these pixels, in smaller pictures: a key point's own noise does not shrink with them."""
 _NEIGHBOURS = 4
 """Features that are looked at within the radius."""
 _MAX_DISTANCE = 0.75
@@ -61,6 +63,7 @@ class Witness:
     ) -> None:
         """`modes` of the map's landmarks; `scale` of descriptor distances, over RootSIFT's."""
         self.features, self.lens, self._modes = features, lens, modes
+        self._share = max(lens.camera.width_px / WIDTH_PX, _LEAST)
         self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
@@ -74,7 +77,7 @@ class Witness:
         found = distance < self._farthest
         chance = np.mean(
             [
-                (self._near(pixel + s, descriptors, mode)[1] < self._farthest).mean()
+                (self._near(pixel + self._share * s, descriptors, mode)[1] < self._farthest).mean()
                 for s in _SHIFTS_PX
             ]
         )
@@ -109,7 +112,9 @@ class Witness:
 
         Descriptors are a row each and then one for each pixel of `mode` (Q,), ascending.
         """
-        _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=RADIUS_PX)
+        _, near = self._tree.query(
+            pixel_px, k=_NEIGHBOURS, distance_upper_bound=self._share * RADIUS_PX
+        )
         if mode is not None:
             near = np.concatenate([near, near[mode]])
         there = near < len(self.features)

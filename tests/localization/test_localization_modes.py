@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ground_station.experiments.alter import scaled_camera
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.lens import Lens
@@ -219,3 +220,25 @@ def test_a_pose_is_as_significant_by_modes(room):
     points = poses.transform(poses.inverse(truth[0]), room.map.landmarks.position_m[told.landmark])
     off = np.linalg.norm(room.camera.project(points) - seen.keypoints_px[told.feature], axis=1)
     assert np.median(off) < 2.0
+
+
+def test_chance_finds_as_much_in_a_smaller_picture(room):
+    """Features of descriptors that are all alike: what is near enough counts, and nothing else."""
+    small = scaled_camera(room.camera, 0.5)
+    alike = np.tile(room.map.landmarks.descriptor[:1], (len(room.map.landmarks), 1))
+    landmarks = replace(room.map.landmarks, descriptor=alike)
+    _, truth = room.path(1)
+    seen = room.features(truth[0], outliers=0.0)
+    flat = room.camera.undistort(seen.keypoints_px)
+    found = []
+    for camera in (room.camera, small):
+        features = replace(
+            seen,
+            keypoints_px=camera.distort(flat).astype(np.float32),
+            descriptors=alike[: len(seen)],
+        )
+        index = np.arange(len(landmarks))
+        found.append(Witness(features, Lens(camera)).support(truth[0], landmarks, index))
+    large, little = found
+    assert little.expected == pytest.approx(large.expected, rel=0.05)
+    assert large.chance > 0.02 and little.chance == pytest.approx(large.chance, rel=0.2)
