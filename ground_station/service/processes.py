@@ -7,6 +7,7 @@ after a pause that doubles; nobody else waits for it.
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import signal
 import subprocess
@@ -148,19 +149,13 @@ class Child:
         return False
 
     def _start(self) -> None:
-        # One that crashes writes where each of its threads was.
-        command = [
-            sys.executable,
-            "-X",
-            "faulthandler",
-            "-m",
-            self.spec.module,
-            *self.spec.arguments,
-        ]
+        command = [sys.executable, "-m", self.spec.module, *self.spec.arguments]
         # A parent that is killed takes its children with it, whoever started it.
         if setpriv := shutil.which("setpriv"):
             command = [setpriv, "--pdeathsig", "KILL", "--", *command]
-        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        # One that crashes writes where each of its threads was.
+        environment = {**os.environ, "PYTHONFAULTHANDLER": "1"}
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment)
         self._started_s, self._heard_s, self._due_s = self._clock(), None, None
         self.started = True
 

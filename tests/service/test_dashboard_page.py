@@ -269,7 +269,7 @@ def test_states_are_said_in_words_and_old_values_are_not_shown_as_current(
     shown.until("document.querySelector('[data-f=word]').textContent === 'Gone'")
     assert re.search(r"since \d\d:\d\d:\d\d", shown.text("[data-f=since]"))
     shown.page.wait_for_selector("#battery[data-stale]")
-    assert shown.page.locator("#act-relocalize").is_disabled()
+    shown.page.wait_for_selector("#act-relocalize:disabled")
     one.alive, one.state = True, "TRACKING"
     shown.until("document.querySelector('[data-f=word]').textContent === 'Tracking'")
     shown.page.wait_for_selector("#battery:not([data-stale])")
