@@ -108,7 +108,7 @@ def test_the_demo_from_its_start_to_a_trajectory_and_its_end(tmp_path: Path) -> 
         with Viewer(service) as viewer:  # of nobody in particular
             service.record(active=True)
             wanted = {"hello", "state", "estimate", "video", "recording"}
-            before = viewer.counts["video"]  # of what is not recorded
+            before = viewer.counts.get("video", 0)  # of what is not recorded
             eventually(lambda: wanted <= {*viewer.counts} and viewer.counts["video"] > before + 20)
             service.record(active=False)
             eventually(lambda: not service.state()["recording"]["active"])
