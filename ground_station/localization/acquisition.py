@@ -25,7 +25,7 @@ from ground_station.localization.matching import (
 from ground_station.localization.relocalization import Relocalization, Relocalizer
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.localization.tracking import Keyframe, spread_out
-from ground_station.localization.verification import RADIUS_PX
+from ground_station.localization.verification import near_px
 from ground_station.map.store import Map
 
 _ALLOWED = 32.9
@@ -166,7 +166,7 @@ class Acquirer:
             return found
         step = sweeping.weakest(other.covariance[:6, :6], median)
         moved_px = float(self.matcher.camera.fx_px * np.linalg.norm(step[3:]) / near)
-        swept = sweeping.along(other.wTc, step, moved_px, RADIUS_PX)
+        swept = sweeping.along(other.wTc, step, moved_px, near_px(self.matcher.camera))
         here, *held = self.matcher.counts(seen, [state.wTc, *swept], near)
         if max(held) - here <= sweeping.MORE * np.sqrt(max(held)):
             return found

@@ -34,7 +34,7 @@ all but 0.04 % at 5 px, and three all at 10 px."""
 
 _FINE_PX = 9
 """Side of the window by which a point's place is read off in the end. Two simulated flights at 640
-px: 0.42 and 0.37 cm, 0.48 and 0.41 without. Alone it would lose points at 4 m/s, and in noise."""
+px: 0.42 and 0.38 cm, 0.48 and 0.41 without. Alone it would lose points at 4 m/s, and in noise."""
 
 _MORE_ALIKE = 0.7
 """Of the larger window's difference: the smaller one's must be less, or nothing in the larger moves

@@ -10,13 +10,14 @@ from scipy.spatial import cKDTree
 from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import NEAREST_M, Lens
 from ground_station.localization.projection import in_cone
 from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
 
-RADIUS_PX = 5.0
+_RADIUS_PX = 5.0
 """A feature this near to where a landmark should be may be it, in a picture of `WIDTH_PX`."""
 _LEAST = 0.5
 """Of these pixels, in smaller pictures: a key point's own noise does not shrink with them."""
@@ -27,9 +28,14 @@ _MAX_DISTANCE = 0.75
 APART = 1.2
 """Descriptors farther apart are never paired for their scale's sake: by chance it is the root of 2.
 """
-_SHIFTS_PX = np.array([[24.0, 10.0], [-24.0, -10.0], [-10.0, 24.0], [10.0, -24.0]])
-"""Where the landmarks are certainly not: what matches there matches by chance."""
+_SHIFTS = np.array([[4.8, 2.0], [-4.8, -2.0], [-2.0, 4.8], [2.0, -4.8]])
+"""In radii: where the landmarks are certainly not: what matches there matches by chance."""
 _CONES = ProjectionSettings(viewing_cone=True)
+
+
+def near_px(camera: Camera) -> float:
+    """How near, in a camera's pictures, a feature is to where a landmark should be to be it."""
+    return _RADIUS_PX * max(camera.width_px / WIDTH_PX, _LEAST)
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class Witness:
     ) -> None:
         """`modes` of the map's landmarks; `scale` of descriptor distances, over RootSIFT's."""
         self.features, self.lens, self._modes = features, lens, modes
-        self._share = max(lens.camera.width_px / WIDTH_PX, _LEAST)
+        self._radius_px = near_px(lens.camera)
         self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
@@ -77,8 +83,8 @@ class Witness:
         found = distance < self._farthest
         chance = np.mean(
             [
-                (self._near(pixel + self._share * s, descriptors, mode)[1] < self._farthest).mean()
-                for s in _SHIFTS_PX
+                (self._near(pixel + s, descriptors, mode)[1] < self._farthest).mean()
+                for s in _SHIFTS * self._radius_px
             ]
         )
         # A feature is one landmark: the one it looks most like.
@@ -112,9 +118,7 @@ class Witness:
 
         Descriptors are a row each and then one for each pixel of `mode` (Q,), ascending.
         """
-        _, near = self._tree.query(
-            pixel_px, k=_NEIGHBOURS, distance_upper_bound=self._share * RADIUS_PX
-        )
+        _, near = self._tree.query(pixel_px, k=_NEIGHBOURS, distance_upper_bound=self._radius_px)
         if mode is not None:
             near = np.concatenate([near, near[mode]])
         there = near < len(self.features)
