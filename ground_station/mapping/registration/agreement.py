@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ground_station.arrays import F64, I64
+from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import GeometryError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
@@ -57,20 +57,21 @@ class Fitted:
     model: F64
     truth: F64
 
-    @property
-    def spread_m(self) -> float:
-        """Standard deviation of the trajectory's path, along one axis, metres."""
-        return float(np.sqrt(np.mean(self.positions.centred()[1] ** 2)))
+
+def most_agree(alike: Bools) -> bool:
+    """Whether of all poses (N,) no more lie far off the others than a robust fit may leave out."""
+    return bool(np.mean(~alike) <= _MOST_LEFT_OUT)
 
 
 def disagreement(found: Fitted) -> str:
     """What shows that the poses are not of the map's flight; empty where nothing does."""
     used, n = len(found.positions.source), found.given
-    allowed_m = MOST_SCATTER * found.spread_m
+    spread_m = found.positions.spread_m()
+    allowed_m = MOST_SCATTER * spread_m
     if found.scatter_m > allowed_m:
         return (
             "the map has not the shape of the trajectory: its keyframes scatter "
-            f"{found.scatter_m:.3g} m an axis about a path that spreads {found.spread_m:.3g} m "
+            f"{found.scatter_m:.3g} m an axis about a path that spreads {spread_m:.3g} m "
             f"(allowed: {allowed_m:.3g} m)"
         )
     if n - used > _MOST_LEFT_OUT * n:
@@ -153,7 +154,7 @@ def mirrored(found: Fitted) -> str:
         left = _scatter_m(x * [1.0, 1.0, -1.0], y)
     except GeometryError:
         return ""
-    if left < _BETTER * found.scatter_m and left < MOST_SCATTER * found.spread_m:
+    if left < _BETTER * found.scatter_m and left < MOST_SCATTER * found.positions.spread_m():
         return "mirrored it fits: one of its axes has the wrong sign, or two are exchanged"
     return ""
 
@@ -209,7 +210,7 @@ def _runs_backwards(found: Fitted) -> bool:
     """Whether the path would fit in reverse, too: a straight line and a circle at even speed do."""
     x, y = found.positions.source, found.positions.target[::-1]
     try:
-        return _scatter_m(x, y) <= MOST_SCATTER * found.spread_m
+        return _scatter_m(x, y) <= MOST_SCATTER * found.positions.spread_m()
     except GeometryError:
         return True  # one line, of which both ends are alike
 

@@ -59,6 +59,11 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
     used, fit, offset = started.used, started.fit, started.offset
     alike, turned, turned_alike = started.alike, started.turned, started.turned_alike
     scatter_m, on_line = started.scatter_m, started.on_line
+    if started.bent:
+        notes.append(
+            f"the map is bent, or the trajectory: {started.bent} positions lie far off where the "
+            f"others agree; all are used, and scatter {scatter_m:.2g} m an axis"
+        )
     if on_line:
         notes.append("the positions lie on one line: the orientations give the roll about it")
     report: dict[str, Any] = {"method": "trajectory", "points": len(used.source), "points_given": n}
@@ -117,6 +122,8 @@ class _Start:
     turned: F64
     turned_alike: Bools
     offset: Offset
+    bent: int
+    """Positions that lie far off where the others agree, and are used all the same."""
 
 
 def _start(model: F64, truth: F64, seed: int) -> _Start:
@@ -132,10 +139,29 @@ def _start(model: F64, truth: F64, seed: int) -> _Start:
     except (MapError, GeometryError):
         fit, alike = similarity_on_a_line(positions, mean, seed)
         on_line = True
+    bent = 0
+    if not agreement.most_agree(alike) and (whole := _whole(positions)):
+        bent = int((~alike).sum())
+        fit, alike, on_line = whole, np.ones(len(model), dtype=bool), False
     used = positions.of(alike)
     scatter_m = max(position_scatter(used, fit), used.floor_m())
     offset = _offset(used, fit, scatter_m, model, truth, seed)
-    return _Start(used, fit, alike, scatter_m, on_line, turned, turned_alike, offset)
+    return _Start(used, fit, alike, scatter_m, on_line, turned, turned_alike, offset, bent)
+
+
+def _whole(positions: Positions) -> Alignment | None:
+    """The similarity by all positions, where they leave as little as those of one flight do.
+
+    The places of a bent map are off by little and all of them, and where half of its way is
+    straight, the other half is off by many times what that half scatters.
+    """
+    try:
+        check_spread(positions.target, "positions")
+        fit = align(positions.source, positions.target, True)
+    except (MapError, GeometryError):
+        return None
+    fitting = position_scatter(positions, fit) <= agreement.MOST_SCATTER * positions.spread_m()
+    return fit if fitting else None
 
 
 def _offset(

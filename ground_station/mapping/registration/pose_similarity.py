@@ -46,6 +46,10 @@ class Positions:
         mean_x, mean_y = self.source.mean(axis=0), self.target.mean(axis=0)
         return self.source - mean_x, self.target - mean_y, mean_x, mean_y
 
+    def spread_m(self) -> float:
+        """Standard deviation of the trajectory's path, along one axis, metres."""
+        return float(np.sqrt(np.mean(self.centred()[1] ** 2)))
+
     def with_rotation(self, rotation: F64) -> Alignment:
         """The best similarity of a known rotation. Raises `MapError` where its scale is open."""
         dx, dy, mean_x, mean_y = self.centred()

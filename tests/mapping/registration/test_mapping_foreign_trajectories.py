@@ -229,6 +229,12 @@ def noisy(f: Flights, sigma_m: float, sigma_deg: float) -> np.ndarray:
     return poses.pose(turn.as_matrix() @ f.wTc[:, :3, :3], position)
 
 
+def bending(wTc: np.ndarray) -> np.ndarray:
+    """A path that is off by centimetres, and by ever more, from two thirds of its way on."""
+    over = np.maximum(np.linspace(-2, 1, len(wTc)), 0.0)[:, None]
+    return positions(wTc, wTc[:, :3, 3] + over * [0.15, -0.1, 0.05])
+
+
 def turned(f: Flights, degrees: float) -> np.ndarray:
     return rotations(
         f.wTc, f.wTc[:, :3, :3] @ Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
@@ -248,6 +254,7 @@ OWN: dict[str, Callable[[Flights], Trajectory]] = {
     "without orientations": lambda f: f.dense(rotations(f.wTc, level(f))),
     "the first third": lambda f: Trajectory.from_poses(f.time_ns[:330], f.wTc[:330]),
     "every fourth keyframe": lambda f: Trajectory.from_poses(f.time_ns[::32], f.wTc[::32]),
+    "by a map that bends over a third of its way": lambda f: f.dense(bending(f.wTc)),
     "in units of its own": lambda f: f.dense(positions(f.wTc, 0.37 * f.wTc[:, :3, 3])),
     "one pose in ten wrong": lambda f: f.dense(
         positions(f.wTc, f.wTc[:, :3, 3] + 5.0 * (np.arange(len(f.wTc)) % 80 == 8)[:, None])
