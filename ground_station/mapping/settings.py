@@ -71,7 +71,7 @@ class SfmSettings:
     method: str = config.key("incremental", choices=("incremental", "global", "auto"))
     part_images: int = config.key(600, unit="images", low=50, high=20000)
     min_tri_angle_deg: float = config.key(1.5, unit="deg", low=0.0, high=45.0)
-    min_track: int = config.key(3, unit="images", low=2, high=100)
+    min_track: int = config.key(2, unit="images", low=2, high=100)
     max_error_px: float = config.key(2.5, unit="px", low=0.1, high=20.0)
     loss_px: float = config.key(1.0, unit="px", low=_LEAST_LOSS_PX, high=100.0)
     max_jump: float = config.key(4.0, low=1.5, high=1000.0)

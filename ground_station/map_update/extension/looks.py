@@ -14,6 +14,9 @@ from ground_station.mapping.settings import MappingSettings
 _MOST_SPREAD = 0.6
 """RMS distance of a mode's observations from their mean, beyond which they are not one look."""
 
+_FEWEST = 3
+"""Frames that must have seen a mode: two may share what hid the landmark."""
+
 
 @dataclass(frozen=True)
 class Looks:
@@ -35,7 +38,7 @@ def new_looks(map_: Map, landmark: I64, descriptor: F32, settings: MappingSettin
 
     An observation is far when its descriptor is further from all that the landmark has than
     `mode_distance` and than `mode_spreads` times the landmark's spread. Far ones, of at least
-    `sfm.min_track` frames and alike among themselves, become a mode: their mean. What is near
+    three frames and alike among themselves, become a mode: their mean. What is near
     changes nothing, so that a landmark goes on to look in its first light as it did.
     """
     wanted, lm = settings.extend, map_.landmarks
@@ -47,7 +50,7 @@ def new_looks(map_: Map, landmark: I64, descriptor: F32, settings: MappingSettin
     mean = mean_descriptors(descriptor[far], group, len(shown))
     square = np.sum((descriptor[far] - mean[group]) ** 2, axis=1)
     spread = np.sqrt(np.bincount(group, square, len(shown)) / np.maximum(count, 1))
-    good = (count >= settings.sfm.min_track) & (spread <= _MOST_SPREAD)
+    good = (count >= _FEWEST) & (spread <= _MOST_SPREAD)
     had = np.zeros(len(lm), np.int64)
     if map_.modes is not None:
         had = np.bincount(map_.modes.landmark, minlength=len(lm))
