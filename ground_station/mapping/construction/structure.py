@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, landmarks
@@ -23,6 +24,7 @@ from ground_station.mapping.construction.placing import (
     lookalikes,
     loops,
     merging,
+    resection,
 )
 from ground_station.mapping.construction.placing.placed import Placed
 from ground_station.mapping.settings import MappingSettings, SfmSettings
@@ -133,6 +135,8 @@ class _Reconstruction:
             models, notes = self._solve("replaced", pairs, start=models[0])
             self._drop_misplaced(models[0], pairs)
         self._drop_implausible(models[0])
+        models[0], resected = self._resected(models[0], pairs)
+        moved += resected
         models, notes, doubts = self._consistent(models, notes, spare, pairs)
         doubts += elsewhere.doubt(self._rivals(models[0], pairs), self._images.names)
         gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
@@ -150,6 +154,50 @@ class _Reconstruction:
             models[1:],
             doubts,
         )
+
+    def _resected(
+        self, model: colmap.Reconstruction, pairs: Pairs
+    ) -> tuple[colmap.Reconstruction, int]:
+        """The model with images where the others put them, and how many of them moved.
+
+        One moves where the model then explains more key points than before, and the chain of
+        neighbours allows it.
+        """
+        moved: set[int] = set()
+        while True:
+            tried = self._elsewhere(model, pairs)
+            better = next(
+                (
+                    (k, other)
+                    for k, wTc in tried.items()
+                    if k not in moved and (other := self._with_moved(model, k, wTc, pairs))
+                ),
+                None,
+            )
+            if better is None:
+                return model, len(moved)
+            moved.add(better[0])
+            model = better[1]
+
+    def _elsewhere(self, model: colmap.Reconstruction, pairs: Pairs) -> dict[int, F64]:
+        return resection.elsewhere(
+            self._placed(model), pairs, self._images.pinhole_px, self._camera.matrix,
+            self._wanted.seed,
+        )  # fmt: skip
+
+    def _with_moved(
+        self, model: colmap.Reconstruction, image: int, wTc: F64, pairs: Pairs
+    ) -> colmap.Reconstruction | None:
+        """The model with an image, by index, at another pose (4, 4); None where it is no better."""
+        other = colmap.copied(model)
+        colmap.drop_images(other, [image + 1])
+        work = self._work / "all"
+        mapping = Incremental(work / "database.db", work, self._wanted, lambda: None)
+        other = mapping.with_images(other, {image + 1: wTc})
+        if other.compute_num_observations() <= model.compute_num_observations():
+            return None
+        worse = self._misplaced(other, pairs) - self._misplaced(model, pairs)
+        return None if worse else other
 
     def _consistent(
         self,

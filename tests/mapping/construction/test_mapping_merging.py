@@ -105,6 +105,23 @@ def test_models_that_split_become_one_by_the_pairs_between_them(corridor, tmp_pa
     assert np.bincount(found.point).min() >= MappingSettings().sfm.min_track
 
 
+def test_an_image_that_stands_aside_goes_where_the_others_see_it(corridor, tmp_path):
+    run = _reconstruction(corridor, tmp_path)
+    right = run._solve("all", corridor.pairs)[0][0]
+    assert run._resected(right, corridor.pairs) == (right, 0)
+    aside = colmap.copied(right)
+    seen = colmap.to_arrays(aside)
+    mine = seen.image_id[seen.image] == 21
+    colmap.drop_observations(aside, seen.image_id[seen.image[mine]], seen.feature[mine])
+    frame = aside.frame(aside.image(21).frame_id)
+    wrong = np.array(frame.rig_from_world.matrix())
+    wrong[:, 3] += 0.2 * run._placed(right).depth
+    frame.rig_from_world = colmap.pycolmap.Rigid3d(wrong)
+    found, moved = run._resected(aside, corridor.pairs)
+    assert moved == 1 and found.num_reg_images() == 40
+    assert geometry.error_m(corridor, found).max() < 0.03 < geometry.error_m(corridor, aside).max()
+
+
 def test_what_is_left_without_misfits_is_the_model_itself(corridor, tmp_path):
     model = _reconstruction(corridor, tmp_path)._solve("all", corridor.pairs)[0][0]
     before = colmap.to_arrays(model)
