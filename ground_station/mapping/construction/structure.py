@@ -139,6 +139,7 @@ class _Reconstruction:
         moved += resected
         models, notes, doubts = self._consistent(models, notes, spare, pairs)
         doubts += elsewhere.doubt(self._rivals(models[0], pairs), self._images.names)
+        doubts += bridges.doubt(bridges.hinges(self._placed(models[0])), self._images.names)
         gone = sorted(placed.difference(*(model.reg_image_ids() for model in models)))
         if moved:
             notes.append(

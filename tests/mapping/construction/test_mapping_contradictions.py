@@ -97,8 +97,14 @@ def test_a_pair_that_no_third_image_confirms_speaks_against_nobody():
     assert contradictions.rotations(flat, pixels, K) == {}
 
 
-@pytest.mark.parametrize(("shared", "sets"), [(60, [10]), (12, [5, 5]), (0, [5, 5])])
-def test_a_bridge_of_few_landmarks_does_not_carry_a_scale(shared, sets):
+@pytest.mark.parametrize(
+    ("shared", "noise_px", "sets"),
+    [(60, 0.5, [10]), (12, 0.5, [10]), (12, 5.0, [10]), (12, 50.0, [5, 5]), (0, 0.5, [5, 5])],
+)
+def test_a_bridge_of_few_landmarks_carries_as_much_as_noise_leaves(
+    monkeypatch, shared, noise_px, sets
+):
+    monkeypatch.setattr(bridges, "_NOISE_PX", noise_px)
     wTc, world, _ = scene(count=10, points=200)
     landmark = []
     for k in range(10):
@@ -109,6 +115,12 @@ def test_a_bridge_of_few_landmarks_does_not_carry_a_scale(shared, sets):
         landmark.append(of)
     model = Placed(landmark, dict(enumerate(wTc)), world, PINHOLE)
     assert [len(each) for each in bridges.separated(model)] == sets
+    said = bridges.doubt(bridges.hinges(model), [f"frame-{k}" for k in range(10)])
+    if (shared, noise_px) == (12, 5.0):
+        assert len(said) == 1 and "5 images, frame-0 to frame-4, hang on the rest" in said[0]
+        assert "off by 2.9%" in said[0]
+    else:
+        assert said == []
 
 
 def test_an_image_alone_hangs_by_its_pose():
