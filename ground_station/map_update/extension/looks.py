@@ -13,7 +13,6 @@ from ground_station.mapping.settings import MappingSettings
 
 _MOST_SPREAD = 0.6
 """RMS distance of a mode's observations from their mean, beyond which they are not one look."""
-
 _FEWEST = 3
 """Frames that must have seen a mode: two may share what hid the landmark."""
 

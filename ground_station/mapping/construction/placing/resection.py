@@ -1,4 +1,4 @@
-"""Where the other images would put an image, who do not ask where it stands.
+"""Where the landmarks of the other images put an image, whatever place it has among them.
 
 An image joins a growing model by the few landmarks that are there then. Behind a turn, where what
 is seen lies on one wall, these may leave two poses that fit; what is built on the wrong one fits
@@ -32,8 +32,8 @@ def elsewhere(
     """Poses (4, 4) of images, by index, that stand elsewhere, the best supported ones first.
 
     `pixels` (N, 2) are each image's undistorted key points, `matrix` (3, 3) the camera's. A pose is
-    told where it explains half as many key points as the model's own or more; which of the two is
-    right that does not say.
+    given where it explains at least half as many key points as the model's own; it may still be the
+    wrong one of the two.
     """
     seen: dict[int, list[I64]] = {k: [] for k in model.wTc}
     for (i, j), view in pairs.items():
