@@ -181,10 +181,8 @@ class _Reconstruction:
             model = better[1]
 
     def _elsewhere(self, model: colmap.Reconstruction, pairs: Pairs) -> dict[int, F64]:
-        return resection.elsewhere(
-            self._placed(model), pairs, self._images.pinhole_px, self._camera.matrix,
-            self._wanted.seed,
-        )  # fmt: skip
+        placed, pixels = self._placed(model), self._images.pinhole_px
+        return resection.elsewhere(placed, pairs, pixels, self._wanted.seed)
 
     def _with_moved(
         self, model: colmap.Reconstruction, image: int, wTc: F64, pairs: Pairs

@@ -63,6 +63,14 @@ class Placed:
         ]
         return float(np.median(distances)) if distances else 0.0
 
+    def error_px(self, wTc: F64, landmark: I64, pixel: F64) -> F64:
+        """How far landmarks (N,) are, from a pose (4, 4), off pixels (N, 2); behind it, inf."""
+        local = poses.transform(poses.inverse(wTc), self.position[landmark])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = local[:, :2] / local[:, 2:] * self.pinhole[:2] + self.pinhole[2:]
+        error = np.linalg.norm(at - pixel, axis=1)
+        return np.asarray(np.where(local[:, 2] > 0, error, np.inf))
+
     def in_place(self, pair: Pair, view: TwoView, pixels: Sequence[F64]) -> tuple[int, int]:
         """How many landmarks of one image are where the other saw them, and of how many.
 
@@ -73,11 +81,9 @@ class Placed:
         for one, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
             landmark = self.landmark[one][matches[:, 0]]
             known = landmark >= 0
-            cTw = poses.inverse(self.wTc[other])
-            local = poses.transform(cTw, self.position[landmark[known]])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                at = local[:, :2] / local[:, 2:] * self.pinhole[:2] + self.pinhole[2:]
-            error = np.linalg.norm(at - pixels[other][matches[known, 1]], axis=1)
-            good += int(np.count_nonzero((local[:, 2] > 0) & (error < IN_PLACE_PX)))
+            error = self.error_px(
+                self.wTc[other], landmark[known], pixels[other][matches[known, 1]]
+            )
+            good += int(np.count_nonzero(error < IN_PLACE_PX))
             total += int(np.count_nonzero(known))
         return good, total
