@@ -72,11 +72,7 @@ def build_map(
                 cache=cache, workers=workers, folder=folder / "work",
             )  # fmt: skip
         # A camera that somebody gives without a word on its lens is a calibrated one.
-        lens = SelfCalibration(
-            prior or LensPrior(camera, "file", 0.0),
-            images,
-            settings.match.of(settings.features).ratio,
-        )
+        lens = SelfCalibration(prior or LensPrior(camera, "file", 0.0), images, settings)
         going = True
         while going:
             if lens.camera != camera:
@@ -93,10 +89,13 @@ def build_map(
             if work is None:
                 work = folder / "work" / str(lens.rounds)
                 work.mkdir(parents=True)
-            with _timed(stage_s, "sfm"), _colmap_in(work):
-                structure = reconstruct(images, pairs, camera, limits, threads, work, workers)
-            with _timed(stage_s, "refine"):
-                model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
+            try:
+                with _timed(stage_s, "sfm"), _colmap_in(work):
+                    structure = reconstruct(images, pairs, camera, limits, threads, work, workers)
+                with _timed(stage_s, "refine"):
+                    model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
+            except MapError as error:
+                raise lens.failed(error) from error
             with _timed(stage_s, "lens"):
                 going = lens.go_on(model, images)
         notes = _notes(len(images.names), len(model.names), structure)

@@ -51,16 +51,16 @@ class Prior:
 class Adjusted:
     """The lens at the optimum, its covariance (9, 9), and what it explains.
 
-    `sigma_px` is the robust standard deviation of a pixel coordinate. `explained` is the share of
-    the residuals' variance that goes with the change of the lens, to second order. `moved_px`: of
-    95 % of the observations the residual moved no further.
+    `sigma_px` is the robust standard deviation of a pixel coordinate. `curvature` (9, 9) is of the
+    residuals' variance over the lens, as a share of it. `before` is the lens that the search began
+    with.
     """
 
     camera: Camera
     covariance: F64
     sigma_px: float
-    explained: float
-    moved_px: float
+    curvature: F64
+    before: Camera
 
     @property
     def sigmas(self) -> F64:
@@ -72,6 +72,20 @@ class Adjusted:
         """Of the geometric mean of both focal lengths, as a share of it."""
         share = np.array([0.5 / self.camera.fx_px, 0.5 / self.camera.fy_px])
         return float(np.sqrt(share @ self.covariance[:2, :2] @ share))
+
+    @property
+    def explained(self) -> float:
+        """Share of the residuals' variance that went with the change of the lens."""
+        return self.left_by(self.before)
+
+    def left_by(self, camera: Camera) -> float:
+        """What another lens leaves more, as a share of the residuals' variance.
+
+        The sum of squares is larger by it with that lens and the poses and points that are best for
+        it, to second order.
+        """
+        off = vector(self.camera) - vector(camera)
+        return float(off @ self.curvature @ off)
 
 
 def vector(camera: Camera) -> F64:
@@ -96,16 +110,13 @@ def adjust(model: Model, camera: Camera, prior: Prior) -> Adjusted | None:
         return None
     problem = _Problem(model, prior)
     cTw = np.asarray(np.linalg.inv(model.wTc)[:, :3], np.float64)
-    begin = _State(vector(camera), cTw, model.position)
-    state = begin
+    state = _State(vector(camera), cTw, model.position)
     for settled in _SETTLED:  # the loss follows the residuals, which the lens makes smaller
         scale = _CAUCHY * _robust_sigma(problem.residuals(state))
         state = problem.minimise(state, scale, settled)
-    first, last = problem.residuals(begin), problem.residuals(state)
-    covariance, explained = problem.covariance(state, scale, begin.lens)
-    moved = float(np.percentile(np.linalg.norm(last - first, axis=1), 95))
-    found = with_vector(camera, state.lens)
-    return Adjusted(found, covariance, _robust_sigma(last), explained, moved)
+    covariance, curvature = problem.covariance(state, scale)
+    found, sigma_px = with_vector(camera, state.lens), _robust_sigma(problem.residuals(state))
+    return Adjusted(found, covariance, sigma_px, curvature, camera)
 
 
 @dataclass(frozen=True)
@@ -188,11 +199,8 @@ class _Problem:
                 damping *= 10
         return state
 
-    def covariance(self, state: _State, scale_px: float, given: F64) -> tuple[F64, float]:
-        """Of the lens (9, 9), poses and points marginalised; and what the given one leaves.
-
-        That is the share of the residuals' variance by which the sum of squares is larger with the
-        lens `given` (9,) and the poses and points that are best for it, to second order.
+    def covariance(self, state: _State, scale_px: float) -> tuple[F64, F64]:
+        """Of the lens (9, 9), poses and points marginalised; and the `curvature` (9, 9) there.
 
         Residuals of one stretch of the flight have much in common, and so have those of one part of
         the image, where no five-parameter lens follows the real one. The inverse of the normal
@@ -228,9 +236,8 @@ class _Problem:
             without = np.linalg.solve(total - held, pulls[:, :, None])[:, :, 0]
             spread += np.sum(without**2, axis=0) * (1 - 1 / len(pulls))
         inflation = np.sqrt(np.maximum(spread / np.diag(inverse), 1.0))
-        off = state.lens - given
-        explained = float(off @ information @ off) / variance / freedom
-        return np.asarray(inverse * np.outer(inflation, inflation)), explained
+        inverse *= np.outer(inflation, inflation)
+        return inverse, np.asarray(information / variance / freedom)
 
     def _clusters(self) -> tuple[I64, I64]:
         """The stretch of images and the part of the image that each observation belongs to."""

@@ -83,26 +83,20 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
 
 def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
     """A map's observations without the readout's shift (O, 2), and how many keyframes that
-    concerns.
-
-    A keyframe's velocity is that of its neighbours, where they are within `gap_s`.
+    concerns, as `shutter.shifts_px`.
     """
     camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
-    pixel = camera.undistort_to_pinhole(kf.pixel_px)
-    # Two keyframes of one time, or inputs that overlap in time, have no velocity.
-    order = np.argsort(kf.time_ns, kind="stable")
-    alone = np.concatenate([np.diff(kf.time_ns[order]) > 0, [True]])
-    order = order[alone]
-    twist = np.full((len(kf), 6), np.nan)
-    if camera.readout_s > 0:
-        twist[order] = shutter.twists(kf.time_ns[order], kf.wTc[order], 0.0, gap_s)
     image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
-    X = shutter.in_cameras(kf.wTc[image], lm.position_m[kf.landmark])
-    row_s = shutter.row_times_s(kf.pixel_px[:, 1], camera)
-    known = np.isfinite(twist[image]).all(axis=1)
-    shift = shutter.shift_px(X[known], twist[image[known]], row_s[known], camera)
-    pixel[known] -= np.nan_to_num(shift)
-    return pixel, int(np.isfinite(twist).all(axis=1).sum())
+    shift, count = shutter.shifts_px(
+        kf.time_ns,
+        kf.wTc,
+        camera,
+        gap_s,
+        image,
+        lm.position_m[kf.landmark],
+        kf.pixel_px.astype(np.float64),
+    )
+    return camera.undistort_to_pinhole(kf.pixel_px) - shift, count
 
 
 def drop(graph: Graph, bad: Bools) -> Graph:

@@ -61,6 +61,35 @@ def shift_px(points_c: F64, twist: F64, row_s: F64, camera: Camera) -> F64:
     return np.asarray(flat[0] - flat[1])
 
 
+def shifts_px(
+    time_ns: I64,
+    wTc: F64,
+    camera: Camera,
+    gap_s: float,
+    image: I64,
+    points_w: F64,
+    pixel_px: F64,
+) -> tuple[F64, int]:
+    """How far the readout moved undistorted observations (O, 2), and in how many images it did.
+
+    K images at `time_ns` (K,) and `wTc` (K, 4, 4); O observations, each of one `image` (O,), a
+    point (O, 3) of the world and where it was seen, distorted (O, 2). An image's velocity is that
+    of its neighbours where they are within `gap_s`; without one it moved nothing.
+    """
+    # Two images of one time, or inputs that overlap in time, have no velocity.
+    order = np.argsort(time_ns, kind="stable")
+    order = order[np.concatenate([np.diff(time_ns[order]) > 0, [True]])]
+    twist = np.full((len(time_ns), 6), np.nan)
+    if camera.readout_s > 0:
+        twist[order] = twists(time_ns[order], wTc[order], 0.0, gap_s)
+    known = np.isfinite(twist[image]).all(axis=1)
+    X = in_cameras(wTc[image[known]], points_w[known])
+    row_s = row_times_s(pixel_px[known, 1], camera)
+    shift = np.zeros((len(image), 2))
+    shift[known] = np.nan_to_num(shift_px(X, twist[image[known]], row_s, camera))
+    return shift, int(np.isfinite(twist).all(axis=1).sum())
+
+
 def in_cameras(wTc: F64, points_w: F64) -> F64:
     """Points (N, 3) of the world in the axes of N cameras (N, 4, 4), each in its own."""
     return np.asarray(np.einsum("oji,oj->oi", wTc[:, :3, :3], points_w - wTc[:, :3, 3]))

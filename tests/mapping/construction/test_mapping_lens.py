@@ -10,17 +10,22 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.errors import MapError
 from ground_station.features.extractor import Features
+from ground_station.geometry import camera as cameras
 from ground_station.geometry import poses
-from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.model import Model
 from ground_station.mapping.construction import lens
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.lens_adjustment import PARAMETERS, adjust, vector
 from ground_station.mapping.construction.lens_prior import LensPrior
+from ground_station.mapping.refinement import shutter
+from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import adjustment
 
+CAMERA = replace(cameras.THESIS_CAMERA, readout_s=0.0)
 NOISE_PX = 0.3
+STEP_S = 0.25
 NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Camera axes in the world's, looking along +y."""
 
@@ -42,12 +47,23 @@ def _flight(turns: bool, seed: int, images: int = 24, points: int = 500):
 
 
 def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
-    """What the camera sees as a build has it: noisy key points, and the model they belong to."""
+    """What the camera sees as a build has it: noisy key points, and the model they belong to.
+
+    Its rows are exposed one after the other where it has a readout.
+    """
+    step = [poses.log(each) for each in poses.inverse(wTc[:-1]) @ wTc[1:]]
+    step = np.array([*step, step[-1]]) / STEP_S
     rng = np.random.default_rng(seed)
     image, feature, point, features = [], [], [], []
     for k, T in enumerate(wTc):
         local = poses.transform(poses.inverse(T), xyz)
         pixel = camera.project(local)
+        if camera.readout_s:
+            row_s = shutter.row_times_s(np.nan_to_num(pixel[:, 1]), camera)
+            there = poses.inverse(np.array([poses.exp(one * step[k]) for one in row_s.tolist()]))
+            pixel = camera.project(
+                np.einsum("nij,nj->ni", there[:, :3, :3], local) + there[:, :3, 3]
+            )
         with np.errstate(invalid="ignore"):
             radius = np.linalg.norm(local[:, :2], axis=1) / local[:, 2]
             inside = (local[:, 2] > 0.5) & (radius < 0.8) & (pixel > 0).all(axis=1)
@@ -76,7 +92,7 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
         camera=camera,
     )
     names = model.names
-    time_ns = np.arange(len(names)) * 100_000_000
+    time_ns = (np.arange(len(names)) * 1e9 * STEP_S).astype(np.int64)
     return Images(names, time_ns, features, [f.keypoints_px.astype(float) for f in features]), model
 
 
@@ -99,10 +115,10 @@ def _off(camera: Camera, share: float, distorted: bool = True) -> Camera:
     return wrong if distorted else replace(wrong, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
 
 
-def _judged(known: LensPrior, turns: bool = True, seed: int = 1, true: Camera = THESIS_CAMERA):
+def _judged(known: LensPrior, turns: bool = True, seed: int = 1, true: Camera = CAMERA):
     """A build's rounds over one flight, its images placed with each lens in turn."""
     images, model = _views(true, *_flight(turns, seed), seed)
-    calibration = lens.SelfCalibration(known, images, 0.8)
+    calibration = lens.SelfCalibration(known, images, MappingSettings())
     while calibration.go_on(_adjusted_with(calibration.camera, images, model), images):
         pass
     return calibration
@@ -110,13 +126,13 @@ def _judged(known: LensPrior, turns: bool = True, seed: int = 1, true: Camera = 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_lens_is_found_within_what_is_said_of_it(seed):
-    wrong = _off(THESIS_CAMERA, 1.04, distorted=False)
-    images, model = _views(THESIS_CAMERA, *_flight(True, seed), seed)
+    wrong = _off(CAMERA, 1.04, distorted=False)
+    images, model = _views(CAMERA, *_flight(True, seed), seed)
     model = _adjusted_with(wrong, images, model)
     known = LensPrior(wrong, "guess", 0.2)
-    found = adjust(lens._as_seen(model, images), wrong, lens.prior_of(known, wrong))
+    found = adjust(lens._as_seen(model, images, wrong, 0.0), wrong, lens.prior_of(known, wrong))
     assert found is not None
-    off = np.abs(vector(found.camera) - vector(THESIS_CAMERA)) / found.sigmas
+    off = np.abs(vector(found.camera) - vector(CAMERA)) / found.sigmas
     assert off.max() < 4, dict(zip(PARAMETERS, off.round(1), strict=True))
     assert found.sigma_focal < 0.005 and found.explained > 0.5
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
@@ -126,22 +142,22 @@ def test_the_covariance_holds_over_many_flights():
     """Of 12 flights the mean square of the focal length's error in sigmas is that of a sigma."""
     off = []
     for seed in range(12):
-        images, model = _views(THESIS_CAMERA, *_flight(True, seed, images=16, points=250), seed)
-        known = LensPrior(THESIS_CAMERA, "guess", 0.2)
+        images, model = _views(CAMERA, *_flight(True, seed, images=16, points=250), seed)
+        known = LensPrior(CAMERA, "guess", 0.2)
         found = adjust(
-            lens._as_seen(model, images), THESIS_CAMERA, lens.prior_of(known, THESIS_CAMERA)
+            lens._as_seen(model, images, CAMERA, 0.0), CAMERA, lens.prior_of(known, CAMERA)
         )
         assert found is not None
-        off.append((found.camera.fx_px - THESIS_CAMERA.fx_px) / found.sigmas[0])
+        off.append((found.camera.fx_px - CAMERA.fx_px) / found.sigmas[0])
     rms = np.sqrt(np.mean(np.square(off)))
     assert 0.2 < rms < 1.3
 
 
 def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
     for share, distorted in ((1.03, True), (0.98, True), (1.05, False)):
-        known = LensPrior(_off(THESIS_CAMERA, share, distorted), "file", 0.02)
+        known = LensPrior(_off(CAMERA, share, distorted), "file", 0.02)
         calibration = _judged(known)
-        assert calibration.camera.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.005)
+        assert calibration.camera.fx_px == pytest.approx(CAMERA.fx_px, rel=0.005)
         built = calibration.as_built()
         assert built["state"] == "found"
         assert built["given"]["fx_px"] == pytest.approx(known.camera.fx_px)
@@ -151,30 +167,67 @@ def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
 
 def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said():
     """What comes from how the camera moved, as of a rolling shutter, is no fault of the file."""
-    images, model = _views(THESIS_CAMERA, *_flight(True, 1), 1)
-    centre = np.array([THESIS_CAMERA.cx_px, THESIS_CAMERA.cy_px], np.float32)
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    centre = np.array([CAMERA.cx_px, CAMERA.cy_px], np.float32)
     features = [
         replace(each, keypoints_px=centre + 0.93 * (each.keypoints_px - centre))
         if k < len(model.names) // 2 else each
         for k, each in enumerate(images.features)
     ]  # fmt: skip
     images = replace(images, features=features)
-    known = LensPrior(THESIS_CAMERA, "file", 0.0)
-    calibration = lens.SelfCalibration(known, images, 0.8)
-    model = _adjusted_with(THESIS_CAMERA, images, model)
-    found = adjust(lens._as_seen(model, images), THESIS_CAMERA, lens.prior_of(known, THESIS_CAMERA))
-    assert found is not None and calibration._misfits(found)
+    known = LensPrior(CAMERA, "file", 0.0)
+    calibration = lens.SelfCalibration(known, images, MappingSettings())
+    model = _adjusted_with(CAMERA, images, model)
+    found = adjust(lens._as_seen(model, images, CAMERA, 0.0), CAMERA, lens.prior_of(known, CAMERA))
+    assert found is not None and found.explained > 0.5
     assert not calibration.go_on(model, images)
-    assert calibration.camera == THESIS_CAMERA and calibration.as_built()["state"] == "kept"
+    assert calibration.camera == CAMERA and calibration.as_built()["state"] == "kept"
     (note,) = calibration.notes()
-    assert "is kept" in note and "both halves" in note and "blimp calibrate" in note
+    assert "is kept" in note and "a part of them" in note and "blimp calibrate" in note
+
+
+def test_a_rolling_shutter_is_not_taken_for_a_lens():
+    rolling = replace(CAMERA, readout_s=0.03)
+    for seed in range(3):
+        images, model = _views(rolling, *_flight(True, seed), seed)
+        model = _adjusted_with(CAMERA, images, model)
+        found = adjust(
+            lens._as_seen(model, images, CAMERA, 0.0), CAMERA,
+            lens.prior_of(LensPrior(CAMERA, "file", 0.0), CAMERA),
+        )  # fmt: skip
+        assert found is not None and found.explained > 0.5
+        for known in (rolling, CAMERA):  # the file says it, or does not
+            calibration = lens.SelfCalibration(
+                LensPrior(known, "file", 0.0), images, MappingSettings()
+            )
+            assert not calibration.go_on(model, images) and calibration.camera == known
+
+
+def test_a_file_that_misfits_is_not_kept_silently_where_the_images_leave_the_lens_open(monkeypatch):
+    known = LensPrior(replace(CAMERA, k1=-0.3, k2=0.0), "file", 0.02)
+    calibration = _judged(known, turns=False)
+    assert calibration.as_built()["state"] == "open" and calibration.camera == known.camera
+    assert "may be bent" in calibration.notes()[0]
+    monkeypatch.setattr(lens, "_GROSS", 0.05)  # by more than all else: it is refused
+    with pytest.raises(MapError, match=r"the given camera is not this one's.*'blimp calibrate'"):
+        _judged(known, turns=False)
+
+
+def test_a_lens_found_by_which_no_model_is_found_is_left_open():
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    known = LensPrior(_off(CAMERA, 1.05, distorted=False), "file", 0.0)
+    calibration = lens.SelfCalibration(known, images, MappingSettings())
+    error = MapError("no pair to start from")
+    assert calibration.failed(error) is error
+    assert calibration.go_on(_adjusted_with(known.camera, images, model), images)
+    assert "leave the lens open" in str(calibration.failed(error))
 
 
 def test_the_views_may_change_both_focal_lengths_but_hardly_one_of_them():
     """A rolling shutter stretches a picture's height; a calibration knew fy over fx already."""
     for source, ratio in (("file", 0.0005), ("guess", 0.002)):
-        known = LensPrior(THESIS_CAMERA, source, 0.02)
-        prior = lens.prior_of(known, THESIS_CAMERA)
+        known = LensPrior(CAMERA, source, 0.02)
+        prior = lens.prior_of(known, CAMERA)
         fx, fy = prior.mean[:2]
         relative = prior.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
         assert np.sqrt([1, -1] @ relative @ [1, -1]) == pytest.approx(ratio)
@@ -184,8 +237,8 @@ def test_the_views_may_change_both_focal_lengths_but_hardly_one_of_them():
 @pytest.mark.parametrize("turns", [True, False])
 def test_a_right_camera_file_is_left_as_it_is(turns):
     for seed in range(3):
-        calibration = _judged(LensPrior(THESIS_CAMERA, "file", 0.02), turns, seed)
-        assert calibration.camera == THESIS_CAMERA and calibration.rounds == 1
+        calibration = _judged(LensPrior(CAMERA, "file", 0.02), turns, seed)
+        assert calibration.camera == CAMERA and calibration.rounds == 1
         assert calibration.notes() == [] and calibration.as_built()["state"] == "given"
 
 
@@ -201,17 +254,17 @@ def test_the_same_guess_is_made_good_where_the_camera_turns(monkeypatch):
     guess = replace(Camera(), fx_px=560.0, fy_px=560.0, cx_px=319.5, cy_px=239.5)
     monkeypatch.setattr(lens, "rough_lens", lambda images, known, ratio: known.camera)
     calibration = _judged(LensPrior(guess, "guess", 0.2))
-    assert calibration.camera.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.005)
+    assert calibration.camera.fx_px == pytest.approx(CAMERA.fx_px, rel=0.005)
     assert calibration.rounds > 1 and "lens found by the images" in calibration.notes()[0]
 
 
 def test_a_lens_of_another_model_is_refused_by_name_where_nobody_calibrated_it():
-    images, model = _views(THESIS_CAMERA, *_flight(True, 1), 1)
-    other = replace(THESIS_CAMERA)
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    other = replace(CAMERA)
     object.__setattr__(other, "model", "fisheye")
     with pytest.raises(MapError, match=r"opencv5 only, not fisheye: calibrate it with 'blimp"):
-        lens.SelfCalibration(LensPrior(other, "guess", 0.2), images, 0.8)
-    calibration = lens.SelfCalibration(LensPrior(other, "file", 0.02), images, 0.8)
+        lens.SelfCalibration(LensPrior(other, "guess", 0.2), images, MappingSettings())
+    calibration = lens.SelfCalibration(LensPrior(other, "file", 0.02), images, MappingSettings())
     assert not calibration.go_on(model, images) and calibration.camera == other
 
 
@@ -229,21 +282,21 @@ def _described(images: Images, model: Model) -> Images:
 
 
 def test_a_rough_lens_is_found_from_a_guess_a_third_off():
-    images, model = _views(THESIS_CAMERA, *_flight(True, 2), 2)
+    images, model = _views(CAMERA, *_flight(True, 2), 2)
     guess = replace(Camera(), fx_px=670.0, fy_px=670.0, cx_px=319.5, cy_px=239.5)
     found = lens.rough_lens(_described(images, model), LensPrior(guess, "guess", 0.3), 0.8)
-    assert found.fx_px == pytest.approx(THESIS_CAMERA.fx_px, rel=0.15)
+    assert found.fx_px == pytest.approx(CAMERA.fx_px, rel=0.15)
 
 
 def test_images_that_share_nothing_leave_the_lens_as_it_is_known():
-    images, _ = _views(THESIS_CAMERA, *_flight(True, 2), 2)
-    known = LensPrior(THESIS_CAMERA, "guess", 0.3)
-    assert lens.rough_lens(images, known, 0.8) == THESIS_CAMERA
+    images, _ = _views(CAMERA, *_flight(True, 2), 2)
+    known = LensPrior(CAMERA, "guess", 0.3)
+    assert lens.rough_lens(images, known, 0.8) == CAMERA
 
 
 def test_a_model_too_small_says_nothing_of_the_lens():
     wTc, xyz = _flight(True, 1, points=4)
-    images, model = _views(THESIS_CAMERA, wTc, xyz, 1)
-    known = LensPrior(THESIS_CAMERA, "file", 0.02)
-    calibration = lens.SelfCalibration(known, images, 0.8)
+    images, model = _views(CAMERA, wTc, xyz, 1)
+    known = LensPrior(CAMERA, "file", 0.02)
+    calibration = lens.SelfCalibration(known, images, MappingSettings())
     assert not calibration.go_on(model, images) and calibration.notes() == []

@@ -83,5 +83,5 @@ def test_a_right_lens_is_kept_where_the_camera_s_motion_looks_like_another(tmp_p
     arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:200:10")
     assert _run(*arguments, "--out", folder) == 0
     lens = store.load_info(folder).built["lens"]
-    assert lens["state"] == "kept" and "both halves" in lens["said"]
+    assert lens["state"] == "kept" and "rolling shutter" in lens["said"]
     assert store.load(folder).info.camera == load_camera(DATA / "camera.toml")
