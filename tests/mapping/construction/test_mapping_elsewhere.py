@@ -80,3 +80,17 @@ def test_a_pair_that_breaks_by_a_drift_is_no_other_place() -> None:
     model, pairs, pixels = wall(60)
     model.position[N:] = model.position[:N] + np.array([0.15, 0.0, 0.0])
     assert 5 not in elsewhere.rivals(model, pairs, pixels, MATRIX)
+
+
+def test_what_several_images_say_alike_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV ends with an error when it draws one point twice."""
+    model, pairs, pixels = wall(60)
+    solve, drawn = elsewhere.cv2.solvePnPRansac, []
+
+    def solved(points: np.ndarray, *rest: object, **named: object) -> object:
+        drawn.append(points)
+        return solve(points, *rest, **named)
+
+    monkeypatch.setattr(elsewhere.cv2, "solvePnPRansac", solved)
+    assert elsewhere.rivals(model, pairs, pixels, MATRIX)[5] == Rival(here=N, there=60)
+    assert all(len(np.unique(points, axis=0)) == len(points) for points in drawn) and drawn

@@ -69,8 +69,9 @@ def rivals(
     found = {}
     for k, lists in sorted(key_point.items()):
         here = int(np.count_nonzero(model.landmark[k] >= 0))
-        index = np.concatenate(lists)
-        points = model.position[np.concatenate(landmark[k])]
+        # Several images may say the same of it, and a sample of one and the same has no pose.
+        said = np.unique([np.concatenate(lists), np.concatenate(landmark[k])], axis=1)
+        index, points = said[0], model.position[said[1]]
         there = _elsewhere(model, k, index, pixels[k][index], points, camera_matrix)
         if there >= SPEAKS:
             found[k] = Rival(here, there)
@@ -91,10 +92,13 @@ def _elsewhere(
     """
     if len(points) < SPEAKS:
         return 0
-    solved, turn, t, inliers = cv2.solvePnPRansac(
-        points, pixel, camera_matrix, None,
-        iterationsCount=_DRAWS, reprojectionError=IN_PLACE_PX, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+    try:
+        solved, turn, t, inliers = cv2.solvePnPRansac(
+            points, pixel, camera_matrix, None,
+            iterationsCount=_DRAWS, reprojectionError=IN_PLACE_PX, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # a sample has no pose
+        return 0
     if not solved or inliers is None:
         return 0
     wTc = poses.inverse(poses.pose(cv2.Rodrigues(turn)[0], t.ravel()))
