@@ -159,7 +159,10 @@ class SelfCalibration:
         if given and still.explained < _EXPLAINED:
             return False
         rolling = adjust(views[1], self.camera, prior)
-        found = rolling if rolling is not None and rolling.sigma_px < still.sigma_px else still
+        found = still
+        if rolling is not None:  # a readout that is known is believed where it fits as well
+            known = _AS_WELL if self.camera.readout_s > 0 else 1.0
+            found = rolling if rolling.sigma_px < known * still.sigma_px else still
         self._found = found
         change = vector(found.camera) - vector(self.camera)
         distance = float(change @ np.linalg.solve(found.covariance, change))
