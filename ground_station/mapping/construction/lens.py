@@ -63,6 +63,9 @@ _AS_WELL = 1.05
 """A readout is possible that leaves so much more than the better one. Those of the kitchen, where
 it is there, and of a real corridor, where it is not, differed by 1 to 5 %; in a simulated walk with
 a headset without one, it left 1.9 times as much."""
+_FEWER = 0.9
+"""A lens that more images have decided than the model by it has, by this share, stands. A simulated
+walk of 195 images decided it to 0.04 %; of the 133 that held together by it, the next was bent."""
 _CHECKED_FOCAL = 0.1
 """A calibrated focal length may be off by this share when the views are asked."""
 _ASPECT = {True: 0.0005, False: 0.002}
@@ -129,6 +132,7 @@ class SelfCalibration:
         self.rounds = 0
         self._found: Adjusted | None = None
         self._gross = False
+        self._by = 0  # images that decided `camera`
         self._state = "given" if known.calibrated else "found"
 
     def settings(self, settings: MappingSettings) -> MappingSettings:
@@ -149,6 +153,8 @@ class SelfCalibration:
         if self._state == "open" or not self._follows:  # given up: this model is the given lens's
             return False
         self.rounds += 1
+        if len(model.names) < _FEWER * self._by:
+            return False
         prior = prior_of(self.known, self.camera)
         views = self._views(model, images)
         given = self._state == "given"
@@ -183,6 +189,7 @@ class SelfCalibration:
         elif self.rounds >= ROUNDS:
             return self._give_up(f"after {self.rounds} rounds it has not settled")
         self.camera = found.camera
+        self._by = 0 if is_open else len(model.names)
         return True
 
     def _views(self, model: Model, images: Images) -> list[Model]:

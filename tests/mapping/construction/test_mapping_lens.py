@@ -22,6 +22,7 @@ from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import adjustment
+from ground_station.mapping.sfm.models import among
 
 CAMERA = replace(cameras.THESIS_CAMERA, readout_s=0.0)
 NOISE_PX = 0.3
@@ -216,6 +217,17 @@ def test_a_lens_found_by_which_no_model_is_found_is_left_open():
     assert calibration.failed(error) is error
     assert calibration.go_on(_adjusted_with(known.camera, images, model), images)
     assert "leave the lens open" in str(calibration.failed(error))
+
+
+def test_a_lens_that_many_images_decided_is_not_reopened_by_few():
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    known = LensPrior(_off(CAMERA, 1.05, distorted=False), "file", 0.0)
+    calibration = lens.SelfCalibration(known, images, MappingSettings())
+    assert calibration.go_on(_adjusted_with(known.camera, images, model), images)
+    found = calibration.camera
+    fewer = among(model, np.arange(len(model.names)) < 5)
+    assert not calibration.go_on(_adjusted_with(known.camera, images, fewer), images)
+    assert calibration.camera == found and calibration.as_built()["state"] == "found"
 
 
 def test_the_views_may_change_both_focal_lengths_but_hardly_one_of_them():
