@@ -65,7 +65,7 @@ it is there, and of a real corridor, where it is not, differed by 1 to 5 %; in a
 a headset without one, it left 1.9 times as much."""
 _FEWER = 0.9
 """A lens that more images have decided than the model by it has, by this share, stands. A simulated
-walk of 195 images decided it to 0.04 %; of the 133 that held together by it, the next was bent."""
+walk of 195 images decided it to 0.04 %; the two thirds that held together by it left it open."""
 _CHECKED_FOCAL = 0.1
 """A calibrated focal length may be off by this share when the views are asked."""
 _ASPECT = {True: 0.0005, False: 0.002}
