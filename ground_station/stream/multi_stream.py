@@ -48,7 +48,7 @@ _CANDIDATES = 8
 _HELD_PACKETS = 512
 """Of a stream whose owner is not known yet: about a second, from its first packet on."""
 _LEAP_S = 0.5
-"""Packets of one stream come so much sooner or later than their times say, at most."""
+"""Packets of one stream come so much sooner than their times say, at most."""
 _CANDIDATE_NS = 10_000_000_000
 """A candidate silent for so long is forgotten."""
 _GIVE_WAY_NS = 500_000_000
@@ -90,7 +90,7 @@ class Stream:
         self._sender_ssrc = 1 + secrets.randbelow(0xFFFFFFFF)
         self._waiting: deque[rtp.Packet] = deque()
         self._there = threading.Condition()
-        self._closing = False
+        self._decoding = self._closing = False
         name = f"video-{payload_id}"
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -108,6 +108,11 @@ class Stream:
     def problem(self) -> str:
         """Why the stream cannot be shown, in words; "" while it can."""
         return self.failure or self._assembly.problem or ""
+
+    @property
+    def behind(self) -> bool:
+        """Whether packets that came are not decoded yet."""
+        return self._decoding or bool(self._waiting)
 
     def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
         """Takes with what SSRC its payload says that it sends again what is asked for; None: never.
@@ -157,9 +162,11 @@ class Stream:
                 if not self._waiting and not self._closing:
                     self._there.wait(wait_s)
                 packets, closing = list(self._waiting), self._closing
+                self._decoding = bool(packets)
                 self._waiting.clear()
             for packet in packets:
                 self._give(self._assembly.push(packet))
+            self._decoding = False
             # After the queue, so that a packet that waits in it is not given up.
             self._ask_for(self._assembly.retransmission.due(time.monotonic_ns()))
             self._give(self._assembly.expire(time.monotonic_ns()))
@@ -209,17 +216,18 @@ def _of_now(packets: Iterable[rtp.Packet]) -> list[rtp.Packet]:
     """The packets of a stream that begins, without what came before this receiver was there.
 
     Recorded from the air and sent again, it is authentic, and none of it came here yet. But the
-    stream's own time leaps where it ends and what is sent now begins, and falls back from there.
+    stream's own time leaps where it ends and what is sent now begins, and falls back from there;
+    the air's may stand still meanwhile.
     """
     kept: list[rtp.Packet] = []
     newest: rtp.Packet | None = None
     for packet in packets:
         if newest is not None:
             ticks = (packet.timestamp - newest.timestamp + (1 << 31)) % (1 << 32) - (1 << 31)
-            ahead_s = ticks / rtp.CLOCK_HZ - 1e-9 * (packet.came_ns - newest.came_ns)
-            if ahead_s < -_LEAP_S:
+            later_s, came_s = ticks / rtp.CLOCK_HZ, 1e-9 * (packet.came_ns - newest.came_ns)
+            if later_s < -_LEAP_S:
                 continue
-            if ahead_s > _LEAP_S and ticks > _LEAP_S * rtp.CLOCK_HZ:
+            if later_s > _LEAP_S and later_s - came_s > _LEAP_S:
                 kept.clear()
         kept.append(packet)
         if newest is None or ticks > 0:
@@ -310,6 +318,11 @@ class MultiStreamReceiver:
         """A payload's stream; None while there is none."""
         found = (stream for stream in self.streams() if stream.payload_id == payload_id)
         return next(found, None)
+
+    def behind(self, ssrc: int) -> bool:
+        """Whether something came of a stream that is held or not decoded yet."""
+        streams = (stream.behind for stream in self.streams() if stream.ssrc == ssrc)
+        return any(source[0] == ssrc for source in list(self._candidates)) or any(streams)
 
     def _run(self) -> None:
         try:
@@ -413,7 +426,8 @@ class MultiStreamReceiver:
         stream = Stream(source, owner, self.port, counters, self._on_frame, self._send)
         with self._changed:
             self._streams[source] = stream
-        packets = _of_now(candidate.packets)
+        # Without keys anybody can send anything, and a replay's time leaps and stands still.
+        packets = [*candidate.packets] if key_owner is None else _of_now(candidate.packets)
         self._counters.replayed += len(candidate.packets) - len(packets)
         for packet in packets:
             stream.put(packet, candidate.address)

@@ -128,9 +128,11 @@ def test_a_stream_is_held_until_somebody_vouches_for_it() -> None:
         port.send(packets(units()[:20], ssrc=9))
         time.sleep(0.3)
         assert port.frames == {} and port.receiver.streams() == []
+        assert port.receiver.behind(9) and not port.receiver.behind(8)
         port.names[9] = "late"
         port.send(packets(units(), ssrc=9)[len(packets(units()[:20], ssrc=9)) :])
         eventually(lambda: port.shown("late") == [*range(FRAMES)])
+        eventually(lambda: not port.receiver.behind(9))
 
 
 @pytest.mark.parametrize("age", [3, 1])
@@ -159,6 +161,35 @@ def test_what_was_sent_before_the_receiver_was_there_is_not_shown_once_more(age:
         time.sleep(0.3)
         assert port.shown("one") == [*range(began, 5 * GOP)]
         assert port.receiver.counters.replayed >= len(recorded)
+
+
+@pytest.mark.parametrize("keyed", [False, True], ids=["plain", "encrypted"])
+def test_a_stream_that_stood_still_before_it_was_taken_is_whole(keyed: bool) -> None:
+    """A radio that begins with a gap; a replay that waited for an answer."""
+    key = random.Random(6).randbytes(30)
+    sent = packets(units(), ssrc=9)
+    if keyed:
+        with SrtpSender(key) as sender:
+            sent = sender.protect(sent)
+    with Port({}, srtp_keys={"one": key} if keyed else None) as port:
+        port.send(sent[:20])
+        time.sleep(0.8)
+        port.send(sent[20:])
+        port.names[9] = "one"
+        eventually(lambda: port.shown("one") == [*range(FRAMES)])
+
+
+def test_a_replay_whose_time_leaps_is_whole() -> None:
+    """A stepped flight whose frames of a second in between were gated."""
+    sent = [*units()[:1], *units()[2 * GOP :]]
+    first, later = packets(sent[:1], ssrc=9), packets(sent, ssrc=9)
+    for number, datagram in enumerate(later[len(first) :], start=len(first)):
+        ticks = int.from_bytes(datagram[4:8]) + 90_000
+        later[number] = datagram[:4] + ticks.to_bytes(4) + datagram[8:]
+    with Port({}) as port:
+        port.send(later)
+        port.names[9] = "one"
+        eventually(lambda: port.shown("one") == [0, *range(2 * GOP, FRAMES)])
 
 
 def test_a_stream_taken_for_nobodys_goes_on_as_whose_it_is() -> None:

@@ -272,7 +272,8 @@ class Intake:
         if state is None or state.gate is None:
             return
         answered, newest = told.sequence if told is not None else -1, state.gate.sequence
-        if self._stands.get(payload.id, (0.0, -1))[1] != newest:
+        is_behind = self.video.behind(state.gate.ssrc)
+        if is_behind or self._stands.get(payload.id, (0.0, -1))[1] != newest:
             self._stands[payload.id] = now_s, newest
         elif (
             payload.last_sequence <= answered < newest
