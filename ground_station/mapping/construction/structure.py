@@ -119,11 +119,13 @@ class _Reconstruction:
         missing = {k for link in links for k in link} - {image_id - 1 for image_id in placed}
         doubtful = len(wrong) + len(missing) > _FOLDED * len(self._counts)
         if doubtful and links and pairs.keys() - links:
-            trusted = self._trusted(pairs)
-            spare, said = self._solve("trusted", trusted)
-            still = self._misplaced(spare[0], trusted)
-            if spare[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
-                models, notes, wrong, pairs, spare = spare, said, still, trusted, []
+            spare, trusted = self._trusted(pairs)
+            others, said = self._solve("trusted", trusted)
+            still = self._misplaced(others[0], trusted)
+            if others[0].num_reg_images() - len(still) >= len(placed) - len(wrong):
+                models, notes, wrong, pairs = others, said, still, trusted
+            else:
+                spare += others
         better = {k for k, rival in self._rivals(models[0], pairs).items() if rival.better} - wrong
         wrong |= better
         moved += len(better)
@@ -207,10 +209,11 @@ class _Reconstruction:
     ) -> tuple[list[colmap.Reconstruction], list[str], list[str]]:
         """Models without images that the rotations of pairs contradict, with notes and doubts.
 
-        Where that breaks the first, or it holds too few images, `spare` models of another try and
-        those of the global method, which starts nowhere, are broken up alike, and what is kept are
-        the largest pieces of all. They are joined again where a similarity does it without a
-        contradiction.
+        Where that breaks the first, the others are placed again from its largest piece on. Where it
+        holds too few images, `spare` models of other tries and those of the global method, which
+        starts nowhere, are broken up alike, and it is tried from the largest piece of all. Else
+        what is kept are the largest pieces. They are joined again where a similarity does it
+        without a contradiction.
         """
         confirmed = contradictions.rotations(
             pairs, self._images.pinhole_px, self._camera.matrix, self._wanted.threads
@@ -240,13 +243,30 @@ class _Reconstruction:
 
         pieces = [piece for model in models for piece in split(model)]
         linked = {k for pair in pairs for k in pair}
-        broken = pieces[:1] != models[:1]
-        if not broken and models[0].num_reg_images() >= _NEARLY_ALL * len(linked):
+        enough = _NEARLY_ALL * len(linked)
+        begun = {*models[0].reg_image_ids()} if pieces[:1] == models[:1] else set()
+        if len(begun) >= enough:
             return models, notes, []
-        for model in [*spare, *self._solve("global", pairs, method="global")[0]]:
-            self._drop_misplaced(model, pairs)
-            self._drop_implausible(model)
-            pieces += split(model)
+        sources: tuple[list[colmap.Reconstruction] | None, ...] = [], spare, None
+        for number, more in enumerate(sources):
+            if more is None:
+                more, _ = self._solve("global", pairs, method="global")
+            for model in more:
+                self._drop_misplaced(model, pairs)
+                self._drop_implausible(model)
+                pieces += split(model)
+            largest = max(pieces, key=lambda piece: piece.num_reg_images(), default=None)
+            if largest is None or begun == {*largest.reg_image_ids()}:
+                continue
+            # What is right is a better place to begin at than any pair.
+            begun = {*largest.reg_image_ids()}
+            again, said = self._solve(f"again-{number}", pairs, start=colmap.copied(largest))
+            self._drop_misplaced(again[0], pairs)
+            self._drop_implausible(again[0])
+            again[0], _ = self._resected(again[0], pairs)
+            if split(again[0]) == again[:1] and again[0].num_reg_images() >= enough:
+                return again, said, []
+            pieces += [piece for model in again for piece in split(model)]
         pieces = self._covering(pieces)
         if not pieces:
             raise MapError(
@@ -287,11 +307,12 @@ class _Reconstruction:
         colmap.drop_images(copy, sorted({*copy.reg_image_ids()} - {k + 1 for k in group}))
         return copy
 
-    def _trusted(self, pairs: Pairs) -> Pairs:
-        """The pairs that agree with a model made of links alone."""
+    def _trusted(self, pairs: Pairs) -> tuple[list[colmap.Reconstruction], Pairs]:
+        """Models made of links alone, and the pairs that agree with them."""
         models, _ = self._solve("chain", loops.among(pairs, self._links), joining=pairs)
         parts = [self._placed(model) for model in models]
-        return loops.among(pairs, loops.believed(parts, self._sequence, self._links, pairs))
+        believed = loops.believed(parts, self._sequence, self._links, pairs)
+        return models, loops.among(pairs, believed)
 
     def _solve(
         self,

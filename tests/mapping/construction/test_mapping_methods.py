@@ -11,6 +11,7 @@ import pytest
 
 from ground_station.map import colmap
 from ground_station.mapping.construction import structure
+from ground_station.mapping.construction.placing import contradictions
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import global_mapping
 from ground_station.mapping.sfm.incremental import Incremental
@@ -76,3 +77,19 @@ def test_a_bent_end_is_taken_from_the_method_that_starts_nowhere(corridor, tmp_p
     off = geometry.error_m(corridor, found.reconstruction)
     assert len(off) == 30 and off.max() < 0.03
     assert found.doubts == [] and found.parts == []
+
+
+def test_what_pairs_contradict_is_placed_again_from_what_is_right(corridor, tmp_path, monkeypatch):
+    groups, asked = contradictions.consistent_groups, []
+
+    def broken_once(placed, *rest):
+        asked.append(sorted(placed.wTc))
+        return [{*range(20)}, {*range(20, 30)}] if len(asked) == 1 else groups(placed, *rest)
+
+    monkeypatch.setattr(contradictions, "consistent_groups", broken_once)
+    monkeypatch.setattr(global_mapping, "reconstruct", lambda *_: pytest.fail("asked in vain"))
+    found = _reconstruct(corridor, "incremental", tmp_path)
+    off = geometry.error_m(corridor, found.reconstruction)
+    assert len(off) == 30 and off.max() < 0.03
+    assert found.doubts == [] and found.parts == []
+    assert asked[0] == asked[-1] == [*range(30)]
