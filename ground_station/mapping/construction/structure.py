@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -209,11 +209,10 @@ class _Reconstruction:
     ) -> tuple[list[colmap.Reconstruction], list[str], list[str]]:
         """Models without images that the rotations of pairs contradict, with notes and doubts.
 
-        Where that breaks the first, the others are placed again from its largest piece on. Where it
-        holds too few images, `spare` models of other tries and those of the global method, which
-        starts nowhere, are broken up alike, and it is tried from the largest piece of all. Else
-        what is kept are the largest pieces. They are joined again where a similarity does it
-        without a contradiction.
+        Where that breaks the first, or it holds too few images, the others are placed again from
+        its largest piece on; then from that of `spare` models of other tries, and of those of the
+        global method, which starts nowhere, until one holds nearly all. Else the largest pieces are
+        kept, joined again where a similarity does it without a contradiction.
         """
         confirmed = contradictions.rotations(
             pairs, self._images.pinhole_px, self._camera.matrix, self._wanted.threads
@@ -247,26 +246,33 @@ class _Reconstruction:
         begun = {*models[0].reg_image_ids()} if pieces[:1] == models[:1] else set()
         if len(begun) >= enough:
             return models, notes, []
-        sources: tuple[list[colmap.Reconstruction] | None, ...] = [], spare, None
-        for number, more in enumerate(sources):
-            if more is None:
-                more, _ = self._solve("global", pairs, method="global")
-            for model in more:
+        tries: tuple[Callable[[], list[colmap.Reconstruction]], ...] = (
+            lambda: [],
+            lambda: spare,
+            lambda: self._solve("global", pairs, method="global")[0],
+        )
+        for number, models_of in enumerate(tries):
+            found = [] if number else pieces
+            for model in models_of():
                 self._drop_misplaced(model, pairs)
                 self._drop_implausible(model)
-                pieces += split(model)
-            largest = max(pieces, key=lambda piece: piece.num_reg_images(), default=None)
+                found += split(model)
+            pieces += found if number else []
+            largest = max(found, key=_size, default=None)
             if largest is None or begun == {*largest.reg_image_ids()}:
                 continue
-            # What is right is a better place to begin at than any pair.
-            begun = {*largest.reg_image_ids()}
-            again, said = self._solve(f"again-{number}", pairs, start=colmap.copied(largest))
-            self._drop_misplaced(again[0], pairs)
-            self._drop_implausible(again[0])
-            again[0], _ = self._resected(again[0], pairs)
-            if split(again[0]) == again[:1] and again[0].num_reg_images() >= enough:
-                return again, said, []
-            pieces += [piece for model in again for piece in split(model)]
+            if _size(largest) < enough:
+                # What is right is a better place to begin at than any pair.
+                begun = {*largest.reg_image_ids()}
+                again, _ = self._solve(f"again-{number}", pairs, start=colmap.copied(largest))
+                self._drop_misplaced(again[0], pairs)
+                self._drop_implausible(again[0])
+                again[0], _ = self._resected(again[0], pairs)
+                more = [piece for model in again for piece in split(model)]
+                pieces += more
+                largest = max([largest, *more], key=_size)
+            if _size(largest) >= enough:
+                return [largest], [], []
         pieces = self._covering(pieces)
         if not pieces:
             raise MapError(
@@ -407,6 +413,10 @@ class _Reconstruction:
             self._sfm.max_jump,
         )
         colmap.drop_images(reconstruction, model.image_id[judged[~keep]])
+
+
+def _size(model: colmap.Reconstruction) -> int:
+    return int(model.num_reg_images())
 
 
 def drop_misfits(reconstruction: colmap.Reconstruction, sfm: SfmSettings) -> Model:
