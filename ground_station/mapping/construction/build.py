@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files, landmarks, store
 from ground_station.map.folder import replacing
+from ground_station.map.model import Model
 from ground_station.mapping.construction import bending, noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
@@ -34,6 +35,19 @@ from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.recording.frames import Frame
+
+
+@dataclass(frozen=True)
+class _Round:
+    """What a build has made with one lens."""
+
+    images: Images
+    pairs: dict[Pair, TwoView]
+    camera: Camera
+    limits: MappingSettings
+    noise: noise.Noise | None
+    structure: Structure
+    model: Model
 
 
 def build_map(
@@ -73,6 +87,7 @@ def build_map(
             )  # fmt: skip
         # A camera that somebody gives without a word on its lens is a calibrated one.
         lens = SelfCalibration(prior or LensPrior(camera, "file", 0.0), images, settings)
+        rounds: list[_Round] = []
         going = True
         while going:
             if lens.camera != camera:
@@ -91,13 +106,27 @@ def build_map(
                 work.mkdir(parents=True)
             try:
                 with _timed(stage_s, "sfm"), _colmap_in(work):
-                    structure = reconstruct(images, pairs, camera, limits, threads, work, workers)
+                    last = rounds[-1].model if rounds else None
+                    before = (
+                        dict(zip(last.image_id.tolist(), last.wTc, strict=True)) if last else {}
+                    )
+                    structure = reconstruct(
+                        images, pairs, camera, limits, threads, work, workers, before
+                    )
                 with _timed(stage_s, "refine"):
                     model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
             except MapError as error:
-                raise lens.failed(error) from error
+                lens.failed(error)
+                break
+            # The first is of the known lens, to which a build may come back.
+            rounds[1:] = [_Round(images, pairs, camera, limits, seen, structure, model)]
             with _timed(stage_s, "lens"):
                 going = lens.go_on(model, images)
+        made = rounds[-1] if rounds[-1].camera == lens.camera else rounds[0]
+        images, pairs, camera, limits, seen = (
+            made.images, made.pairs, made.camera, made.limits, made.noise
+        )  # fmt: skip
+        structure, model = made.structure, made.model
         notes = _notes(len(images.names), len(model.names), structure)
         map_ = assemble(model, images, camera, settings, out.name)
         map_.info.built = {

@@ -139,6 +139,22 @@ def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
     assert np.abs(again.wTc - before.wTc).max() < 1e-6
 
 
+@pytest.mark.parametrize("seed", [5, 6])
+def test_halves_that_only_lookalikes_join_are_not_one_model(seed, tmp_path):
+    """Where the camera turned round too fast for a chain, nothing tells the next bay from this."""
+    corridor = geometry.make_corridor(own=30, alike=120, seed=seed)
+    middle = len(corridor.images.names) // 2
+    cut = {
+        (i, j) for i, j in corridor.pairs if i < middle <= j and j - i <= chains.REACH
+    }  # fmt: skip
+    corridor.pairs = loops.among(corridor.pairs, corridor.pairs.keys() - cut)
+    found = _judged(corridor, tmp_path)
+    assert found.sizes == [middle, middle] and found.dropped == []
+    for model in (found.reconstruction, *found.parts):
+        assert geometry.error_m(corridor, model).max() < 0.02
+    assert "form a model of their own" in " ".join(found.notes)
+
+
 def test_pictures_in_no_order_of_equal_bays_are_placed_or_doubted(corridor, tmp_path):
     rng = np.random.default_rng(0)
     order = rng.permutation(len(corridor.images.names))

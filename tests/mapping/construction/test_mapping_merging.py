@@ -15,6 +15,7 @@ from ground_station.map.model import Model
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.placing import loops, merging
 from ground_station.mapping.construction.placing.placed import Placed
+from ground_station.mapping.construction.solver import Solver
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 
@@ -81,8 +82,8 @@ def corridor() -> geometry.Corridor:
     return geometry.make_corridor(frames=40, bays=3, own=110, alike=0)
 
 
-def _reconstruction(corridor, work) -> structure._Reconstruction:
-    return structure._Reconstruction(
+def _solver(corridor, work) -> Solver:
+    return Solver(
         corridor.images, corridor.pairs, corridor.camera, MappingSettings(), threads=1, work=work
     )
 
@@ -95,9 +96,9 @@ def _halves(corridor) -> set[tuple[int, int]]:
 
 def test_models_that_split_become_one_by_the_pairs_between_them(corridor, tmp_path):
     apart = loops.among(corridor.pairs, _halves(corridor))
-    run = _reconstruction(corridor, tmp_path)
-    models, notes = run._solve("apart", apart, joining=corridor.pairs)
-    assert notes == ["a model of 20 images joined to the largest"]
+    run = _solver(corridor, tmp_path)
+    models, notes = run.solve("apart", apart, joining=corridor.pairs)
+    assert notes == ["a model of 20 images joined to one of 20"]
     assert [model.num_reg_images() for model in models] == [40]
     assert geometry.error_m(corridor, models[0]).max() < 0.03
     found = structure.adjust_and_filter(models[0], MappingSettings().sfm, 1)
@@ -105,25 +106,43 @@ def test_models_that_split_become_one_by_the_pairs_between_them(corridor, tmp_pa
     assert np.bincount(found.point).min() >= MappingSettings().sfm.min_track
 
 
+def test_poses_of_another_lens_are_where_the_search_begins(corridor, tmp_path):
+    """A longer lens's model has the same images a little further apart along their way."""
+    run = _solver(corridor, tmp_path)
+    longer = corridor.wTc.copy()
+    longer[:, 1, 3] *= 1.02
+    first = longer[:30]
+    (model,), notes = run.solve("before", corridor.pairs, start={
+        k + 1: wTc for k, wTc in enumerate(first)
+    })  # fmt: skip
+    assert model.num_reg_images() == 40 and notes == []
+    assert geometry.error_m(corridor, model).max() < 0.03
+    found = structure.reconstruct(
+        corridor.images, corridor.pairs, corridor.camera, MappingSettings(), 1, tmp_path / "whole",
+        dict(enumerate(longer, start=1)),
+    )  # fmt: skip
+    assert geometry.error_m(corridor, found.reconstruction).max() < 0.03
+
+
 def test_an_image_that_stands_aside_goes_where_the_others_see_it(corridor, tmp_path):
-    run = _reconstruction(corridor, tmp_path)
-    right = run._solve("all", corridor.pairs)[0][0]
-    assert run._resected(right, corridor.pairs) == (right, 0)
+    run = _solver(corridor, tmp_path)
+    right = run.solve("all", corridor.pairs)[0][0]
+    assert run.resected(right, corridor.pairs) == (right, 0)
     aside = colmap.copied(right)
     seen = colmap.to_arrays(aside)
     mine = seen.image_id[seen.image] == 21
     colmap.drop_observations(aside, seen.image_id[seen.image[mine]], seen.feature[mine])
     frame = aside.frame(aside.image(21).frame_id)
     wrong = np.array(frame.rig_from_world.matrix())
-    wrong[:, 3] += 0.2 * run._placed(right).depth
+    wrong[:, 3] += 0.2 * run.placed(right).depth
     frame.rig_from_world = colmap.pycolmap.Rigid3d(wrong)
-    found, moved = run._resected(aside, corridor.pairs)
+    found, moved = run.resected(aside, corridor.pairs)
     assert moved == 1 and found.num_reg_images() == 40
     assert geometry.error_m(corridor, found).max() < 0.03 < geometry.error_m(corridor, aside).max()
 
 
 def test_what_is_left_without_misfits_is_the_model_itself(corridor, tmp_path):
-    model = _reconstruction(corridor, tmp_path)._solve("all", corridor.pairs)[0][0]
+    model = _solver(corridor, tmp_path).solve("all", corridor.pairs)[0][0]
     before = colmap.to_arrays(model)
     error = np.linalg.norm(landmarks.residuals_px(before), axis=1)
     strict = replace(MappingSettings().sfm, max_error_px=float(np.median(error)), min_track=4)

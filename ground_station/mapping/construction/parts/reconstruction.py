@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
@@ -36,6 +37,7 @@ def reconstruct(
     threads: int,
     work: Path,
     workers: Workers,
+    before: Mapping[int, F64] | None = None,
 ) -> Structure:
     """As `structure.reconstruct`; of more than `sfm.part_images` images in parts.
 
@@ -44,7 +46,7 @@ def reconstruct(
     """
     most = settings.sfm.part_images
     if len(images.names) <= most:
-        return structure.reconstruct(images, pairs, camera, settings, threads, work)
+        return structure.reconstruct(images, pairs, camera, settings, threads, work, before)
     matches = {pair: len(view.matches) for pair, view in pairs.items()}
     parts = cutting.overlapping(matches, len(images.names), most)
     folder = work / "parts"

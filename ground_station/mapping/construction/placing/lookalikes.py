@@ -25,6 +25,8 @@ SPEAKS = 15
 HOLDS, BREAKS = 0.5, 0.2
 """Shares of the landmarks in common that are in their place: of a link that holds, and of one that
 does not. Between the two a link says nothing."""
+_PIECE = 5
+"""Images that hold together by themselves; fewer hang by their poses."""
 
 
 def misplaced(
@@ -38,17 +40,8 @@ def misplaced(
     From the largest piece to the smallest, each is believed unless a link breaks between it and a
     piece that is believed already. `pixels` (N, 2) are each image's undistorted key points.
     """
-    holding: list[Pair] = []
-    broken: list[Pair] = []
-    for pair in sorted(links):
-        if {*pair} <= model.wTc.keys():
-            good, total = model.in_place(pair, pairs[pair], pixels)
-            if total >= SPEAKS and good >= HOLDS * total:
-                holding.append(pair)
-            elif total >= SPEAKS and good <= BREAKS * total:
-                broken.append(pair)
-    edges = np.array(holding, dtype=np.int64).reshape(-1, 2)
-    piece = components([edges], len(model.landmark))
+    holding, broken = _judged(model, links, pairs, pixels)
+    piece = components([np.array(holding, np.int64).reshape(-1, 2)], len(model.landmark))
     against: dict[int, set[int]] = {}
     for i, j in broken:
         one, other = int(piece[i]), int(piece[j])
@@ -62,6 +55,39 @@ def misplaced(
         if not against.get(number, set()) & believed:
             believed.add(number)
     return {int(k) for k in placed if int(piece[k]) not in believed}
+
+
+def pieces(
+    model: Placed,
+    chosen: Iterable[Pair],
+    pairs: Mapping[Pair, TwoView],
+    pixels: Sequence[F64],
+) -> list[set[int]]:
+    """The model's images, by index, in sets that the chosen pairs hold together; not the few."""
+    holding, _ = _judged(model, chosen, pairs, pixels)
+    piece = components([np.array(holding, np.int64).reshape(-1, 2)], len(model.landmark))
+    placed = np.array(sorted(model.wTc), dtype=np.int64)
+    sets = [{*placed[piece[placed] == number].tolist()} for number in np.unique(piece[placed])]
+    return [each for each in sets if len(each) >= _PIECE]
+
+
+def _judged(
+    model: Placed,
+    chosen: Iterable[Pair],
+    pairs: Mapping[Pair, TwoView],
+    pixels: Sequence[F64],
+) -> tuple[list[Pair], list[Pair]]:
+    """Which of the chosen pairs hold in the model, and which are broken."""
+    holding: list[Pair] = []
+    broken: list[Pair] = []
+    for pair in sorted(chosen):
+        if {*pair} <= model.wTc.keys():
+            good, total = model.in_place(pair, pairs[pair], pixels)
+            if total >= SPEAKS and good >= HOLDS * total:
+                holding.append(pair)
+            elif total >= SPEAKS and good <= BREAKS * total:
+                broken.append(pair)
+    return holding, broken
 
 
 def refuted(
