@@ -200,13 +200,14 @@ class SelfCalibration:
         change = vector(found.camera) - vector(self.camera)
         distance = float(change @ np.linalg.solve(found.covariance, change))
         if not given:
-            # It may go to and fro with the points that each model happens to have.
-            little = self.rounds > 2 and _longer(found.camera, self.camera) < _CALIBRATION
-            if little or distance < len(change) or found.explained < _SETTLED:
+            if distance < len(change) or found.explained < _SETTLED:
                 return self._give_up(_open(found)) if is_open else False
             if is_open and self.rounds >= _OPEN_ROUNDS:
                 return self._give_up(_open(found))
             if self.rounds >= ROUNDS:
+                # It may go to and fro with the points that each model happens to have.
+                if not is_open and _longer(found.camera, self.camera) < _CALIBRATION:
+                    return False
                 return self._give_up(f"after {self.rounds} rounds it has not settled")
         self.camera = found.camera
         self._by = 0 if is_open else len(model.names)

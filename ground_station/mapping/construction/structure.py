@@ -185,7 +185,8 @@ class _Consistent:
                 "structure from motion contradicts what pairs of images say of each other: the "
                 "images show too little, or the camera file is of another camera"
             )
-        joined, notes = self._solver.joined(kept, self._pairs)
+        # Of the pairs that were not believed, too: whole pieces know better which are right.
+        joined, notes = self._solver.joined(kept, self._solver.pairs)
         if self._split(joined[:1]) == joined[:1]:
             return joined, notes, []
         return kept, [], [

@@ -172,6 +172,29 @@ def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
         assert "the given camera misfits" in note and "blimp calibrate" in note
 
 
+@pytest.mark.parametrize("swings", [0.0005, 0.004])
+def test_a_lens_that_goes_to_and_fro_stands_if_that_is_little(monkeypatch, swings):
+    """Each model has other points: a lens may never settle within its deviations."""
+
+    def swinging(model, camera, prior):
+        found = adjust(model, camera, prior)
+        if camera.fx_px == known.camera.fx_px:
+            return found
+        side = 1 - swings if camera.fx_px > CAMERA.fx_px else 1 + swings
+        return replace(found, camera=_off(CAMERA, side), covariance=1e-4 * found.covariance)
+
+    known = LensPrior(_off(CAMERA, 1.03), "file", 0.02)
+    monkeypatch.setattr(lens, "adjust", swinging)
+    monkeypatch.setattr(lens, "_SETTLED", 0.0)
+    if swings > 0.002:
+        with pytest.raises(MapError, match="after 5 rounds it has not settled"):
+            _judged(known)
+        return
+    calibration = _judged(known)
+    assert calibration.rounds == lens.ROUNDS and calibration.as_built()["state"] == "found"
+    assert calibration.camera.fx_px == pytest.approx(CAMERA.fx_px, rel=0.001)
+
+
 def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said():
     """What comes from how the camera moved, as of a rolling shutter, is no fault of the file."""
     images, model = _views(CAMERA, *_flight(True, 1), 1)
