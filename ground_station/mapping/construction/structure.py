@@ -64,16 +64,15 @@ def reconstruct(
 
     `work` is a folder for its files. What an earlier, killed run of the same inputs left there is
     gone on from. `before`: poses (4, 4) of images, by COLMAP's id, by another lens; the search
-    begins there if more is explained so. Raises `MapError` when structure from motion finds no
+    begins there, unless a new one finds more. Raises `MapError` when structure from motion finds no
     model.
     """
     solver = Solver(images, pairs, camera, settings, threads, work)
     links, pairs, pixels = solver.links, solver.pairs, images.pinhole_px
-    models, notes = solver.solve("all", pairs)
-    if before:
-        others, said = solver.solve("before", pairs, start=before)
-        if others[0].compute_num_observations() > models[0].compute_num_observations():
-            models, notes = others, said
+    tries = [solver.solve("before", pairs, start=before)] if before else []
+    if not tries or _size(tries[0][0][0]) < NEARLY_ALL * len(images.names):
+        tries.append(solver.solve("all", pairs))
+    models, notes = max(tries, key=lambda one: one[0][0].compute_num_observations())
     spare: Models = []
     wrong = solver.misplaced(models[0], pairs)
     moved, placed = len(wrong), set(models[0].reg_image_ids())
