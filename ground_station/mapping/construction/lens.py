@@ -44,7 +44,8 @@ so much too near or too far, at a depth of 5 m by 5 cm, what the maps are judged
 _CALIBRATION = 0.002
 """Standard deviation of a focal length that somebody calibrated, as a share of it."""
 _FAR = 4.0
-"""A calibrated focal length that is so many standard deviations off the images' is worth a word."""
+"""A focal length that is so many standard deviations off the images' is worth a word. From round to
+round of simulated walks it went to and fro by 0.2 %, one of its own deviations being 0.05 %."""
 _EXPLAINED, _SETTLED = 0.1, 0.003
 """A calibrated lens misfits only when another explains the first share of the residuals' variance:
 over six simulated turning flights a focal length off by 1 % left 0.09 to 0.12, by 2 % 0.39 to 0.44.
@@ -169,7 +170,7 @@ class SelfCalibration:
         still = adjust(still_view, self.camera, prior)
         if still is None:
             return False if given else self._give_up("the model is too small")
-        if given and still.explained < _EXPLAINED and not self._is_far(still):
+        if given and still.explained < _EXPLAINED and not _is_far(still, self.known.camera):
             self._found = still
             return False
         rolling = adjust(rolling_view, self.camera, prior) or still
@@ -191,7 +192,7 @@ class SelfCalibration:
             )
             if not misfit:
                 self._found = found
-                doubtful = found.explained > _GROSS or self._is_far(found)
+                doubtful = found.explained > _GROSS or _is_far(found, self.known.camera)
                 if is_open or not doubtful:
                     return self._back("kept" if doubtful else "given")
             self._state = "found" if misfit else "tried"
@@ -206,7 +207,7 @@ class SelfCalibration:
                 return self._give_up(_open(found))
             if self.rounds >= ROUNDS:
                 # It may go to and fro with the points that each model happens to have.
-                if not is_open and _longer(found.camera, self.camera) < _CALIBRATION:
+                if not is_open and not _is_far(found, self.camera):
                     return False
                 return self._give_up(f"after {self.rounds} rounds it has not settled")
         self.camera = found.camera
@@ -245,7 +246,7 @@ class SelfCalibration:
         Each half's lens must leave less than half of what the known one leaves in the other.
         """
         halves, known = self._halves(seen, prior), self.known.camera
-        if halves is None or not self._is_far(found):
+        if halves is None or not _is_far(found, self.known.camera):
             return False
         return all(
             one.left_by(other.camera) < 0.5 * one.left_by(known)
@@ -257,11 +258,6 @@ class SelfCalibration:
         late = np.arange(len(seen.names)) >= len(seen.names) // 2
         one, other = (adjust(among(seen, half), self.camera, prior) for half in (late, ~late))
         return None if one is None or other is None else (one, other)
-
-    def _is_far(self, found: Adjusted) -> bool:
-        """Whether the known focal length is further off than both lenses' deviations hold."""
-        off = _longer(found.camera, self.known.camera)
-        return bool(off > _FAR * np.hypot(found.sigma_focal, _CALIBRATION))
 
     def as_built(self) -> dict[str, Any]:
         """What map.toml says of the lens, beside the one that it holds."""
@@ -429,9 +425,10 @@ def _focal(camera: Camera) -> float:
     return float(np.sqrt(camera.fx_px * camera.fy_px))
 
 
-def _longer(one: Camera, other: Camera) -> float:
-    """How much longer or shorter the one's focal length is, as a share of the other's."""
-    return float(abs(np.log(_focal(one) / _focal(other))))
+def _is_far(found: Adjusted, camera: Camera) -> bool:
+    """Whether a focal length is further off than its deviations and a calibration's hold."""
+    off = abs(np.log(_focal(found.camera) / _focal(camera)))
+    return bool(off > _FAR * np.hypot(found.sigma_focal, _CALIBRATION))
 
 
 def _lens_of(camera: Camera) -> dict[str, float]:

@@ -172,7 +172,7 @@ def test_a_wrong_camera_file_is_named_and_the_lens_found_is_used():
         assert "the given camera misfits" in note and "blimp calibrate" in note
 
 
-@pytest.mark.parametrize("swings", [0.0005, 0.004])
+@pytest.mark.parametrize("swings", [0.0005, 0.006])
 def test_a_lens_that_goes_to_and_fro_stands_if_that_is_little(monkeypatch, swings):
     """Each model has other points: a lens may never settle within its deviations."""
 
@@ -186,7 +186,7 @@ def test_a_lens_that_goes_to_and_fro_stands_if_that_is_little(monkeypatch, swing
     known = LensPrior(_off(CAMERA, 1.03), "file", 0.02)
     monkeypatch.setattr(lens, "adjust", swinging)
     monkeypatch.setattr(lens, "_SETTLED", 0.0)
-    if swings > 0.002:
+    if swings > 0.004:
         with pytest.raises(MapError, match="after 5 rounds it has not settled"):
             _judged(known)
         return
