@@ -70,7 +70,9 @@ def reconstruct(
     solver = Solver(images, pairs, camera, settings, threads, work)
     links, pairs, pixels = solver.links, solver.pairs, images.pinhole_px
     tries = [solver.solve("before", pairs, start=before)] if before else []
-    if not tries or _size(tries[0][0][0]) < NEARLY_ALL * len(images.names):
+    # What went on from a model that was believed is that one, and its pairs were chosen already.
+    goes_on = bool(tries) and _size(tries[0][0][0]) >= NEARLY_ALL * len(images.names)
+    if not goes_on:
         tries.append(solver.solve("all", pairs))
     models, notes = max(tries, key=lambda one: one[0][0].compute_num_observations())
     spare: Models = []
@@ -78,7 +80,8 @@ def reconstruct(
     moved, placed = len(wrong), set(models[0].reg_image_ids())
     missing = {k for link in links for k in link} - {image_id - 1 for image_id in placed}
     doubtful = len(wrong) + len(missing) > _FOLDED * len(images.names)
-    if links and pairs.keys() - links and (doubtful or solver.fall_apart(models, links)):
+    loose = not goes_on and solver.fall_apart(models, links)
+    if links and pairs.keys() - links and (doubtful or loose):
         spare, trusted = solver.trusted()
         denied = solver.fall_apart(models, trusted.keys())
         if doubtful or denied:

@@ -51,9 +51,9 @@ def _plain(corridor, pairs, work) -> colmap.Reconstruction:
     return max(models, key=lambda model: model.num_reg_images())
 
 
-def _judged(corridor, work) -> structure.Structure:
+def _judged(corridor, work, before=None) -> structure.Structure:
     return structure.reconstruct(
-        corridor.images, corridor.pairs, corridor.camera, SETTINGS, 1, work
+        corridor.images, corridor.pairs, corridor.camera, SETTINGS, 1, work, before
     )
 
 
@@ -139,8 +139,7 @@ def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
     assert np.abs(again.wTc - before.wTc).max() < 1e-6
 
 
-@pytest.mark.parametrize("seed", [5, 6])
-def test_halves_that_only_lookalikes_join_are_not_one_model(seed, tmp_path):
+def _cut_at_the_turn(seed) -> geometry.Corridor:
     """Where the camera turned round too fast for a chain, nothing tells the next bay from this."""
     corridor = geometry.make_corridor(own=30, alike=120, seed=seed)
     middle = len(corridor.images.names) // 2
@@ -148,11 +147,26 @@ def test_halves_that_only_lookalikes_join_are_not_one_model(seed, tmp_path):
         (i, j) for i, j in corridor.pairs if i < middle <= j and j - i <= chains.REACH
     }  # fmt: skip
     corridor.pairs = loops.among(corridor.pairs, corridor.pairs.keys() - cut)
+    return corridor
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_halves_that_only_lookalikes_join_are_not_one_model(seed, tmp_path):
+    corridor = _cut_at_the_turn(seed)
+    middle = len(corridor.images.names) // 2
     found = _judged(corridor, tmp_path)
     assert found.sizes == [middle, middle] and found.dropped == []
     for model in (found.reconstruction, *found.parts):
         assert geometry.error_m(corridor, model).max() < 0.02
     assert "form a model of their own" in " ".join(found.notes)
+
+
+def test_halves_that_another_lens_has_joined_stay_one_model(tmp_path):
+    corridor = _cut_at_the_turn(seed=5)
+    before = {k + 1: wTc for k, wTc in enumerate(corridor.wTc)}
+    found = _judged(corridor, tmp_path, before)
+    assert found.sizes == [len(before)]
+    assert geometry.error_m(corridor, found.reconstruction).max() < 0.02
 
 
 def test_pictures_in_no_order_of_equal_bays_are_placed_or_doubted(corridor, tmp_path):
