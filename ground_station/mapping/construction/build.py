@@ -88,6 +88,7 @@ def build_map(
         # A camera that somebody gives without a word on its lens is a calibrated one.
         lens = SelfCalibration(prior or LensPrior(camera, "file", 0.0), images, settings)
         rounds: list[_Round] = []
+        unlike: set[Pair] = set()
         going = True
         while going:
             if lens.camera != camera:
@@ -96,7 +97,10 @@ def build_map(
             with _timed(stage_s, "match"):
                 seen = noise.measured(images, camera, limits.match.of(limits.features).ratio)
                 limits = _with_noise(limits, seen)
-                pairs = match(images, camera, limits, threads, cache=cache, workers=workers)
+                pairs = match(
+                    images, camera, limits, threads,
+                    cache=cache, workers=workers, unlike=unlike,
+                )  # fmt: skip
             work = None
             if cache:
                 key = structure_key(images, pairs, camera, limits)

@@ -8,7 +8,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ground_station.arrays import F64, I64
+import numpy as np
+
+from ground_station.arrays import F32, F64, I32, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
@@ -64,11 +66,13 @@ def match(
     *,
     cache: Cache | None = None,
     workers: Workers | None = None,
+    unlike: set[Pair] | None = None,
 ) -> dict[Pair, TwoView]:
     """Verified pairs (i, j) of images; raises `MapError` when no two images overlap.
 
     What `cache` holds is not compared again. Where not every pair is compared, a second round
-    tries those that images seen by both bring near each other.
+    tries those that images seen by both bring near each other. `unlike` are pairs whose descriptors
+    deny them, by whatever lens: they are not compared, and what is found of them is added.
     """
     descriptors = Lazily(len(images.names), lambda k: images.features[k].descriptors)
     sequence = choice.sequences(images.names, images.time_ns)
@@ -83,7 +87,10 @@ def match(
             Lazily(len(descriptors), lambda k: (descriptors[k], images.pinhole_px[k]))
         )
     with sharing as shared:
-        run = _Comparison(images, shared, camera, settings, sequence, cache, workers)
+        run = _Comparison(
+            images, shared, camera, settings, sequence, cache, workers,
+            set() if unlike is None else unlike,
+        )  # fmt: skip
         verified = run.compare(chosen, "matching, pairs")
         if wanted.covisible and not choice.is_exhaustive(len(descriptors), wanted):
             linked = {pair: len(view.matches) for pair, view in verified.items()}
@@ -99,20 +106,24 @@ def match(
     return dict(sorted(verified.items()))
 
 
-def verify_pair(first: Side, second: Side, rules: Rules, camera_matrix: F64) -> TwoView | None:
-    """The geometry that two images share by the rules, or None."""
+def alike(first: F32, second: F32, rules: Rules) -> I32:
+    """Matches (K, 2) of two images' descriptors by the rules; none where they are too few."""
     # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
     # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
-    if rules.preview:
-        few, others = first[0][: rules.preview], second[0][: rules.preview]
-        if len(mutual_matches(few, others, rules.ratio)) < rules.preview_matches:
-            return None
-    matches = mutual_matches(first[0], second[0], rules.ratio)
-    if len(matches) < rules.min_inliers:
-        return None
+    few, others = first[: rules.preview], second[: rules.preview]
+    if rules.preview and len(mutual_matches(few, others, rules.ratio)) < rules.preview_matches:
+        return np.empty((0, 2), np.int32)
+    matches = mutual_matches(first, second, rules.ratio)
+    return matches if len(matches) >= rules.min_inliers else matches[:0]
+
+
+def verify_pair(
+    first_px: F64, second_px: F64, matches: I32, rules: Rules, camera_matrix: F64
+) -> TwoView | None:
+    """The geometry that two images' matches share by the rules, or None."""
     view = verify(
-        first[1],
-        second[1],
+        first_px,
+        second_px,
         matches,
         camera_matrix,
         error_px=rules.error_px,
@@ -128,10 +139,16 @@ def verify_pair(first: Side, second: Side, rules: Rules, camera_matrix: F64) -> 
 
 def verify_pairs(
     pairs: Sequence[tuple[int, int, Rules]], camera_matrix: F64, *sides: Side | KeptSide
-) -> list[TwoView | None]:
-    """`verify_pair` of each (i, j, rules), i and j indices into `sides`."""
+) -> list[tuple[bool, TwoView | None]]:
+    """Of each (i, j, rules), i and j indices into `sides`: are they `alike`, and their geometry."""
     opened = [side.load() if isinstance(side, KeptSide) else side for side in sides]
-    return [verify_pair(opened[i], opened[j], rules, camera_matrix) for i, j, rules in pairs]
+    result = []
+    for i, j, rules in pairs:
+        (first, first_px), (second, second_px) = opened[i], opened[j]
+        matches = alike(first, second, rules)
+        view = verify_pair(first_px, second_px, matches, rules, camera_matrix)
+        result.append((len(matches) > 0, view))
+    return result
 
 
 class _Comparison:
@@ -146,6 +163,7 @@ class _Comparison:
         sequence: I64,
         cache: Cache | None,
         workers: Workers,
+        unlike: set[Pair],
     ) -> None:
         self._images, self._sides, self._sequence = images, sides, sequence
         self._matrix = camera.matrix
@@ -154,7 +172,7 @@ class _Comparison:
         self._how = {
             far: content.comparison(camera, asdict(rules)) for far, rules in self._rules.items()
         }
-        self._cache, self._workers = cache, workers
+        self._cache, self._workers, self._unlike = cache, workers, unlike
 
     def compare(self, pairs: Sequence[Pair], label: str) -> dict[Pair, TwoView]:
         """The pairs that share a geometry."""
@@ -162,7 +180,9 @@ class _Comparison:
         under_way: deque[list[Pair]] = deque()
         with Progress(label, len(pairs)) as progress:
 
-            def note(pair: Pair, view: TwoView | None) -> None:
+            def note(pair: Pair, view: TwoView | None, *, new: bool) -> None:
+                if new and self._cache:
+                    self._cache.keep_view(self._key(pair), view)
                 if view is not None:
                     verified[pair] = view
                 progress.step()
@@ -171,8 +191,8 @@ class _Comparison:
                 batch: list[Pair] = []
                 for pair in pairs:
                     known = self._known(pair)
-                    if known is not None:
-                        note(pair, known.view)
+                    if known is not None or pair in self._unlike:
+                        note(pair, known.view if known else None, new=known is None)
                         continue
                     batch.append(pair)
                     if len(batch) == self._workers.batch:
@@ -187,10 +207,10 @@ class _Comparison:
                     yield self._call(batch)
 
             for views in self._workers.map(verify_pairs, calls()):
-                for pair, view in zip(under_way.popleft(), views, strict=True):
-                    if self._cache:
-                        self._cache.keep_view(self._key(pair), view)
-                    note(pair, view)
+                for pair, (is_alike, view) in zip(under_way.popleft(), views, strict=True):
+                    if not is_alike:
+                        self._unlike.add(pair)
+                    note(pair, view, new=True)
         return verified
 
     def _is_far(self, pair: Pair) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pickle
 from pathlib import Path
@@ -12,10 +13,11 @@ import pytest
 from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.mapping.construction import content
+from ground_station.mapping.construction import content, matching, verification
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.feature_file import FeatureFile
 from ground_station.mapping.construction.images import extract
+from ground_station.mapping.construction.lens import with_lens
 from ground_station.mapping.construction.verification import match
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
@@ -120,6 +122,30 @@ def test_structure_from_motion_starts_from_the_same_wherever_features_lie(tmp_pa
         pairs = match(disk, camera, SETTINGS, 2, workers=workers)
         assert content.structure_key(disk, pairs, camera, SETTINGS) == expected
     assert far.sent > 300 * 128 * 4  # the descriptors themselves
+
+
+def test_pairs_that_look_unlike_are_not_compared_again_by_another_lens(tmp_path, monkeypatch):
+    source = open_input(SAMPLE, 30.0, parse_range("0:24"))
+    camera = source.camera
+    longer = dataclasses.replace(camera, fx_px=1.05 * camera.fx_px, fy_px=1.05 * camera.fy_px)
+    images = extract(list(source), camera, SETTINGS, 2, None)
+    unlike: set[tuple[int, int]] = set()
+    first = match(images, camera, SETTINGS, 2, unlike=unlike)
+    assert len(unlike) > 20 and not unlike & first.keys()
+    compared = []
+    monkeypatch.setattr(
+        verification,
+        "mutual_matches",
+        lambda *args: compared.append(args) or matching.mutual_matches(*args),
+    )
+    images = with_lens(images, longer)
+    fresh = match(images, longer, SETTINGS, 2)
+    without = len(compared)
+    again = match(images, longer, SETTINGS, 2, unlike=unlike)
+    assert len(compared) - without <= without - len(unlike)
+    assert content.structure_key(images, again, longer, SETTINGS) == content.structure_key(
+        images, fresh, longer, SETTINGS
+    )
 
 
 def test_a_disk_that_refuses_is_one_line_and_leaves_no_map(tmp_path, monkeypatch):
