@@ -30,8 +30,9 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.fleet import maps
-from ground_station.service.fleet.fleet import FRESH_S, Fleet
+from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.fleet.shelf import Elsewhere
+from ground_station.service.fleet.whereabouts import FRESH_S
 from ground_station.service.settings import SAMPLE
 from ground_station.service.web.recordings import Recordings
 from ground_station.service.web.tape import Tape
@@ -157,9 +158,9 @@ def test_pictures_cross_only_while_somebody_looks(stations: Any) -> None:
 
     for _ in range(20):
         assert not shown()
-    assert hall.fleet.wanted() == frozenset()
+    assert hall.fleet.where.wanted() == frozenset()
     eventually(lambda: shown(BLIMP), 10.0)
-    assert attic.pictures[0] == (BLIMP, b"JPEG") and hall.fleet.wanted() == {BLIMP}
+    assert attic.pictures[0] == (BLIMP, b"JPEG") and hall.fleet.where.wanted() == {BLIMP}
 
 
 def test_commands_go_to_the_station_that_has_the_payload_and_all_are_told(stations: Any) -> None:
@@ -212,7 +213,7 @@ def test_recordings_are_read_where_they_lie(stations: Any) -> None:
     eventually(lambda: acquainted(hall, attic), 20.0)
     hall.fleet.shelf = Shelf()
     shelf = attic.fleet.shelf_of("hall")
-    assert shelf.list() == Shelf().list() and attic.fleet.knows("hall")
+    assert shelf.list() == Shelf().list() and attic.fleet.where.knows("hall")
     size = shelf.size("one.mcap")
     assert b"".join(shelf.pieces("one.mcap", 0, size)) == (bytes(range(256)) * 1200)[:size]
     with pytest.raises(GroundStationError, match="has no such file"):
@@ -249,7 +250,7 @@ def test_a_recording_is_played_where_it_does_not_lie(stations: Any, tmp_path: Pa
 def test_a_pose_recorded_elsewhere_has_this_station_s_name_of_the_map(stations: Any) -> None:
     hall = stations("hall")
     hall.tell()
-    ours = hall.fleet._maps[0]
+    ours = hall.fleet.where.maps[0]
     said = replace(POSE, map="theirs", coordinates=ours.coordinates)
     assert hall.fleet.named(said).map == ours.name != "theirs"
     for note in (replace(said, coordinates="other"), replace(said, coordinates="")):
@@ -303,10 +304,10 @@ def test_alarms_are_told_once_with_their_station(stations: Any) -> None:
     def told() -> bool:
         hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
         hall.tell(alarms=found)
-        return len(attic.fleet.alarms()) > 1
+        return len(attic.fleet.where.alarms()) > 1
 
     eventually(told, 10.0)
-    assert [(alarm["id"], alarm["text"]) for alarm in attic.fleet.alarms()] == [
+    assert [(alarm["id"], alarm["text"]) for alarm in attic.fleet.where.alarms()] == [
         ("hall/disk", "little left (station 'hall')"),
         (f"hall/battery/{BLIMP}", "battery low (station 'hall')"),
     ]

@@ -14,13 +14,12 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ground_station.service import bus_messages
-from ground_station.service.alarms import EVERYWHERE, Alarm
+from ground_station.service.alarms import Alarm
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import (
     EstimateMessage,
@@ -41,11 +40,11 @@ from ground_station.service.fleet.messages import (
     ROOT,
     SESSION,
     WANTS,
-    WORD,
     StationMessage,
     rules,
 )
 from ground_station.service.fleet.shelf import TIMEOUT_S, Elsewhere, Shelf, ask, read
+from ground_station.service.fleet.whereabouts import Whereabouts
 from ground_station.service.settings import StationSettings
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
@@ -53,31 +52,17 @@ from pi_firmware.wire.keys import check_payload_id
 from pi_firmware.wire.refusal import refusal
 from pi_firmware.wire.telemetry import open_session
 
-FRESH_S = 3.0
-"""Older than this a station's word says nothing of now."""
-_KEPT_S = 600.0
 _TELL_S = 0.5
 _SEEN_HZ, _WATCHED_HZ = 5.0, 15.0
 """Poses of a payload that somebody elsewhere looks at go there more often, with its points."""
 _LOOK_S = 5.0
 _OVERLOADED_S = 2.0
-_STATIONS = 32
 _INTAKE, _LOCALIZER = "intake", "localizer/"
 _COMMAND = "payload-command"
 _ASKED = "asked"
 _RECORDINGS = "recordings"
-_MOVED_S = 30.0
-"""A payload that came from another station no longer ago than this goes on being recorded."""
 
 Take = Callable[[str, Any], None]
-
-
-@dataclass(frozen=True)
-class _Other:
-    said: StationMessage
-    came_s: float
-    clock_s: float
-    """Its clock less ours, and what the message took."""
 
 
 _TOLD: dict[str, type[Message]] = {
@@ -107,14 +92,11 @@ class Fleet:
         self._bus, self._version, self._on_picture = bus, version, on_picture
         self._own_maps = OwnMaps(settings.map)
         self._shelf = Path(settings.map.shelf)
-        self._maps = self._own_maps.told()
+        self.where = Whereabouts(self._own_maps.told())
+        """Who flies where, for the page."""
         self._fetching = threading.Lock()
         self._lock = threading.Lock()
         self._takes: dict[str, list[Take]] = {kind: [] for kind in _TOLD}
-        self._here: dict[str, tuple[float, PayloadMessage]] = {}
-        self._away: dict[str, tuple[str, float]] = {}
-        self._twins: dict[str, tuple[str, float]] = {}
-        self._others: dict[str, _Other] = {}
         self._recording: RecordingMessage | None = None
         self.shelf: Shelf | None = None
         """This station's recordings, for the others."""
@@ -157,12 +139,12 @@ class Fleet:
 
     def subscribe(self, kind: str, of: type[N], take: Callable[[str, N], None]) -> None:
         """Calls `take` with each message of a kind, of payloads here and elsewhere."""
-        if kind == bus_messages.PAYLOAD:
-            self._bus.subscribe(
-                kind, of, lambda name, note: None if self._told_of(name) else take(name, note)
-            )
-        else:
-            self._bus.subscribe(kind, of, take)
+
+        def own(payload_id: str, message: N) -> None:
+            if kind != bus_messages.PAYLOAD or not self.where.station_of(payload_id):
+                take(payload_id, message)
+
+        self._bus.subscribe(kind, of, own)
         if kind in self._takes:
             self._takes[kind].append(take)
 
@@ -175,7 +157,7 @@ class Fleet:
     ) -> Mapping[str, Any]:
         """Asks a process of this station, or of the one that the payload in question flies with."""
         payload_id = _payload_of(name, request)
-        station = self._told_of(payload_id)
+        station = self.where.station_of(payload_id)
         if not station:
             answer = self._bus.query(name, request, timeout_s=timeout_s)
             if payload_id:
@@ -186,11 +168,6 @@ class Fleet:
             if isinstance(answer, dict):
                 return {"done": False, "reason": "", **answer}
         return {"done": False, "reason": f"station '{station}' did not answer"}
-
-    def knows(self, station: str) -> bool:
-        """Whether a station flies beside this one."""
-        with self._lock:
-            return station in self._others
 
     def shelf_of(self, station: str) -> Elsewhere:
         """The recordings of another station, read from there."""
@@ -218,22 +195,21 @@ class Fleet:
         if now_s < self._due_s.get("", 0.0):
             return
         self._due_s[""] = now_s + _TELL_S
+        away = self.where.stations_of(sorted(wants)[:WANTS])
+        heard, here = self.where.heard_here()
+        alone = {name for name, note in here.items() if not _follows(note)}
+        overloaded = now_s - self._overloaded_s < _OVERLOADED_S
+        load = cpu / (os.cpu_count() or 1)
+        peers = {
+            name: Peer(said.load, said.overloaded, frozenset(said.hears))
+            for name, said in self.where.fresh().items()
+        }
         with self._lock:
-            away = {name: self._flown(name, now_s) for name in sorted(wants)[:WANTS]}
-            fresh = {n: o.said for n, o in self._others.items() if now_s - o.came_s < FRESH_S}
-            heard = {
-                n for n, (at_s, note) in self._here.items() if now_s - at_s < FRESH_S and note.alive
-            }
-            here = {n for n in heard if self._flies_here(n, now_s)}
-            alone = {n for n in here if not _follows(self._here[n][1])}
-            overloaded = now_s - self._overloaded_s < _OVERLOADED_S
-            load = cpu / (os.cpu_count() or 1)
-            peers = {n: Peer(o.load, o.overloaded, frozenset(o.hears)) for n, o in fresh.items()}
-            leaves = self._allocation.leaves(here - alone, alone, load, overloaded, peers)
+            leaves = self._allocation.leaves(here.keys() - alone, alone, load, overloaded, peers)
             pins = dict(self._allocation.pins)
         self._leave(leaves)
         maps = self._own_maps.told()
-        self._maps = maps
+        self.where.maps = maps
         self._watch({f"{ROOT}/{at}/{_PICTURE}/{name}" for name, at in away.items() if at})
         said = StationMessage(
             time_ns=time.time_ns(),
@@ -268,120 +244,24 @@ class Fleet:
 
     def picture(self, payload_id: str, message: bytes) -> None:
         """A picture of a payload that flies here; it goes to those who look at it elsewhere."""
-        if payload_id in self.wanted() and len(message) < MESSAGE_BYTES:
+        if payload_id in self.where.wanted() and len(message) < MESSAGE_BYTES:
             self._put(_PICTURE, payload_id, message)
-
-    def wanted(self) -> frozenset[str]:
-        """The payloads here whose pictures are looked at elsewhere."""
-        now_s = time.monotonic()
-        with self._lock:
-            return frozenset(
-                name
-                for other in self._others.values()
-                if now_s - other.came_s < FRESH_S
-                for name in other.said.wants
-                if self._flies_here(name, now_s)
-            )
 
     def document(self) -> dict[str, Any]:
         """The other stations, and what is wrong between them, as plain values."""
-        now_s = time.monotonic()
         with self._lock:
-            flown = {name: self._flown(name, now_s) for name in self._away}
-            return {
-                "stations": [
-                    {
-                        "name": name,
-                        "version": other.said.version,
-                        "map": other.said.map,
-                        "same_map": self._is_ours(other.said),
-                        "load": other.said.load,
-                        "age_s": round(now_s - other.came_s, 1),
-                        "clock_s": round(other.clock_s, 2),
-                        "recording": bool(other.said.recording and other.said.recording.active),
-                        "payloads": sorted(one for one, where in flown.items() if where == name),
-                    }
-                    for name, other in sorted(self._others.items())
-                ],
-                "offers": self._offers(now_s),
-                "pins": {
-                    name: pin.station for name, pin in self._allocation.pins.items() if pin.station
-                },
-                "twins": {
-                    name: station
-                    for name, (station, at_s) in self._twins.items()
-                    if now_s - at_s < FRESH_S
-                },
-                "refused": sorted(self._refused.values()),
-            }
-
-    def _offers(self, now_s: float) -> list[dict[str, Any]]:
-        """Maps of others that grew from this station's, and that it has not yet.
-
-        Call it with the lock held.
-        """
-        own, held = self._maps[0], {one.id for one in self._maps}
-        return [
-            {
-                "station": name,
-                "map": one.name,
-                "more": one.landmarks - one.grown_from[own.id],
-            }
-            for name, other in sorted(self._others.items())
-            if now_s - other.came_s < FRESH_S
-            for one in other.said.maps
-            if own.id in one.grown_from
-            and one.coordinates == own.coordinates
-            and one.id not in held
-        ]
-
-    def alarms(self) -> list[dict[str, Any]]:
-        """The alarms of the other stations and of the payloads that fly with them.
-
-        Those that this station finds by itself as well are left out.
-        """
-        now_s = time.monotonic()
-        with self._lock:
-            return [
-                {
-                    **dataclasses.asdict(alarm),
-                    "id": f"{name}/{alarm.id}",
-                    "text": f"{alarm.text} (station '{name}')",
-                }
-                for name, other in sorted(self._others.items())
-                if now_s - other.came_s < FRESH_S
-                for alarm in other.said.alarms
-                if not alarm.id.startswith(EVERYWHERE)
-                if alarm.payload == bus_messages.STATION
-                or self._flown(alarm.payload, now_s) == name
-            ]
+            pins = {n: pin.station for n, pin in self._allocation.pins.items() if pin.station}
+            refused = sorted(self._refused.values())
+        return {**self.where.document(), "pins": pins, "refused": refused}
 
     # This station's bus
 
     def _own_payload(self, payload_id: str, note: PayloadMessage) -> None:
-        with self._lock:
-            self._here[payload_id] = (time.monotonic(), note)
-            if note.rate_hz > 0 and self._flies_here(payload_id, time.monotonic()):
-                before = self._recorded_before(payload_id)
-                self._away.pop(payload_id, None)
-            else:
-                before = ""
+        before = self.where.here(payload_id, note)
         if before and not (self._recording and self._recording.active):
             threading.Thread(target=self._record, args=(payload_id, before), daemon=True).start()
         if note.alive and not note.station:
             self._put(bus_messages.PAYLOAD, payload_id, bus_messages.encode(note))
-
-    def _recorded_before(self, payload_id: str) -> str:
-        """STATION/FILE that a payload was recorded in until it came here; "" for none.
-
-        Call it with the lock held.
-        """
-        station, at_s = self._away.get(payload_id, ("", 0.0))
-        other = self._others.get(station)
-        if other is None or time.monotonic() - at_s > _MOVED_S:
-            return ""
-        recording = other.said.recording
-        return f"{station}/{recording.file}" if recording and recording.active else ""
 
     def _record(self, payload_id: str, before: str) -> None:
         """A flight that was recorded where it was goes on being recorded."""
@@ -396,7 +276,7 @@ class Fleet:
     def _own_estimate(self, payload_id: str, note: EstimateMessage) -> None:
         if note.overload:
             self._overloaded_s = time.monotonic()
-        watched = payload_id in self.wanted()
+        watched = payload_id in self.where.wanted()
         now_s = time.monotonic()
         period_s = 1.0 / (_WATCHED_HZ if watched else _SEEN_HZ)
         due_s = self._due_s.get(payload_id, 0.0)
@@ -418,21 +298,6 @@ class Fleet:
     def _put(self, kind: str, payload_id: str, data: bytes) -> None:
         with contextlib.suppress(Exception):  # of a session that is being closed
             self._session.zenoh.put(f"{ROOT}/{self.name}/{kind}/{payload_id}", data)
-
-    def _flies_here(self, payload_id: str, now_s: float) -> bool:
-        """Call it with the lock held."""
-        came_s, note = self._here.get(payload_id, (float("-inf"), None))
-        return note is not None and now_s - came_s < FRESH_S and note.alive and not note.station
-
-    def _told_of(self, payload_id: str) -> str:
-        """The station that a payload flies with, as that one says; "" for here or nowhere."""
-        with self._lock:
-            return self._flown(payload_id, time.monotonic())
-
-    def _flown(self, payload_id: str, now_s: float) -> str:
-        station, at_s = self._away.get(payload_id, ("", float("-inf")))
-        here = self._flies_here(payload_id, now_s)
-        return station if now_s - at_s < FRESH_S and not here else ""
 
     # The other stations
 
@@ -461,27 +326,26 @@ class Fleet:
             self._bus.dropped += 1
 
     def _take(self, station: str, kind: str, payload_id: str, data: bytes) -> None:
-        now_s = time.monotonic()
         if kind == _STATION:
             said = bus_messages.decode(StationMessage, data)
-            clock_s = 1e-9 * (said.time_ns - time.time_ns())
-            with self._lock:
-                if station in self._others or len(self._others) < _STATIONS:
-                    self._others[station] = _Other(said, now_s, clock_s)
+            if self.where.heard(station, said):
+                with self._lock:
                     for name, pin in said.pins.items():
                         self._allocation.pin(name, pin)
         elif kind == _PICTURE:
-            if self._told_of(payload_id) == station:
+            if self.where.station_of(payload_id) == station:
                 self._on_picture(payload_id, data)
         elif kind in _TOLD:
             note: Any = bus_messages.decode(_TOLD[kind], data)
             if kind == bus_messages.PAYLOAD:
-                if note.station or not self._takes_up(station, payload_id, note, now_s):
+                if note.station or not self.where.takes_up(station, payload_id, note):
                     return
                 note = dataclasses.replace(note, station=station, relayed=True)
             elif kind == bus_messages.EVENT:
                 note = dataclasses.replace(note, text=f"{note.text} (station '{station}')")
-            elif self._told_of(payload_id) != station or not self._in_our_map(station, note):
+            elif self.where.station_of(payload_id) != station or not self.where.in_our_map(
+                station, note
+            ):
                 return
             else:
                 note = self._named(note)
@@ -489,50 +353,14 @@ class Fleet:
             for take in self._takes[kind]:
                 take(payload_id, note)
 
-    def _takes_up(self, station: str, payload_id: str, note: PayloadMessage, now_s: float) -> bool:
-        """Whether a payload is another station's; one that flies here, too, is two of one name."""
-        with self._lock:
-            if self._flies_here(payload_id, now_s):
-                own = self._here[payload_id][1]
-                if own.rate_hz > 0 and note.rate_hz > 0 and own.ssrc != note.ssrc:
-                    self._twins[payload_id] = (station, now_s)
-                return False
-            before, at_s = self._away.get(payload_id, (station, now_s))
-            if before != station and now_s - at_s < FRESH_S and note.rate_hz <= 0:
-                return False  # it has just gone from there
-            if payload_id not in self._away and len(self._away) >= PAYLOADS:
-                self._away = {n: one for n, one in self._away.items() if self._flown(n, now_s)}
-                if len(self._away) >= PAYLOADS:
-                    return False
-            self._away[payload_id] = (station, now_s)
-        return True
-
-    def _in_our_map(self, station: str, note: EstimateMessage) -> bool:
-        """Whether a pose is in this station's coordinates, whatever its map is called there."""
-        with self._lock:
-            other = self._others.get(station)
-        if other is None:
-            return False
-        if note.coordinates:
-            return note.coordinates == self._maps[0].coordinates
-        return self._is_ours(other.said) and note.map[:WORD] in ("", other.said.map)
-
     def named(self, note: EstimateMessage) -> EstimateMessage:
         """A pose told elsewhere, with this station's name of the map where that is its own."""
-        is_ours = note.coordinates == self._maps[0].coordinates
+        is_ours = note.coordinates == self.where.maps[0].coordinates
         return self._named(note) if note.coordinates and is_ours else note
 
     def _named(self, note: EstimateMessage) -> EstimateMessage:
-        ours = self._maps[0]
+        ours = self.where.maps[0]
         return dataclasses.replace(note, map=note.map and ours.name, coordinates=ours.coordinates)
-
-    def _is_ours(self, said: StationMessage) -> bool:
-        """Whether another station's map has the coordinates of this one's; an older one tells the
-        content of its map alone."""
-        own = self._maps[0]
-        if said.maps and said.maps[0].coordinates:
-            return said.maps[0].coordinates == own.coordinates
-        return said.map_id == own.id
 
     def _asked(self, query: Any) -> None:
         """Another station's operator asks something of a payload that flies here."""
@@ -581,10 +409,7 @@ class Fleet:
                 continue
             with self._lock:
                 self._refused = refused
-                now_s = time.monotonic()
-                gone = [n for n, other in self._others.items() if now_s - other.came_s > _KEPT_S]
-                for name in gone:
-                    del self._others[name]
+            self.where.forget()
 
 
 def _payload_of(name: str, request: Mapping[str, Any]) -> str:

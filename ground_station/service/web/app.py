@@ -180,7 +180,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
 
 def _elsewhere(fleet: Fleet | None) -> Callable[[str], Elsewhere]:
     def shelf(station: str) -> Elsewhere:
-        if fleet is None or not fleet.knows(station):
+        if fleet is None or not fleet.where.knows(station):
             raise NotFound(f"no station {station!r} flies beside this one")
         return fleet.shelf_of(station)
 

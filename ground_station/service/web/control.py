@@ -111,7 +111,7 @@ def router(control: Control, maps: Maps, fleet: Fleet | None = None) -> APIRoute
         """Has a payload fly with a station, and stay there."""
         control.check_payload(payload_id)
         known = fleet is not None and (
-            request.name in ("", fleet.name) or fleet.knows(request.name)
+            request.name in ("", fleet.name) or fleet.where.knows(request.name)
         )
         if fleet is None or not known:
             raise NotFound(f"no station {request.name!r} flies beside this one")
@@ -123,7 +123,7 @@ def router(control: Control, maps: Maps, fleet: Fleet | None = None) -> APIRoute
     )
     def fetch_map(station: StationName, name: MapName) -> Any:
         """Takes a map that another station offers; `values.map` is what it is called here."""
-        if fleet is None or not fleet.knows(station):
+        if fleet is None or not fleet.where.knows(station):
             raise NotFound(f"no station {station!r} flies beside this one")
         return {"done": True, "reason": "", "values": {"map": fleet.fetch_map(station, name)}}
 

@@ -138,7 +138,7 @@ class Live:
             own = [standing.alarm for standing in self._alarms.values()]
             cpu = sum(process["cpu"] for process in state["processes"])
             self._fleet.tell(own, self._looked_at(), cpu)
-            state["alarms"] += self._fleet.alarms()
+            state["alarms"] += self._fleet.where.alarms()
             self._want()
         self._snapshot.set_alarms(state["alarms"])
         for name in self._alarms.keys() - before.keys():
@@ -262,7 +262,7 @@ class Live:
 
     def _want(self) -> None:
         if self.video is not None:
-            elsewhere = self._fleet.wanted() if self._fleet is not None else frozenset()
+            elsewhere = self._fleet.where.wanted() if self._fleet is not None else frozenset()
             self.video.want(self._looked_at() | elsewhere)
 
     def _looked_at(self) -> frozenset[str]:
