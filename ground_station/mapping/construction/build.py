@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files, landmarks, store
@@ -48,6 +49,11 @@ class _Round:
     noise: noise.Noise | None
     structure: Structure
     model: Model
+
+    def places(self) -> list[dict[int, F64]]:
+        """Of each model, the poses (4, 4) of its images, by COLMAP's id."""
+        models = [self.model, *map(colmap.to_arrays, self.structure.parts)]
+        return [dict(zip(one.image_id.tolist(), one.wTc, strict=True)) for one in models]
 
 
 def build_map(
@@ -110,13 +116,10 @@ def build_map(
                 work.mkdir(parents=True)
             try:
                 with _timed(stage_s, "sfm"), _colmap_in(work):
-                    last = rounds[-1].model if rounds else None
-                    before = (
-                        dict(zip(last.image_id.tolist(), last.wTc, strict=True)) if last else {}
-                    )
                     structure = reconstruct(
-                        images, pairs, camera, limits, threads, work, workers, before
-                    )
+                        images, pairs, camera, limits, threads, work, workers,
+                        rounds[-1].places() if rounds else (),
+                    )  # fmt: skip
                 with _timed(stage_s, "refine"):
                     model = adjust_and_filter(structure.reconstruction, limits.sfm, threads)
             except MapError as error:

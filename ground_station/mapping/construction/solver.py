@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -75,13 +75,13 @@ class Solver:
         pairs: Pairs,
         *,
         joining: Pairs | None = None,
-        start: colmap.Reconstruction | Mapping[int, F64] | None = None,
+        starts: Sequence[colmap.Reconstruction | Mapping[int, F64]] = (),
         method: str | None = None,
     ) -> tuple[Models, list[str]]:
         """The models that pairs give, the largest first, and what is to say of the others.
 
         By the settings' method where none is given. Models are merged by the pairs `joining`, the
-        same ones if none are given; the first one goes on from `start`, a model or poses (4, 4) of
+        same ones if none are given; the first ones go on from `starts`, models or poses (4, 4) of
         images by COLMAP's id.
         """
         count = len(self._images.names)
@@ -89,7 +89,7 @@ class Solver:
             mapping = self._mapping(name, pairs, progress.step)
             models: Models = []
             method = method or self._sfm.method
-            if method != "incremental" and start is None:
+            if method != "incremental" and not starts:
                 folder = self._work / name
                 models = global_mapping.reconstruct(
                     folder / "database.db", folder / "global", self.wanted
@@ -97,9 +97,14 @@ class Solver:
                 most = max((model.num_reg_images() for model in models), default=0)
                 if method == "auto" and most < NEARLY_ALL * count:
                     models = []
-            if isinstance(start, Mapping):
-                start = mapping.with_images(colmap.pycolmap.Reconstruction(), start)
-            models = models or mapping.run(start)
+            models = models or mapping.run(
+                [
+                    mapping.with_images(colmap.pycolmap.Reconstruction(), start)
+                    if isinstance(start, Mapping)
+                    else start
+                    for start in starts
+                ]
+            )
         if not models:
             raise MapError(
                 "structure from motion found no pair of images to start from: the camera must move "

@@ -58,30 +58,33 @@ def reconstruct(
     settings: MappingSettings,
     threads: int,
     work: Path,
-    before: Mapping[int, F64] | None = None,
+    before: Sequence[Mapping[int, F64]] = (),
 ) -> Structure:
     """COLMAP's model of the images in the places where the chain of neighbours believes them.
 
     `work` is a folder for its files. What an earlier, killed run of the same inputs left there is
-    gone on from. `before`: poses (4, 4) of images, by COLMAP's id, by another lens; the search
-    begins there, unless a new one finds more. Raises `MapError` when structure from motion finds no
-    model.
+    gone on from. `before`: models by another lens, poses (4, 4) of images by COLMAP's id; the
+    search begins there, unless a new one finds more. Raises `MapError` when structure from motion
+    finds no model.
     """
     solver = Solver(images, pairs, camera, settings, threads, work)
     links, pairs, pixels = solver.links, solver.pairs, images.pinhole_px
-    tries = [solver.solve("before", pairs, start=before)] if before else []
-    # What went on from a model that was believed is that one, and its pairs were chosen already.
-    goes_on = bool(tries) and _size(tries[0][0][0]) >= NEARLY_ALL * len(images.names)
+    tries = [solver.solve("before", pairs, starts=before)] if before else []
+    # What went on from models that were believed are those, and their pairs were chosen already.
+    held = len({k for model in tries[0][0] for k in model.reg_image_ids()}) if before else 0
+    goes_on = held >= NEARLY_ALL * len(images.names)
     if not goes_on:
         tries.append(solver.solve("all", pairs))
-    models, notes = max(tries, key=lambda one: one[0][0].compute_num_observations())
+    models, notes = max(
+        tries, key=lambda one: sum(model.compute_num_observations() for model in one[0])
+    )
     spare: Models = []
     wrong = solver.misplaced(models[0], pairs)
     moved, placed = len(wrong), set(models[0].reg_image_ids())
     missing = {k for link in links for k in link} - {image_id - 1 for image_id in placed}
     doubtful = len(wrong) + len(missing) > _FOLDED * len(images.names)
-    loose = not goes_on and solver.fall_apart(models, links)
-    if links and pairs.keys() - links and (doubtful or loose):
+    asked = links and pairs.keys() - links and not goes_on
+    if asked and (doubtful or solver.fall_apart(models, links)):
         spare, trusted = solver.trusted()
         denied = solver.fall_apart(models, trusted.keys())
         if doubtful or denied:
@@ -98,12 +101,12 @@ def reconstruct(
         lies = lookalikes.refuted(solver.placed(models[0]), wrong, links, pairs, pixels)
         colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
         pairs = loops.among(pairs, pairs.keys() - lies)
-        models, notes = solver.solve("replaced", pairs, start=models[0])
+        models, notes = solver.solve("replaced", pairs, starts=models[:1])
     solver.settle(models[0], pairs)
     models[0], resected = solver.resected(models[0], pairs)
     moved += resected
     models, notes, doubts = _Consistent(solver, pairs, pixels, camera, settings.sfm).of(
-        models, notes, spare
+        models, notes, spare, goes_on
     )
     doubts += elsewhere.doubt(solver.rivals(models[0], pairs), images.names)
     doubts += bridges.doubt(bridges.hinges(solver.placed(models[0])), images.names)
@@ -142,10 +145,11 @@ class _Consistent:
         )
 
     def of(
-        self, models: Models, notes: list[str], spare: Models
+        self, models: Models, notes: list[str], spare: Models, goes_on: bool
     ) -> tuple[Models, list[str], list[str]]:
         """The models where they are consistent, or others that are, with notes and doubts.
 
+        Where they go on from others it was tried to hold more.
         Where that breaks the first, or it holds too few images, the others are placed again from
         its largest piece on; then from that of `spare` models of other tries, and of those of the
         global method, which starts nowhere, until one holds nearly all. Else the largest pieces are
@@ -154,7 +158,7 @@ class _Consistent:
         pieces = self._split(models)
         enough = NEARLY_ALL * len({k for pair in self._pairs for k in pair})
         begun = {*models[0].reg_image_ids()} if pieces[:1] == models[:1] else set()
-        if len(begun) >= enough:
+        if len(begun) >= enough or (goes_on and pieces == models):
             return models, notes, []
         tries: tuple[Callable[[], Models], ...] = (
             lambda: pieces,
@@ -172,7 +176,7 @@ class _Consistent:
                 # What is right is a better place to begin at than any pair.
                 begun = {*largest.reg_image_ids()}
                 again, _ = self._solver.solve(
-                    f"again-{number}", self._pairs, start=colmap.copied(largest)
+                    f"again-{number}", self._pairs, starts=[colmap.copied(largest)]
                 )
                 self._solver.settle(again[0], self._pairs)
                 again[0], _ = self._solver.resected(again[0], self._pairs)

@@ -105,8 +105,8 @@ class Incremental:
         self._finished = Snapshots(work / "models")
         self._on_image = on_image
 
-    def run(self, start: colmap.Reconstruction | None = None) -> list[colmap.Reconstruction]:
-        """The models, in the order in which they were found; `start` is where the first begins.
+    def run(self, starts: Sequence[colmap.Reconstruction] = ()) -> list[colmap.Reconstruction]:
+        """The models, in the order in which they were found; `starts` is where the first begin.
 
         What the folder holds comes first: finished models, and the newest snapshot of the next.
         """
@@ -116,7 +116,8 @@ class Incremental:
         while len(models) < self._options.max_num_models:
             if models and self._total(models) >= self._cache.num_images() - 1:
                 break
-            found = self._next_model(models, level, None if models else start)
+            start = starts[len(models)] if len(models) < len(starts) else None
+            found = self._next_model(models, level, start)
             if found is None:
                 break
             model, level = found

@@ -51,7 +51,7 @@ def _plain(corridor, pairs, work) -> colmap.Reconstruction:
     return max(models, key=lambda model: model.num_reg_images())
 
 
-def _judged(corridor, work, before=None) -> structure.Structure:
+def _judged(corridor, work, before=()) -> structure.Structure:
     return structure.reconstruct(
         corridor.images, corridor.pairs, corridor.camera, SETTINGS, 1, work, before
     )
@@ -164,7 +164,7 @@ def test_halves_that_only_lookalikes_join_are_not_one_model(seed, tmp_path):
 def test_halves_that_another_lens_has_joined_stay_one_model(tmp_path):
     corridor = _cut_at_the_turn(seed=5)
     before = {k + 1: wTc for k, wTc in enumerate(corridor.wTc)}
-    found = _judged(corridor, tmp_path, before)
+    found = _judged(corridor, tmp_path, [before])
     assert found.sizes == [len(before)]
     assert geometry.error_m(corridor, found.reconstruction).max() < 0.02
 

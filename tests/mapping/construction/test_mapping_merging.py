@@ -111,17 +111,30 @@ def test_poses_of_another_lens_are_where_the_search_begins(corridor, tmp_path):
     run = _solver(corridor, tmp_path)
     longer = corridor.wTc.copy()
     longer[:, 1, 3] *= 1.02
-    first = longer[:30]
-    (model,), notes = run.solve("before", corridor.pairs, start={
-        k + 1: wTc for k, wTc in enumerate(first)
-    })  # fmt: skip
+    places = dict(enumerate(longer, start=1))
+    first = {k: wTc for k, wTc in places.items() if k <= 30}
+    (model,), notes = run.solve("before", corridor.pairs, starts=[first])
     assert model.num_reg_images() == 40 and notes == []
     assert geometry.error_m(corridor, model).max() < 0.03
     found = structure.reconstruct(
         corridor.images, corridor.pairs, corridor.camera, MappingSettings(), 1, tmp_path / "whole",
-        dict(enumerate(longer, start=1)),
+        [places],
     )  # fmt: skip
     assert geometry.error_m(corridor, found.reconstruction).max() < 0.03
+
+
+def test_models_that_stayed_apart_by_another_lens_begin_each_where_it_was(corridor, tmp_path):
+    apart = loops.among(corridor.pairs, _halves(corridor))
+    half = [
+        {k + 1: corridor.wTc[k] for k in members} for members in (range(20), range(20, 40))
+    ]  # fmt: skip
+    found = structure.reconstruct(
+        corridor.images, apart, corridor.camera, MappingSettings(), 1, tmp_path, half
+    )
+    assert found.sizes == [20, 20]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["before"]
+    for model in (found.reconstruction, *found.parts):
+        assert geometry.error_m(corridor, model).max() < 0.03
 
 
 def test_an_image_that_stands_aside_goes_where_the_others_see_it(corridor, tmp_path):

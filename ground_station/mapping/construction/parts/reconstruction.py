@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def reconstruct(
     threads: int,
     work: Path,
     workers: Workers,
-    before: Mapping[int, F64] | None = None,
+    before: Sequence[Mapping[int, F64]] = (),
 ) -> Structure:
     """As `structure.reconstruct`; of more than `sfm.part_images` images in parts.
 
