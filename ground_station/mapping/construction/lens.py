@@ -162,15 +162,15 @@ class SelfCalibration:
         if not self._follows:
             return False
         self.rounds += 1
-        tried = self._state == "tried"
-        if len(model.names) < _FEWER * self._by:
-            return self._back("kept") if tried else False
+        given, tried = self._state == "given", self._state == "tried"
         prior = prior_of(self.known, self.camera)
         still_view, rolling_view = self._views(model, images)
-        given = self._state == "given"
-        still = adjust(still_view, self.camera, prior)
+        fewer = len(model.names) < _FEWER * self._by
+        still = None if fewer else adjust(still_view, self.camera, prior)
         if still is None:
-            return False if given else self._give_up("the model is too small")
+            if tried:
+                return self._back("kept")
+            return False if given or fewer else self._give_up("the model is too small")
         if given and still.explained < _EXPLAINED and not _is_far(still, self.known.camera):
             self._found = still
             return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -195,7 +196,7 @@ def test_a_lens_that_goes_to_and_fro_stands_if_that_is_little(monkeypatch, swing
     assert calibration.camera.fx_px == pytest.approx(CAMERA.fx_px, rel=0.001)
 
 
-def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said():
+def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said(monkeypatch):
     """What comes from how the camera moved, as of a rolling shutter, is no fault of the file."""
     images, model = _views(CAMERA, *_flight(True, 1), 1)
     centre = np.array([CAMERA.cx_px, CAMERA.cy_px], np.float32)
@@ -211,6 +212,11 @@ def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said():
     found = adjust(lens._as_seen(model, images, CAMERA, 0.0), CAMERA, lens.prior_of(known, CAMERA))
     assert found is not None and found.explained > 0.5
     assert calibration.go_on(model, images)  # the other is tried, and half denies it as well
+    in_vain = copy.copy(calibration)
+    with monkeypatch.context() as patch:
+        patch.setattr(lens, "adjust", lambda *_: None)  # its model is too small for a lens
+        assert not in_vain.go_on(model, images)
+    assert in_vain.as_built()["state"] == "kept"
     model = _adjusted_with(calibration.camera, images, model)
     assert not calibration.go_on(model, images)
     assert calibration.camera == CAMERA and calibration.as_built()["state"] == "kept"
