@@ -53,11 +53,13 @@ install-service: setup  ## Install the ground station as a hardened system servi
 uninstall-service:  ## Take the service away; configuration and recordings stay
 	@sh deploy/ground_station/service.sh uninstall
 
+SPREAD = --dist loadfile --no-loadscope-reorder
+
 test: setup  ## Run the tests of every room
 	@sh tests/tools.sh
 	@failed=0; \
-	.venv/bin/python -m pytest -q -m beside -n auto --dist loadfile tests || failed=1; \
-	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 3 --dist loadfile tests || failed=1; \
+	.venv/bin/python -m pytest -q -m beside -n auto $(SPREAD) tests || failed=1; \
+	.venv/bin/python -m pytest -q -m "not beside and not alone" -n 3 $(SPREAD) tests || failed=1; \
 	.venv/bin/python -m pytest -q -m alone tests || failed=1; \
 	exit $$failed
 

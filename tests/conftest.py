@@ -6,6 +6,7 @@ and those marked `alone`, which measure or need the machine, one by one.
 
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,7 +39,12 @@ def _cache_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what may run beside other tests, all of these rooms but what measures."""
+    """Marks what may run beside other tests, all of these rooms but what measures.
+
+    Files of few tests come first: they are the long ones, which no worker shall begin last.
+    """
+    tests = Counter(item.path for item in items)
+    items.sort(key=lambda item: (tests[item.path], item.path))
     here = Path(__file__).parent
     for item in items:
         room = item.path.relative_to(here).parts[0]
