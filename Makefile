@@ -53,6 +53,7 @@ install-service: setup  ## Install the ground station as a hardened system servi
 uninstall-service:  ## Take the service away; configuration and recordings stay
 	@sh deploy/ground_station/service.sh uninstall
 
+# In the order that tests/conftest.py makes.
 SPREAD = --dist loadfile --no-loadscope-reorder
 
 test: setup  ## Run the tests of every room

@@ -67,9 +67,10 @@ it is there, and of a real corridor, where it is not, differed by 1 to 5 %; in a
 a headset without one, it left 1.9 times as much."""
 _PROVEN = 0.2
 """A tried lens is so in both halves of its model: each one's leaves a smaller share of what the
-known one leaves in the other. In simulated walks with a lens 1 % off it was at most 0.15, in 40
-frames of a real kitchen, whose rolling shutter looks like a lens 4 % off, 0.46 in one half and 0.05
-in the other. How much more such a lens explains tells less: there 1.9 %, in walks 0.6 to 8 %."""
+known one leaves in the other. In three simulated walks with a lens 1 % off it was at most 0.15, in
+40 frames of a real kitchen, whose rolling shutter looks like a lens 4 % off, 0.46 in one half and
+0.05 in the other. How much more such a lens explains tells less: there 1.9 %, in walks 0.6 to 7 %.
+"""
 _FEWER = 0.9
 """A lens that more images have decided than the model by it has, by this share, stands. A simulated
 walk of 195 images decided it to 0.04 %; the two thirds that held together by it left it open."""

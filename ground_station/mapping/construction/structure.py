@@ -149,7 +149,7 @@ class _Consistent:
     ) -> tuple[Models, list[str], list[str]]:
         """The models where they are consistent, or others that are, with notes and doubts.
 
-        Where they go on from others it was tried to hold more.
+        Where they go on from an earlier round's, that round has tried what could hold more.
         Where that breaks the first, or it holds too few images, the others are placed again from
         its largest piece on; then from that of `spare` models of other tries, and of those of the
         global method, which starts nowhere, until one holds nearly all. Else the largest pieces are

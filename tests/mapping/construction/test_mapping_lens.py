@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -264,6 +265,27 @@ def test_a_lens_that_a_bent_model_denies_proves_itself_in_its_own(fewer):
     assert calibration.as_built()["state"] == ("kept" if fewer else "found")
     true = wrong if fewer else CAMERA
     assert calibration.camera.fx_px == pytest.approx(true.fx_px, rel=0.005)
+
+
+@pytest.mark.parametrize(
+    "left, proven",
+    [
+        ([(0.0171, 0.1288), (0.0051, 0.0354)], True),  # a simulated walk, its lens 1 % off
+        ([(0.1009, 0.2176), (0.0357, 0.679)], False),  # a real kitchen's rolling shutter
+    ],
+)
+def test_both_halves_of_a_tried_lens_must_deny_the_known_one_by_far(monkeypatch, left, proven):
+    """By what each half's lens leaves in the other, and what the known one leaves, as measured."""
+    known, better = _off(CAMERA, 1.04), replace(CAMERA, cx_px=CAMERA.cx_px + 1)
+    halves = tuple(
+        SimpleNamespace(camera=better, left_by=lambda by, two=two: two[by == known])
+        for two in left
+    )  # fmt: skip
+    images, _ = _views(CAMERA, *_flight(True, 1), 1)
+    calibration = lens.SelfCalibration(LensPrior(known, "file", 0.0), images, MappingSettings())
+    monkeypatch.setattr(calibration, "_halves", lambda *_: halves)
+    found = SimpleNamespace(camera=CAMERA, sigma_focal=0.005)
+    assert calibration._proves(found, None, None) == proven
 
 
 def test_a_file_that_misfits_is_not_kept_silently_where_the_images_leave_the_lens_open(monkeypatch):
