@@ -64,7 +64,8 @@ class Solution:
     `inlier` (N,) belong to the observations given; `reason` says why there is no state.
     `pose_by_focal` (6, 2) is by how much the pose (right tangent) that the observations alone say
     follows the share by which the focal length is longer, the frame's and the map's; None by
-    solvers that do not tell."""
+    solvers that do not tell. `noise` is the variance of the observations, as their residuals show
+    it, over the one that `information` weighs them with."""
 
     state: Kinematics | None
     information: F64
@@ -75,6 +76,7 @@ class Solution:
     iterations: int = 0
     reason: str = ""
     pose_by_focal: F64 | None = None
+    noise: float = 1.0
 
 
 def no_solution(count: int, reason: str, iterations: int = 0) -> Solution:

@@ -32,8 +32,16 @@ _WIDENING = 9.0
 _MEDIAN_OF_TWO = 1.17741
 """The median length of two standard normal numbers (Rayleigh's distribution)."""
 
-_LEAST_SCALE = 0.02
+_LEAST_MISS = 0.02
 """For residuals of all but nothing: no feature is found to a few hundredths of a pixel."""
+
+_NOISE_OF_MISS = 4.0
+"""Variance that moves a pose over that of what its inliers miss by: what neighbours miss by alike,
+the pose takes up, and nothing of it is left to see.
+
+Of 16 simulated flights of 20 s in four buildings (sharp, at 4 m/s, blurred by 2 to 4 px, at 150 to
+300 kbit/s), those in which the map's own errors are the lesser part, 1.4 to 7.7, the median 3.9.
+"""
 
 _SMALLEST = 1e-9
 """A predicted standard deviation (rad, m, rad/s, m/s) below this counts as this."""
@@ -77,7 +85,7 @@ def solve_rolling(
         huber_k=settings.huber_k,
         by_focal_m=observations.by_focal_m.T,
     )
-    chosen, inlier, iterations = every, np.ones(count, bool), 0
+    chosen, inlier, iterations, noise = every, np.ones(count, bool), 0, 1.0
     wTc, twist = np.asarray(predicted.wTc, np.float64), np.asarray(predicted.twist, np.float64)
     with np.errstate(all="ignore"):  # what is not finite is a reason below
         for last in (False, True) if settings.reject_outliers else (True,):
@@ -95,7 +103,11 @@ def solve_rolling(
             view = every.view(wTc, twist)
             residual_px, inlier = _judge(view, spread, inlier_px)
             if not last and inlier.any():
-                scale = _scale(every.where(inlier), view.residual_px[:, inlier], spread[:, inlier])
+                missed = _missed(
+                    every.where(inlier), view.residual_px[:, inlier], spread[:, inlier]
+                )
+                scale = min(1.0, missed)
+                noise = _NOISE_OF_MISS * missed**2 / scale
                 every = replace(
                     every,
                     variance_px2=every.variance_px2 * scale,
@@ -116,6 +128,7 @@ def solve_rolling(
         float(apart @ prior.information @ apart),
         iterations,
         pose_by_focal=_pose_by_focal(linear, prior),
+        noise=noise,
     )
 
 
@@ -187,15 +200,15 @@ def _pose_by_focal(linear: Linear, prior: Prior) -> F64 | None:
     return -follows[:6] if np.isfinite(follows).all() else None
 
 
-def _scale(inliers: Reprojection, residual_px: F64, spread_px2: F64) -> float:
-    """How far inliers miss over what their noise says: by the median, as of a Gaussian; at most 1.
+def _missed(inliers: Reprojection, residual_px: F64, spread_px2: F64) -> float:
+    """How far inliers miss over what their noise says: by the median, as of a Gaussian.
 
     Where pictures and map are better than `sigma_px`, pairs that are wrong by a pixel or two would
     count as right ones do, and they turn the pose.
     """
     r = residual_px
     squared = (solve2(inliers.variance_px2, spread_px2, r)[0] * r).sum(axis=0)
-    return min(1.0, max(_LEAST_SCALE, math.sqrt(float(np.median(squared))) / _MEDIAN_OF_TWO))
+    return max(_LEAST_MISS, math.sqrt(float(np.median(squared))) / _MEDIAN_OF_TWO)
 
 
 def _judge(view: View, spread_px2: F64, inlier_px: F64) -> tuple[F64, Bools]:

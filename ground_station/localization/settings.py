@@ -159,7 +159,7 @@ class CovarianceSettings:
     """From what the filter believes to what is published: calibrated against truth."""
 
     scale: float = config.key(1.0, low=0.01, high=100)
-    shared: float = config.key(0.0, low=0, high=10)
+    shared: float = config.key(0.0, low=0, high=1)
     map: float = config.key(0.0, low=0, high=10)
     focal: float = config.key(0.0, low=0, high=0.1)
 

@@ -304,17 +304,20 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
     assert not catch_up(landed, recent, acquirer.matcher, fresh)
 
 
-def test_what_frames_share_is_added_to_what_is_published():
+def test_what_frames_have_in_common_is_no_less_for_many_than_for_one():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(12, 12))
     covariance, moves, none = A @ A.T, rng.normal(size=(6, 2)), np.zeros((2, 2))
     told = dataclasses.replace(
-        no_solution(0, ""), information=np.diag(np.arange(1.0, 13.0)), pose_by_focal=moves
+        no_solution(0, ""),
+        information=np.diag(np.arange(1.0, 13.0)),
+        pose_by_focal=moves,
+        noise=3.0,
     )
     plain = covariance_in_map(covariance, told, CovarianceSettings(), none)
     assert np.array_equal(plain, covariance[:6, :6])
-    more = covariance_in_map(covariance, told, CovarianceSettings(scale=2.0, shared=0.5), none)
-    assert np.allclose(more, 4 * plain + 0.25 * np.diag(1 / np.arange(1.0, 7.0)))
+    more = covariance_in_map(covariance, told, CovarianceSettings(scale=2.0, shared=0.25), none)
+    assert np.allclose(more, 3 * plain + 0.75 * np.diag(1 / np.arange(1.0, 7.0)))
     lenses = np.array([[0.01, 0.002], [0.002, 0.03]])
     more = covariance_in_map(covariance, told, CovarianceSettings(), lenses)
     assert np.allclose(more, plain + moves @ lenses @ moves.T)

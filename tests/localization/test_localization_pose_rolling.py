@@ -116,8 +116,23 @@ def test_pairs_that_are_a_little_wrong_do_not_turn_the_pose_where_the_others_fit
         return float(np.linalg.norm(_error(state)[:3]))
 
     follows = [off(seed) for seed in range(5)]
-    monkeypatch.setattr(pose_rolling, "_LEAST_SCALE", 1.0)  # as their sigma says
+    monkeypatch.setattr(pose_rolling, "_LEAST_MISS", 1.0)  # as their sigma says
     assert np.mean(follows) < 0.6 * np.mean([off(seed) for seed in range(5)])
+
+
+@pytest.mark.parametrize("noise_px", [0.2, 1.0, 1.6])
+@pytest.mark.parametrize("told_px", [0.5, 2.0])
+def test_the_noise_told_is_what_the_residuals_show_whatever_was_claimed(noise_px, told_px):
+    settings = dataclasses.replace(SETTINGS, huber_k=100.0, inlier_px=50.0)
+    predicted, observations, _ = _scene(np.random.default_rng(3), noise_px=noise_px)
+    true = solve_rolling(
+        predicted, observations, CAMERA, dataclasses.replace(settings, reject_outliers=False)
+    )
+    assert true.noise == 1.0
+    told = dataclasses.replace(observations, sigma_px=np.full(len(observations), told_px))
+    found = solve_rolling(predicted, told, CAMERA, settings)
+    ratio = found.noise * np.linalg.inv(found.information) @ true.information
+    np.testing.assert_allclose(np.trace(ratio) / 12, pose_rolling._NOISE_OF_MISS, rtol=0.3)
 
 
 def test_without_the_rows_the_pose_is_many_times_worse():
