@@ -39,7 +39,7 @@ _NOISE_OF_MISS = 4.0
 """Variance that moves a pose over that of what its inliers miss by: what neighbours miss by alike,
 the pose takes up, and nothing of it is left to see.
 
-Of 16 simulated flights of 20 s in four buildings (sharp, at 4 m/s, blurred by 2 to 4 px, at 150 to
+Of 16 runs of simulated flights in four buildings (sharp, at 4 m/s, blurred by 2 to 4 px, at 150 to
 300 kbit/s), those in which the map's own errors are the lesser part, 1.4 to 7.7, the median 3.9.
 """
 

@@ -54,6 +54,7 @@ class Solver:
         work: Path,
     ) -> None:
         self._images, self._camera, self._sfm, self._work = images, camera, settings.sfm, work
+        self.names = images.names
         self._counts = [len(pixels) for pixels in images.pinhole_px]
         self._sequence = sequences(images.names, images.time_ns)
         self.wanted = Wanted(

@@ -139,6 +139,7 @@ class _Consistent:
         sfm: SfmSettings,
     ) -> None:
         self._solver, self._pairs, self._pixels, self._sfm = solver, pairs, pixels, sfm
+        self._names = solver.names
         self._wanted = solver.wanted
         self._confirmed = contradictions.rotations(
             pairs, pixels, camera.matrix, self._wanted.threads
@@ -185,7 +186,7 @@ class _Consistent:
                 largest = max([largest, *more], key=_size)
             if _size(largest) >= enough:
                 return [largest], [], []
-        kept = covering(kept, self._wanted.smallest)
+        tried, kept = kept, covering(kept, self._wanted.smallest)
         if not kept:
             raise MapError(
                 "structure from motion contradicts what pairs of images say of each other: the "
@@ -193,12 +194,18 @@ class _Consistent:
             )
         # Of the pairs that were not believed, too: whole pieces know better which are right.
         joined, notes = self._solver.joined(kept, self._solver.pairs)
-        if self._split(joined[:1]) == joined[:1]:
-            return joined, notes, []
-        return kept, [], [
-            f"{len(kept)} pieces fit each other only against what pairs of their images say: "
-            "they are kept apart"
-        ]  # fmt: skip
+        doubts: list[str] = []
+        if self._split(joined[:1]) != joined[:1]:
+            joined, notes = kept, []
+            doubts = [
+                f"{len(kept)} pieces fit each other only against what pairs of their images say: "
+                "they are kept apart"
+            ]
+        chosen = self._solver.placed(joined[0])
+        elsewhere_too = elsewhere.otherwise(
+            chosen, (self._solver.placed(one) for one in tried), self._wanted.seed
+        )
+        return joined, notes, doubts + elsewhere.otherwise_doubt(elsewhere_too, self._names)
 
     def _settled(self, models: Models) -> Models:
         for model in models:

@@ -94,3 +94,25 @@ def test_what_several_images_say_alike_counts_once(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(elsewhere.cv2, "solvePnPRansac", solved)
     assert elsewhere.rivals(model, pairs, pixels, MATRIX)[5] == Rival(here=N, there=60)
     assert all(len(np.unique(points, axis=0)) == len(points) for points in drawn) and drawn
+
+
+def row(moved: float, seen: int, images: int = 20) -> Placed:
+    """Images along a wall, each of which sees so many landmarks; the last six are moved."""
+    x_m = np.where(np.arange(images) < images - 6, 0.0, moved) + np.arange(images)
+    points = np.random.default_rng(1).uniform([-2, -1, 4], [25, 1, 6], (N, 3))
+    landmark = [np.arange(N)] * (images - 6) + [np.where(np.arange(N) < seen, 1, -1)] * 6
+    wTc = {k: poses.pose(np.eye(3), [x, np.sin(k), 0.5 * np.cos(2 * k)]) for k, x in enumerate(x_m)}
+    return Placed(landmark, wTc, points, np.array([500.0, 500.0, 320.0, 240.0]))
+
+
+def test_images_that_another_model_has_elsewhere_are_doubtful_where_it_holds_them_as_well() -> None:
+    model, last = row(0.0, N), set(range(14, 20))
+    assert elsewhere.otherwise(model, [model, row(BAY_M, N)], seed=0) == last
+    assert elsewhere.otherwise(model, [row(BAY_M, N // 2 - 1)], seed=0) == set()
+    assert elsewhere.otherwise(model, [row(BAY_M, N, images=12)], seed=0) == set()
+    said = elsewhere.otherwise_doubt(last, [f"frame-{k}" for k in range(20)])
+    assert said == [
+        "tried from another place, the same pairs put 6 images elsewhere nearly as well:"
+        " frame-14, frame-15, frame-16, frame-17, frame-18 and 1 more"
+    ]
+    assert elsewhere.otherwise_doubt(set(), []) == []

@@ -22,11 +22,14 @@ from ground_station.mapping.construction.placing.lookalikes import BREAKS, SPEAK
 from ground_station.mapping.construction.placing.loops import SLACK_DEPTHS
 from ground_station.mapping.construction.placing.merging import SECOND
 from ground_station.mapping.construction.placing.placed import IN_PLACE_PX, Placed
+from ground_station.mapping.sfm.robust_similarity import similarity
 from ground_station.mapping.sfm.two_view import TwoView
 
 _DRAWS = 1000
 """Of four each: where three in ten are right, three of ten thousand searches miss the pose."""
 _SHOWN = 5
+_AGREE = 15
+"""Images; of fewer any similarity is one of most."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +115,55 @@ def doubt(found: Mapping[int, Rival], names: Sequence[str]) -> list[str]:
     doubtful = [k for k, rival in sorted(found.items()) if rival.doubtful]
     if not doubtful:
         return []
-    shown = ", ".join(names[k] for k in doubtful[:_SHOWN])
-    more = f" and {len(doubtful) - _SHOWN} more" if len(doubtful) > _SHOWN else ""
     return [
         f"{_images(doubtful)} in another place nearly as well as in theirs, because what is seen"
-        f" repeats itself: {shown}{more}"
+        f" repeats itself: {_shown(doubtful, names)}"
     ]
+
+
+def otherwise(model: Placed, others: Iterable[Placed], seed: int) -> set[int]:
+    """The images, by index, that other models of the same pairs have in another place.
+
+    Where most images of both agree, each of the rest that sees there half as many landmarks as
+    here: what the pairs of the one say without a contradiction, those of the other deny.
+    """
+    found: set[int] = set()
+    for other in others:
+        both = np.array(sorted(model.wTc.keys() & other.wTc.keys()))
+        here, there = (_centres(one, both) for one in (model, other))
+        within = SLACK_DEPTHS * model.depth
+        similar = similarity(there, here, within, seed) if len(both) >= _AGREE else None
+        if similar is None:
+            continue
+        off = np.linalg.norm(similar.apply(there) - here, axis=1) > within
+        mine, theirs = (_landmarks(one, both) for one in (model, other))
+        found.update(both[off & (theirs >= SECOND * mine)].tolist())
+    return found
+
+
+def otherwise_doubt(found: Iterable[int], names: Sequence[str]) -> list[str]:
+    """A sentence on images that other models place elsewhere; none where there are none."""
+    index = sorted(found)
+    if not index:
+        return []
+    return [
+        "tried from another place, the same pairs put "
+        f"{'an image' if len(index) == 1 else f'{len(index)} images'} elsewhere nearly as well: "
+        f"{_shown(index, names)}"
+    ]
+
+
+def _centres(model: Placed, images: I64) -> F64:
+    return np.array([model.wTc[k][:3, 3] for k in images.tolist()]).reshape(-1, 3)
+
+
+def _landmarks(model: Placed, images: I64) -> I64:
+    return np.array([np.count_nonzero(model.landmark[k] >= 0) for k in images.tolist()])
+
+
+def _shown(index: Sequence[int], names: Sequence[str]) -> str:
+    more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
+    return ", ".join(names[k] for k in index[:_SHOWN]) + more
 
 
 def _images(index: Iterable[int]) -> str:
