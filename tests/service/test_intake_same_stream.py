@@ -83,11 +83,14 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
     assert told() == (5, 0)
     take(5, 103.0)  # a stutter alone is no new session
     assert received() == 6
-    payload.started_s = 104.0
+    payload.started_ns = 99_900_000_000  # this session's own word, heard late
+    take(6, 104.0)
+    assert received() == 7
+    payload.started_ns = 104_500_000_000
     take(9, 105.0)
     take(10, 105.1)
     assert received() == 2
-    payload.started_s = 105.125  # its word came late
+    payload.started_ns = 105_125_000_000  # without a silence it is no session
     take(11, 105.2)
     assert received() == 3
     take(12, 105.3, clock_s=-60.0)  # nor is a clock that is set

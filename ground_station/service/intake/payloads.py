@@ -47,12 +47,12 @@ class Payload:
         self.stream: Stream | None = None
         """The newest; it may have ended."""
         self.clock: Callable[[], Offset | None] = lambda: None
-        self.started_s = float("-inf")
-        """When it said that a session starts; `time.monotonic`, as clocks may be set."""
+        self.started_ns = 0
+        """When a session starts, by the payload's own clock: its word may be heard after frames."""
         self._say, self._recorder = say, recorder
         self._pictures = PictureWriter(folder, payload_id) if folder is not None else None
         self._lock = threading.Lock()  # two streams overlap for a moment when it restarts
-        self._frame_s = float("-inf")
+        self._frame_s, self._clock_ns = float("-inf"), 0
         self._first: tuple[int, int, int] | None = None
         self.last_sequence = -1
         self._base = Counters()
@@ -69,32 +69,33 @@ class Payload:
         if capture_ns is not None and not (-_LATE_NS < capture_ns - frame.arrival_ns < _EARLY_NS):
             capture_ns = None
         with self._lock:
-            before_s, self._frame_s = self._frame_s, time.monotonic()
+            now_s = time.monotonic()
+            silent_s = now_s - self._frame_s
             self.seen_ns = frame.arrival_ns
             if self._first is None or self._first[0] != frame.ssrc:
                 units = self.stream.counters.access_units if self.stream else 1
                 self._first = (frame.ssrc, frame.sequence, units)
                 self._shown = 0
-            elif self._began_anew(frame, before_s) and self.stream is not None:
+            elif self._began_anew(frame, silent_s) and self.stream is not None:
                 counters = self.stream.counters
                 fate = "decoded" if frame.damaged is None else "damaged"
                 before = {name: getattr(counters, name) - 1 for name in ("access_units", fate)}
                 self._base = dataclasses.replace(counters, **before)
                 self._first = (frame.ssrc, frame.sequence, 1)
                 self._before, self._dropped, self._shown = None, 0, 0
+            self._frame_s, self._clock_ns = now_s, frame.clock_ns
             self.last_sequence = frame.sequence
             self._show(frame, capture_ns)
         log_ns = frame.arrival_ns if capture_ns is None else capture_ns
         self._recorder.frame(self.id, frame, log_ns)
 
-    def _began_anew(self, frame: ReceivedFrame, before_s: float) -> bool:
+    def _began_anew(self, frame: ReceivedFrame, silent_s: float) -> bool:
         """Whether a frame is the first of a session.
 
         Its number tells, but where as many were lost at the start as the session before had: there
         its word does, in the silence between the two.
         """
-        silent = self._frame_s - before_s > _RESTART_S
-        said = silent and before_s < self.started_s <= self._frame_s
+        said = self._clock_ns < self.started_ns <= frame.clock_ns and silent_s > _RESTART_S
         return said or frame.sequence <= self.last_sequence
 
     def _show(self, frame: ReceivedFrame, capture_ns: int | None) -> None:

@@ -253,7 +253,7 @@ class Intake:
         level = _LEVELS.get(event.name, bus_messages.INFO)
         payload = self._roster.get(payload_id)
         if payload is not None and event.name == messages.EVENT_STARTED:
-            payload.started_s = time.monotonic()
+            payload.started_ns = event.time_ns
         name, text = event.name[:_NAME_LENGTH], event.text[:_TEXT_LENGTH]
         self._event("payload", level, name, text, payload_id)
 
