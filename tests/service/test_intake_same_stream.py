@@ -13,10 +13,12 @@ from intake_stand import Stand, eventually
 from ground_station.arrays import Bools
 from ground_station.service.intake import payloads
 from ground_station.service.intake.payloads import Payload
+from ground_station.service.intake.process import Intake
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
+from pi_firmware.wire import messages
 
 
 def test_a_session_with_the_ssrc_of_the_one_before_counts_from_its_own_beginning(
@@ -100,3 +102,12 @@ def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.Monkey
     assert told() == (6, 1)
     take(0, 107.0, damaged=np.ones((1, 1), bool))  # the first one of a session
     assert told() == (1, 1)
+
+
+def test_the_word_of_a_start_is_dated_by_the_payloads_clock() -> None:
+    payload = SimpleNamespace(started_ns=0)
+    intake = SimpleNamespace(_roster={"blimp-1": payload}, _event=lambda *_: None)
+    for name, time_ns in ((messages.EVENT_STARTED, 5), ("stopped", 7)):
+        event = messages.Event(time_ns=time_ns, name=name, text="")
+        Intake._pass_on(intake, "blimp-1", event)  # type: ignore[arg-type]
+    assert payload.started_ns == 5

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from ground_station.geometry import poses
+from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.placing import elsewhere
 from ground_station.mapping.construction.placing.elsewhere import Rival
 from ground_station.mapping.construction.placing.placed import Placed
+from ground_station.mapping.settings import SfmSettings
 from ground_station.mapping.sfm.two_view import TwoView
 
 MATRIX = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -116,3 +120,31 @@ def test_images_that_another_model_has_elsewhere_are_doubtful_where_it_holds_the
         " frame-14, frame-15, frame-16, frame-17, frame-18 and 1 more"
     ]
     assert elsewhere.otherwise_doubt(set(), []) == []
+
+
+def test_a_build_whose_tries_deny_each_other_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Model(SimpleNamespace):
+        def reg_image_ids(self) -> list[int]:
+            return [k + 1 for k in self.placed.wTc]
+
+        def num_reg_images(self) -> int:
+            return len(self.placed.wTc)
+
+    solver = SimpleNamespace(
+        wanted=SimpleNamespace(threads=1, smallest=5, seed=0),
+        names=[f"frame-{k}" for k in range(30)],
+        pairs={},
+        placed=lambda model: model.placed,
+        solve=lambda *_, **__: ([], []),
+        settle=lambda *_: None,
+        joined=lambda models, _: (models[:1], []),
+    )
+    monkeypatch.setattr(structure.contradictions, "rotations", lambda *_: {})
+    monkeypatch.setattr(structure._Consistent, "_split", lambda _, models: models)
+    pairs = {(k, k + 1): view(N) for k in range(29)}
+    camera, sfm = SimpleNamespace(matrix=MATRIX), SfmSettings()
+    for moved, doubts in ((BAY_M, 1), (0.0, 0)):
+        judge = structure._Consistent(solver, pairs, [], camera, sfm)  # type: ignore[arg-type]
+        spare = [Model(placed=row(moved, N))]
+        said = judge.of([Model(placed=row(0.0, N))], [], spare, False)[2]  # type: ignore[list-item]
+        assert len(said) == doubts
