@@ -74,7 +74,7 @@ def add_packages(
             package isn't there or doesn't install; nothing half-made is left. What the tools said
             then stands in `base-BOARD.log` there.
     """
-    made_by = (_RECIPE, _HERE / "install.sh", _HERE / "layer.py")
+    made_by = (_RECIPE, *(_HERE / name for name in ("install.sh", "plugins.sh", "layer.py")))
     names = sorted(missing)
     key = cache.key(base, board.architecture, names, board.left_out, *made_by)
     target = cache_folder / f"base-{board.name}-{key}.tar"
@@ -99,9 +99,8 @@ def add_packages(
         lacked = set(libraries.missing(root))
         (root / _SETTINGS).parent.mkdir(parents=True, exist_ok=True)
         (root / _SETTINGS).write_text(apt.SETTINGS + _OPTIONS)
-        script = str(_HERE / "install.sh")
         clean = ["env", *(f"--unset={name}" for name in _NOT_INSIDE)]
-        words = [*emulated, *clean, "unshare", "--mount", "sh", script, str(root), *names]
+        inside = [*emulated, *clean, "unshare", "--mount", "sh"]
         environment = {
             **foreign.environment(),
             "DEBIAN_FRONTEND": "noninteractive",
@@ -111,8 +110,13 @@ def add_packages(
             "SYSTEMD_OFFLINE": "1",
         }
         log = cache_folder / f"base-{board.name}.log"
+        words = [*inside, str(_HERE / "install.sh"), str(root), *names]
         run_long(words, log, f"packages of {board.name}", environment)
         leave_out(root, before, board.left_out)
+        words = [*inside, str(_HERE / "plugins.sh"), str(root)]
+        run_long(
+            words, log.with_stem(f"{log.stem}-plugins"), f"plugins of {board.name}", environment
+        )
         if lost := sorted(set(libraries.missing(root)) - lacked):
             raise DeployError(f"packages of {board.name}: misses a library: {lost[0]}")
         layer.write(root, before, layer.snapshot(root, _not_kept), work / target.name)

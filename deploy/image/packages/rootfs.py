@@ -37,7 +37,7 @@ def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
             package isn't there; nothing half-made is left. What the tools said then stands in
             `rootfs-BOARD.log` there.
     """
-    made_by = (_RECIPE, _HERE / "finish.sh", _HERE / "bytecode.py")
+    made_by = (_RECIPE, *(_HERE / name for name in ("finish.sh", "plugins.sh", "bytecode.py")))
     inputs = (board.architecture, board.suite, board.archives, board.packages, board.left_out)
     target = cache_folder / f"rootfs-{board.name}-{cache.key(*inputs, epoch, *made_by)}.tar"
     with cache.made(target) as work:
@@ -69,14 +69,17 @@ def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:
     sources, pins = work / "board.sources", work / "board.pref"
     sources.write_text(apt.sources(board.archives))
     pins.write_text(apt.preferences(board.archives))
-    shutil.copy(_HERE / "finish.sh", work)
+    for name in ("finish.sh", "plugins.sh"):
+        shutil.copy(_HERE / name, work)
     rules = [
         f"path-include={name[1:]}" if name.startswith("!") else f"path-exclude={name}"
         for group in board.left_out
         for name in group.names
     ]
     copy_pins = f'cp {shlex.quote(str(pins))} "$1/etc/apt/preferences.d/board.pref"'
-    finish = f'sh {shlex.quote(str(work / "finish.sh"))} "$1"'
+    finish, plugins = (
+        f'sh {shlex.quote(str(work / name))} "$1"' for name in ("finish.sh", "plugins.sh")
+    )
     python = f"{shlex.quote(sys.executable)} -m deploy.image.packages"
     return [
         "mmdebstrap",
@@ -95,6 +98,7 @@ def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:
         f'--essential-hook=mkdir -p "$1/etc/ssh"; cd "$1/etc/ssh"; touch {_HOST_KEYS}',
         f'--customize-hook={python}.libraries "$1"',
         f'--customize-hook={python}.bytecode "$1"',
+        f"--customize-hook={plugins}",
         f"--customize-hook={finish}",
         "--format=tar",
         board.suite,

@@ -17,7 +17,7 @@ _PROGRAMS = (
     "sh", "apt-get", "apt-config", "apt-key", "dpkg", "dpkg-deb", "dpkg-split", "dpkg-query", "tar",
     "gpgv", "gpgconf", "rm", "mkdir", "chmod", "chown", "cat", "ls", "mktemp", "find", "grep",
     "sed", "tr", "cut", "id", "touch", "readlink", "cmp", "diff", "ldconfig", "start-stop-daemon",
-    "true", "sort", "head", "basename", "dirname", "ln", "mv", "cp", "stat", "echo", "sleep",
+    "true", "sort", "env", "head", "basename", "dirname", "ln", "mv", "cp", "stat", "echo", "sleep",
 )  # fmt: skip
 _OPTIONAL = ("apt-key", "gpgconf", "sqv")
 _METHODS = Path("/usr/lib/apt/methods")

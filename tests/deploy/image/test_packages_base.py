@@ -41,9 +41,13 @@ pytestmark = [
 
 _ROOT = Path(__file__).parents[3]
 _PYC = "usr/lib/python3/dist-packages/__pycache__/tool.cpython-313.pyc"
+_GSTREAMER = "usr/lib/any/gstreamer-1.0"
+# Writes down which plugins are there, where GStreamer would write what it learnt of them.
+_PYTHON = f'#!/bin/sh\necho /{_GSTREAMER}/* >"$GST_REGISTRY"\n'.encode()
 _POSTINST = """\
 chown 1:44 /usr/bin/tool
 chmod 4755 /usr/bin/tool
+chmod 755 /usr/bin/python3
 mkdir /var/lib/tool
 chown 1:44 /var/lib/tool
 chmod 2770 /var/lib/tool
@@ -116,6 +120,9 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
             "2.0-1",
             {
                 "usr/bin/tool": b"#!/bin/sh\n",
+                "usr/bin/python3": _PYTHON,
+                f"{_GSTREAMER}/libgstapp.so": b"stays",
+                f"{_GSTREAMER}/libgstrealmedia.so": b"no pipeline names it",
                 "usr/share/doc/tool/README": b"to read",
                 "usr/share/doc/tool/copyright": b"free",
                 "etc/tool.conf": b"set\n",
@@ -184,6 +191,22 @@ def test_what_was_missing_is_on_the_card_as_its_packages_made_it(reader: ImageRe
     assert reader.read(_PYC).encode() == b"3.13\1\0\0\0" + bytes(8) + b"code"
     path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
     subprocess.run(["e2fsck", "-fn", reader.root], check=True, env={**os.environ, "PATH": path})
+
+
+def test_the_plugins_that_stay_are_listed_by_the_card_s_own_programs(reader: ImageReader) -> None:
+    listed = "usr/share/blimp/gstreamer-registry.bin"
+    assert reader.read(listed) == f"/{_GSTREAMER}/libgstapp.so\n"
+    assert reader.stat(listed)["mode"] == "0644"
+    root = _ROOT / "deploy/board/root/usr/lib"
+    (line,) = [
+        line.split()
+        for line in (root / "blimp/data.conf").read_text().splitlines()
+        if listed in line
+    ]
+    assert line[0] == "C" and line[-1] == f"/{listed}"  # unless the payload has written its own
+    assert (
+        f"GST_REGISTRY={line[1]}\n" in (root / "systemd/system/blimp-payload.service").read_text()
+    )
 
 
 def test_what_the_base_had_is_untouched(stand: Stand, reader: ImageReader, tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def test_mmdebstrap_is_told_archives_packages_and_what_to_leave_out(
     licence = "path-include=/usr/share/doc/*/copyright"
     # dpkg goes by the last rule that fits.
     assert rules.index(document) < rules.index(licence)
+    assert any("plugins.sh" in word and word.startswith("--customize-hook") for word in words)
     (sources,) = inputs.values()
     assert f"Signed-By: {native.archives[0].keyring}" in sources and "Trusted" not in sources
 

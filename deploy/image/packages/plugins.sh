@@ -1,0 +1,16 @@
+#!/bin/sh
+# plugins.sh ROOT: lists GStreamer's plugins in a root file system, by that system's own GStreamer.
+# A payload that has no list makes one at its first start, and opens every plugin and all that they
+# need for it: a third of that boot. What is another on the board (its video devices) GStreamer
+# notices by itself, and looks at those plugins again.
+set -eu
+cd "$1"
+ls usr/lib/*/gstreamer-1.0/libgst*.so >/dev/null 2>&1 || exit 0
+list=usr/share/blimp/gstreamer-registry.bin
+mkdir -p "${list%/*}"
+chroot . /usr/bin/env -i GST_REGISTRY="/$list" GST_REGISTRY_FORK=no /usr/bin/python3 -B -c '
+import gi
+gi.require_version("Gst", "1.0")
+from gi.repository import Gst
+Gst.init(None)'
+chmod 644 "$list"
