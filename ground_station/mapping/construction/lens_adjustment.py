@@ -32,6 +32,10 @@ _MOST_IMAGES, _MOST_OBSERVATIONS = 160, 20_000
 the lens, not their count."""
 _GROUPS = 10
 """Stretches of images whose residuals count as independent of each other's."""
+_NEAREST = 0.01
+"""Of an image's median depth: a point that is nearer is at the camera's centre, where it fits
+whatever pixel. Where a camera turned on the spot each feature had 3 to 62 such points of some
+10,000, the nearest at 1e-8; of 30 maps of walks and flights none had one."""
 _CELLS = 4, 3
 """Parts of the image, across and down, that count as independent, too."""
 _CAUCHY = 2.385
@@ -104,7 +108,7 @@ def adjust(model: Model, camera: Camera, prior: Prior) -> Adjusted | None:
     `model.pixel_px` are distorted pixels; `camera` is where the search begins. A point that one
     image sees twice counts once there. None when a model is too small to say anything of a lens.
     """
-    model = _thinned(_once(model))
+    model = _thinned(_apart(_once(model)))
     freedom = 2 * len(model.image) - 3 * len(model.position) - 6 * len(model.names) + 7
     if len(model.names) < 3 or freedom <= len(PARAMETERS):
         return None
@@ -335,6 +339,18 @@ def _once(model: Model) -> Model:
     first = np.unique(keys, return_index=True)[1]
     rows = {name: getattr(model, name)[first] for name in ("image", "feature", "point", "pixel_px")}
     return replace(model, **rows)
+
+
+def _apart(model: Model) -> Model:
+    """The model without points at a camera's centre; its observations are in order of image."""
+    to_camera = np.linalg.inv(model.wTc)[model.image, 2]
+    depth = np.einsum("oi,oi->o", to_camera[:, :3], model.position[model.point]) + to_camera[:, 3]
+    parts = np.split(depth, np.searchsorted(model.image, np.arange(1, len(model.names))))
+    typical = np.array([np.median(part) if len(part) else 0.0 for part in parts])
+    near = model.point[depth < _NEAREST * typical[model.image]]
+    dropped = np.zeros(len(model.position), dtype=bool)
+    dropped[near] = True
+    return without_points(model, dropped) if len(near) else model
 
 
 def _thinned(model: Model) -> Model:

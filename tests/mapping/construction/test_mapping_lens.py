@@ -147,6 +147,28 @@ def test_a_lens_is_found_within_what_is_said_of_it(seed):
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
 
 
+def test_a_point_at_a_camera_s_centre_changes_nothing():
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    model = lens._as_seen(model, images, CAMERA, 0.0)
+    pair = np.array([4, 5])  # the first sees the second's centre
+    point = poses.transform(model.wTc[5], np.array([[0, 0, 1e-8]]))
+    seen = [CAMERA.project(poses.transform(poses.inverse(model.wTc[k]), point)) for k in pair]
+    more = replace(
+        model,
+        point_id=np.append(model.point_id, 10_000),
+        position=np.concatenate([model.position, point]),
+        image=np.append(model.image, pair),
+        feature=np.append(model.feature, [0, 0]),
+        point=np.append(model.point, [len(model.position)] * 2),
+        pixel_px=np.concatenate([model.pixel_px, *seen]),
+    )
+    prior = lens.prior_of(LensPrior(CAMERA, "file", 0.0), CAMERA)
+    without, with_it = (adjust(each, CAMERA, prior) for each in (model, more))
+    assert with_it.sigmas == pytest.approx(without.sigmas, rel=0.02)
+    assert np.abs(vector(with_it.camera) - vector(without.camera)).max() < 0.02
+    assert with_it.explained == pytest.approx(without.explained, abs=0.002)
+
+
 def test_the_covariance_holds_over_many_flights():
     """Of 12 flights the mean square of the focal length's error in sigmas is that of a sigma."""
     off = []
