@@ -1,21 +1,22 @@
 """The part of Python's pickle format that tensors are described in, as data: it can call nothing.
 
 Python's own unpickler can be told which names to refuse, but memory is not bounded by its input (a
-`LONG_BINPUT` of few bytes claims gigabytes for the memo). This is a machine of its own for the
-opcodes of protocols 2 to 5 that weights need (pickletools describes them); a name in the file is
-looked up in the caller's table and nowhere else, and every other opcode is refused.
+`LONG_BINPUT` of few bytes claims gigabytes for the memo). `pickletools` only reads opcodes and what
+stands behind them; this is a machine of its own for those of protocols 2 to 5 that weights need. A
+name in the file is looked up in the caller's table and nowhere else, and every other opcode is
+refused.
 """
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Mapping
+import io
+import pickletools
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 MOST_BYTES: Final = 1 << 20
 """Of one pickle. It bounds time and memory: an opcode has at least a byte and makes one object."""
-_LONGEST_INTEGER = 16
 _LONGEST_SHOWN = 60
 
 
@@ -53,9 +54,22 @@ def load(
     check it. `persistent` is given the identities of what lies outside the pickle. Raises
     `PickleError`.
     """
-    machine = _Machine(data[at : at + MOST_BYTES], names, persistent)
-    value = machine.run()
-    return value, at + machine.at
+    file = io.BytesIO(data[at : at + MOST_BYTES])
+    machine = _Machine(names, persistent)
+    for opcode, value in _opcodes(file):
+        machine.step(opcode, value)
+    return machine.pop(1)[0], at + file.tell()
+
+
+def _opcodes(file: io.BytesIO) -> Iterator[tuple[str, Any]]:
+    """The name of each opcode, and the number or text behind it, up to the one that ends."""
+    try:
+        for opcode, value, _ in pickletools.genops(file):
+            yield opcode.name, value
+    except ValueError as error:  # text that is none, too
+        if len(file.getbuffer()) == MOST_BYTES:
+            raise PickleError(f"it describes its tensors in more than {MOST_BYTES} bytes") from None
+        raise PickleError(f"it is cut or damaged ({shown(str(error))})") from None
 
 
 def shown(value: object) -> str:
@@ -68,51 +82,90 @@ def shown(value: object) -> str:
 
 
 class _Machine:
-    def __init__(
-        self, data: bytes | memoryview, names: Names, persistent: Callable[[Any], Any] | None
-    ) -> None:
-        self._data, self._names, self._persistent = bytes(data), names, persistent
-        self.at = 0
+    def __init__(self, names: Names, persistent: Callable[[Any], Any] | None) -> None:
+        self._names, self._persistent = names, persistent
         self._stack: list[Any] = []
         self._memo: dict[int, Any] = {}
 
-    def run(self) -> Any:
-        """The object; afterwards `at` is behind it."""
-        while True:
-            code = self._bytes(1)
-            if code == b".":
-                return self._pop()
-            step = _STEPS.get(code)
-            if step is None:
-                raise PickleError(f"opcode {code!r} has no place in a file of tensors")
-            step(self)
+    def step(self, opcode: str, value: Any) -> None:
+        """What an opcode does with what stands behind it, None where nothing does."""
+        push = self._stack.append
+        match opcode:
+            case "PROTO":
+                if not 2 <= value <= 5:
+                    raise PickleError(f"its pickle protocol is {value}; known are 2 to 5")
+            case "FRAME" | "STOP":
+                pass  # a hint how much to read at once, which changes nothing here; and the end
+            case "MARK":
+                push(_MARK)
+            case "NONE" | "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT":
+                push(value)
+            # Text of Python 3, and of Python 2, whose own strings held names, too.
+            case (
+                "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "BINSTRING" | "SHORT_BINSTRING"
+            ):
+                push(value)
+            case "NEWTRUE" | "NEWFALSE":
+                push(opcode == "NEWTRUE")
+            case "EMPTY_TUPLE":
+                push(())
+            case "EMPTY_LIST":
+                push([])
+            case "EMPTY_DICT":
+                push({})
+            case "BINPUT" | "LONG_BINPUT" | "MEMOIZE":
+                place = len(self._memo) if value is None else value
+                self._memo[place] = self._top(object)
+            case "BINGET" | "LONG_BINGET":
+                if value not in self._memo:
+                    raise PickleError(f"it asks for object {value} that it never kept")
+                push(self._memo[value])
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                push(tuple(self.pop(int(opcode[-1]))))
+            case "TUPLE":
+                push(tuple(self._pop_to_mark()))
+            case "LIST":
+                push(self._pop_to_mark())
+            case "DICT":
+                pairs = self._pop_to_mark()
+                push({})
+                self._set_items(pairs)
+            case "SETITEM":
+                self._set_items(self.pop(2))
+            case "SETITEMS":
+                self._set_items(self._pop_to_mark())
+            case "APPEND":
+                self._extend(self.pop(1))
+            case "APPENDS":
+                self._extend(self._pop_to_mark())
+            case "GLOBAL":
+                push(self._named(*value.split(" ", 1)))
+            case "STACK_GLOBAL":
+                push(self._named(*self.pop(2)))
+            case "REDUCE":
+                function, arguments = self.pop(2)
+                if not isinstance(arguments, tuple) or not isinstance(function, Name):
+                    raise PickleError("it calls what is no function")
+                if not callable(function.meaning):
+                    raise PickleError("it calls what is no function")
+                push(function.meaning(*arguments))
+            case "BUILD":  # attributes, as a state dictionary's `_metadata`: nothing that is needed
+                self.pop(1)
+                self._top(dict)
+            case "BINPERSID":
+                if self._persistent is None:
+                    raise PickleError("it points outside where nothing is")
+                push(self._persistent(*self.pop(1)))
+            case _:
+                raise PickleError(f"opcode {opcode} has no place in a file of tensors")
 
-    def _bytes(self, size: int) -> bytes:
-        piece = self._data[self.at : self.at + size]
-        if len(piece) < size:
-            limit = len(self._data) == MOST_BYTES
-            raise PickleError(
-                f"it describes its tensors in more than {MOST_BYTES} bytes"
-                if limit
-                else "it is cut"
-            )
-        self.at += size
-        return piece
-
-    def _number(self, form: str) -> int:
-        value = struct.unpack("<" + form, self._bytes(struct.calcsize("<" + form)))[0]
-        return int(value)
-
-    def _line(self) -> str:
-        end = self._data.find(b"\n", self.at)
-        if end < 0:
-            raise PickleError("it is cut")
-        return _text(self._bytes(end - self.at + 1)[:-1])
-
-    def _pop(self) -> Any:
-        if not self._stack or self._stack[-1] is _MARK:
+    def pop(self, count: int) -> list[Any]:
+        """So many objects from the stack, the last one on it last."""
+        items = self._stack[-count:]
+        if len(items) < count or any(item is _MARK for item in items):
             raise PickleError("it takes more from the stack than is there")
-        return self._stack.pop()
+        del self._stack[-count:]
+        return items
 
     def _pop_to_mark(self) -> list[Any]:
         for place in range(len(self._stack) - 1, -1, -1):
@@ -123,98 +176,28 @@ class _Machine:
         raise PickleError("it takes more from the stack than is there")
 
     def _top(self, kind: type) -> Any:
-        value = self._stack[-1] if self._stack else None
-        if not isinstance(value, kind):
+        value = self._stack[-1] if self._stack else _MARK
+        if value is _MARK or not isinstance(value, kind):
             raise PickleError(f"what should be a {kind.__name__} is none")
         return value
 
-    # What each opcode does.
+    def _extend(self, values: list[Any]) -> None:
+        self._top(list).extend(values)
 
-    def _protocol(self) -> None:
-        version = self._number("B")
-        if not 2 <= version <= 5:
-            raise PickleError(f"its pickle protocol is {version}; known are 2 to 5")
-
-    def _frame(self) -> None:
-        self._bytes(8)  # a hint how much to read at once, which changes nothing here
-
-    def _long(self) -> None:
-        size = self._number("B")
-        if size > _LONGEST_INTEGER:
-            raise PickleError(f"it has an integer of {size} bytes; at most {_LONGEST_INTEGER}")
-        self._stack.append(int.from_bytes(self._bytes(size), "little", signed=True))
-
-    def _float(self) -> None:
-        self._stack.append(struct.unpack(">d", self._bytes(8))[0])
-
-    def _put(self, place: int) -> None:
-        value = self._pop()
-        self._stack.append(value)
-        self._memo[place] = value
-
-    def _get(self, place: int) -> None:
-        if place not in self._memo:
-            raise PickleError(f"it asks for object {place} that it never kept")
-        self._stack.append(self._memo[place])
-
-    def _tuple(self, size: int) -> None:
-        items = [self._pop() for _ in range(size)]
-        self._stack.append(tuple(reversed(items)))
-
-    def _set(self, pairs: list[Any]) -> None:
+    def _set_items(self, pairs: list[Any]) -> None:
         target = self._top(dict)
         if len(pairs) % 2:
             raise PickleError("a key has no value")
         for key, value in zip(pairs[::2], pairs[1::2], strict=True):
             set_item(target, key, value)
 
-    def _set_one(self) -> None:
-        value, key = self._pop(), self._pop()
-        self._set([key, value])
-
-    def _append(self) -> None:
-        value = self._pop()
-        self._top(list).append(value)
-
-    def _extend(self) -> None:
-        values = self._pop_to_mark()
-        self._top(list).extend(values)
-
-    def _make_dictionary(self) -> None:
-        pairs = self._pop_to_mark()
-        self._stack.append({})
-        self._set(pairs)
-
-    def _global(self, module: Any, name: Any) -> None:
+    def _named(self, module: Any, name: Any) -> Name:
         if not isinstance(module, str) or not isinstance(name, str):
             raise PickleError("a name in it is no text")
         found = self._names.get((module, name))
         if found is None:
             raise PickleError(f"it names {shown(f'{module}.{name}')}, which no tensor needs")
-        self._stack.append(found)
-
-    def _stack_global(self) -> None:
-        name, module = self._pop(), self._pop()
-        self._global(module, name)
-
-    def _reduce(self) -> None:
-        arguments, function = self._pop(), self._pop()
-        if not isinstance(arguments, tuple) or not isinstance(function, Name):
-            raise PickleError("it calls what is no function")
-        if not callable(function.meaning):
-            raise PickleError("it calls what is no function")
-        self._stack.append(function.meaning(*arguments))
-
-    def _build(self) -> None:
-        """Attributes of an object, as a state dictionary's `_metadata`: nothing that is needed."""
-        self._pop()
-        self._top(dict)
-
-    def _persistent_id(self) -> None:
-        identity = self._pop()
-        if self._persistent is None:
-            raise PickleError("it points outside where nothing is")
-        self._stack.append(self._persistent(identity))
+        return found
 
 
 def set_item(target: dict[Any, Any], key: Any, value: Any) -> None:
@@ -222,62 +205,3 @@ def set_item(target: dict[Any, Any], key: Any, value: Any) -> None:
     if not isinstance(key, str | int):
         raise PickleError("a key in it is neither text nor a number")
     target[key] = value
-
-
-def _text(data: bytes) -> str:
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        raise PickleError("a text in it is not UTF-8") from None
-
-
-def _push(value: Any) -> Callable[[_Machine], None]:
-    return lambda m: m._stack.append(value)
-
-
-def _sized(form: str) -> Callable[[_Machine], None]:
-    return lambda m: m._stack.append(_text(m._bytes(m._number(form))))
-
-
-_STEPS: dict[bytes, Callable[[_Machine], None]] = {
-    b"\x80": _Machine._protocol,
-    b"\x95": _Machine._frame,
-    b"(": _push(_MARK),
-    b"N": _push(None),
-    b"\x88": _push(True),
-    b"\x89": _push(False),
-    b")": _push(()),
-    b"]": lambda m: m._stack.append([]),
-    b"}": lambda m: m._stack.append({}),
-    b"J": lambda m: m._stack.append(m._number("i")),
-    b"K": lambda m: m._stack.append(m._number("B")),
-    b"M": lambda m: m._stack.append(m._number("H")),
-    b"\x8a": _Machine._long,
-    b"G": _Machine._float,
-    # Text of Python 3, and of Python 2, whose own strings held names, too.
-    b"X": _sized("I"),
-    b"\x8c": _sized("B"),
-    b"\x8d": _sized("Q"),
-    b"T": _sized("I"),
-    b"U": _sized("B"),
-    b"q": lambda m: m._put(m._number("B")),
-    b"r": lambda m: m._put(m._number("I")),
-    b"\x94": lambda m: m._put(len(m._memo)),
-    b"h": lambda m: m._get(m._number("B")),
-    b"j": lambda m: m._get(m._number("I")),
-    b"t": lambda m: m._stack.append(tuple(m._pop_to_mark())),
-    b"\x85": lambda m: m._tuple(1),
-    b"\x86": lambda m: m._tuple(2),
-    b"\x87": lambda m: m._tuple(3),
-    b"s": _Machine._set_one,
-    b"u": lambda m: m._set(m._pop_to_mark()),
-    b"a": _Machine._append,
-    b"e": _Machine._extend,
-    b"d": _Machine._make_dictionary,
-    b"l": lambda m: m._stack.append(m._pop_to_mark()),
-    b"c": lambda m: m._global(m._line(), m._line()),
-    b"\x93": _Machine._stack_global,
-    b"R": _Machine._reduce,
-    b"b": _Machine._build,
-    b"Q": _Machine._persistent_id,
-}
