@@ -11,9 +11,8 @@ import numpy as np
 from ground_station.arrays import U8
 from ground_station.feature_models import homographic
 from ground_station.feature_models.homographic import Matching
-from ground_station.feature_models.quantize import network_input
 from ground_station.features.extractors import of_network
-from ground_station.features.inference import Network
+from ground_station.features.inference import Network, network_input
 from ground_station.features.model_info import Model
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameSource

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 from onnx import helper
 from onnxruntime.quantization import (
@@ -19,11 +18,11 @@ from onnxruntime.quantization import (
     quantize_static,
 )
 
-from ground_station.arrays import F32, U8
+from ground_station.arrays import U8
 from ground_station.feature_models.graph import serialized
 from ground_station.features.extractor import FeatureError
+from ground_station.features.inference import network_input
 from ground_station.features.model_info import Model, ModelInfo
-from ground_station.features.padding import padded
 
 _OPERATORS = ["Conv", "Relu", "Clip", "MaxPool", "AveragePool", "Add", "Concat", "Resize"]
 """Those that onnxruntime's CPU runs on integers; what stands between others stays float."""
@@ -58,12 +57,6 @@ def check(model: Model) -> onnx.ModelProto:
     if any(node.op_type in ("QuantizeLinear", "Cast") for node in proto.graph.node):
         raise FeatureError(f"{model.path}: the model '{model.info.name}' is no fp32 model")
     return proto
-
-
-def network_input(info: ModelInfo, image: U8) -> F32:
-    """What a model's network takes, (1, channels, H', W') 0..1, of a picture (H, W)."""
-    grey = padded(image, info.multiple).astype(np.float32)[None, None] * np.float32(1 / 255)
-    return np.repeat(grey, info.channels, axis=1)
 
 
 def _int8(proto: onnx.ModelProto, info: ModelInfo, images: Sequence[U8]) -> onnx.ModelProto:

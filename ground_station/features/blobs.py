@@ -9,12 +9,8 @@ import numpy as np
 
 from ground_station.arrays import F32, U8, Indices
 from ground_station.features import sampling
-from ground_station.features.extractor import Features, check_image
-from ground_station.features.learned import LearnedFeatures
-from ground_station.features.padding import padded
-
-NMS_PX = 2
-THRESHOLD = 0.0
+from ground_station.features.extractor import Features
+from ground_station.features.learned import LearnedFeatures, described
 
 SIGMAS_PX = (1.6, 1.6 * 2**0.5, 3.2)
 """An octave of scales: of one alone the places shift as the camera comes nearer (of made pairs a
@@ -136,15 +132,13 @@ class BlobFeatures(LearnedFeatures):
     centres of 8x8 pixels, before `details`, between those of 4x4, at unit length together.
     """
 
-    NMS_PX, THRESHOLD = NMS_PX, THRESHOLD
+    NMS_PX, THRESHOLD = 2, 0.0
 
     def extract(self, image: U8) -> Features:
         """Features of a grey image (H, W) uint8, strongest first."""
-        check_image(image)
+        outputs = self._outputs(image)
         points, heights = strongest(responses(image), self.nms_px, _MARGIN * self.max_features)
-        whole = padded(image, self._info.multiple).astype(np.float32)[None, None]
-        outputs = self._network.run(whole * np.float32(1 / 255))
-        return self.of_outputs(points, heights, {name: out[0] for name, out in outputs.items()})
+        return self.of_outputs(points, heights, outputs)
 
     def of_outputs(self, points_px: F32, heights: F32, outputs: Mapping[str, F32]) -> Features:
         """Features at blobs (N, 2) of heights (N,) from what the network said of their picture."""
@@ -157,6 +151,4 @@ class BlobFeatures(LearnedFeatures):
         order = order[scores[order] > self.threshold][: self.max_features]  # nor NaN
         both = (sampling.bicubic(outputs["descriptors"], eighth[order]),
                 sampling.bicubic(outputs["details"], quarter[order]))  # fmt: skip
-        vectors, good = sampling.unit(np.concatenate(both, axis=1))
-        order = order[good]
-        return Features(points_px[order], scores[order], vectors[good])
+        return described(points_px[order], scores[order], np.concatenate(both, axis=1))

@@ -67,8 +67,7 @@ def of_network(
 ) -> Extractor:
     """The extractor over a network, by the layout of its model."""
     from ground_station.features.blobs import BlobFeatures
-    from ground_station.features.cells import CellFeatures
-    from ground_station.features.pixels import PixelFeatures
+    from ground_station.features.learned import CellFeatures, PixelFeatures
 
     kinds: dict[str, Callable[[Network, int, LearnedSettings], Extractor]] = {
         "blobs": BlobFeatures,

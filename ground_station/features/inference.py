@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import cv2
 import numpy as np
 import onnxruntime
 
-from ground_station.arrays import F32
+from ground_station.arrays import F32, U8
 from ground_station.features.extractor import FeatureError
-from ground_station.features.model_info import Model
+from ground_station.features.model_info import Model, ModelInfo
 
 _SUFFIX = "ExecutionProvider"
 _WARM_UP_PX = (480, 640)
@@ -31,6 +32,21 @@ def threads_beside_tracker() -> int:
     A ground station has other work than one network, and other payloads.
     """
     return min(4, max(1, len(os.sched_getaffinity(0)) - 1))
+
+
+def network_input(info: ModelInfo, image: U8) -> F32:
+    """What a model's network takes of a picture (H, W): (1, channels, H', W') 0..1.
+
+    The picture's last row and column are repeated to the next multiples: no edge is added. A grey
+    picture is given three times to a network that takes colour.
+    """
+    below, right = (-side % info.multiple for side in image.shape)
+    if below or right:
+        image = np.asarray(
+            cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE), np.uint8
+        )
+    grey = image.astype(np.float32)[None, None] * np.float32(1 / 255)
+    return np.repeat(grey, info.channels, axis=1) if info.channels > 1 else grey
 
 
 class Network:
@@ -70,9 +86,11 @@ class Network:
                 f"features: the execution provider '{provider}' is installed but cannot run here"
             )
         self._outputs = [output.name for output in self._session.get_outputs()]
-        rows, columns = (-(-side // model.info.multiple) * model.info.multiple
-                         for side in _WARM_UP_PX)  # fmt: skip
-        self.run(np.zeros((1, model.info.channels, rows, columns), np.float32))
+        self.run_on(np.zeros(_WARM_UP_PX, np.uint8))
+
+    def run_on(self, image: U8) -> dict[str, F32]:
+        """The outputs by name for one picture (H, W) uint8, padded."""
+        return self.run(network_input(self.model.info, image))
 
     def run(self, image: F32) -> dict[str, F32]:
         """The outputs by name for pictures (N, channels, H, W), H and W of the right multiple."""

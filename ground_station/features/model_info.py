@@ -42,7 +42,7 @@ class ModelInfo:
     points and the least score that the model was made for; None: the layout's usual ones.
     `subpixel_px` is the reach of the window in which a key point is refined; 0: it stays on its
     pixel, as SuperPoint's do. `distance_scale`: how far apart the descriptors of one point in two
-    views are, over RootSIFT's; see `importing.scale`.
+    views are, over RootSIFT's; see `feature_models.scale`.
     """
 
     name: str

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ground_station.features.blobs import NMS_PX
+from ground_station.features.blobs import BlobFeatures
 from ground_station.training.pairs import Batch
 from ground_station.training.peaks import responses, strongest
 from ground_station.training.topology import CELL_PX
@@ -126,7 +126,9 @@ def blob_losses(
     views = batch.views
     area = batch.known.repeat_interleave(CELL_PX, 1).repeat_interleave(CELL_PX, 2)
     with torch.no_grad():
-        places, heights = strongest(responses(batch.images), NMS_PX, _MOST, area, batch.favour)
+        places, heights = strongest(
+            responses(batch.images), BlobFeatures.NMS_PX, _MOST, area, batch.favour
+        )
     vectors = sampled(outputs, places)
     odds = _at(outputs[2], places, CELL_PX, "bilinear")[:, :, 0] + heights.clamp(min=1e-9).log()
     found, worth, rights = [], [], []

@@ -13,7 +13,7 @@ import pytest
 from onnx import numpy_helper
 
 from ground_station.feature_models import comparison, homographic, quantize
-from ground_station.features import model
+from ground_station.features import inference, model
 from ground_station.features.extractor import FeatureError
 
 
@@ -49,7 +49,7 @@ def made(fp32: model.Model, folder: Path) -> model.Model:
 def outputs(found: model.Model, image: np.ndarray) -> dict[str, np.ndarray]:
     session = onnxruntime.InferenceSession(found.data, providers=["CPUExecutionProvider"])
     names = [each.name for each in session.get_outputs()]
-    blob = quantize.network_input(found.info, image)
+    blob = inference.network_input(found.info, image)
     return dict(zip(names, session.run(names, {"image": blob}), strict=True))
 
 

@@ -13,10 +13,9 @@ import pytest
 from reference import plain_alike, plain_superpoint
 
 from ground_station.features import extractors, inference, model
-from ground_station.features.cells import CellFeatures
 from ground_station.features.extractor import FeatureError
 from ground_station.features.inference import Network
-from ground_station.features.pixels import PixelFeatures
+from ground_station.features.learned import CellFeatures, PixelFeatures
 from ground_station.features.settings import LearnedSettings
 
 
