@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from ground_station.features.extractor import FeatureError
 
@@ -90,22 +91,13 @@ class ModelInfo:
         return 3 if self.layout == "pixels" else 1
 
     def metadata(self) -> dict[str, str]:
-        """The file's metadata, as `of_metadata` reads it."""
-        values = {
-            "schema": SCHEMA,
-            "name": self.name,
-            "layout": self.layout,
-            "dimension": str(self.dimension),
-            "multiple": str(self.multiple),
-            "licence": self.licence,
-            "source": self.source,
-            "nms_px": None if self.nms_px is None else str(self.nms_px),
-            "threshold": None if self.threshold is None else repr(self.threshold),
-            "subpixel_px": str(self.subpixel_px) if self.subpixel_px else None,
-            "distance_scale": None if self.distance_scale == 1 else repr(self.distance_scale),
-            "details": str(self.details) if self.details else None,
-        }
-        return {_PREFIX + key: value for key, value in values.items() if value is not None}
+        """The file's metadata, as `of_metadata` reads it; what is as usual is left out."""
+        said = {"schema": SCHEMA}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value != each.default:
+                said[each.name] = value if isinstance(value, str) else repr(value)
+        return {_PREFIX + key: value for key, value in said.items()}
 
     @classmethod
     def of_metadata(cls, metadata: Mapping[str, str]) -> ModelInfo:
@@ -118,38 +110,33 @@ class ModelInfo:
         schema = metadata[_PREFIX + "schema"]
         if schema != SCHEMA:
             raise FeatureError(f"its schema is '{schema:.40}'; this program reads '{SCHEMA}'")
+        values: dict[str, Any] = {}
+        for each in fields(cls):
+            text = metadata.get(_PREFIX + each.name)
+            if text is not None:
+                read = _READERS[str(each.type).removesuffix(" | None")]
+                values[each.name] = read(each.name, text)
+            elif each.default is MISSING:
+                raise FeatureError(f"its metadata lacks '{_PREFIX}{each.name}'")
+        return cls(**values)
 
-        def text(key: str) -> str:
-            if _PREFIX + key not in metadata:
-                raise FeatureError(f"its metadata lacks '{_PREFIX}{key}'")
-            return metadata[_PREFIX + key]
 
-        def whole(key: str) -> int:
-            if not re.fullmatch(r"\d{1,6}(\.0)?", text(key), re.ASCII):
-                raise FeatureError(f"{key} is '{text(key):.40}', not a whole number")
-            return int(float(text(key)))
+def _whole(key: str, text: str) -> int:
+    if not re.fullmatch(r"\d{1,6}(\.0)?", text, re.ASCII):
+        raise FeatureError(f"{key} is '{text:.40}', not a whole number")
+    return int(float(text))
 
-        def real(key: str) -> float:
-            try:
-                return float(text(key))
-            except ValueError:
-                raise FeatureError(f"{key} is '{text(key):.40}', not a number") from None
 
-        return cls(
-            name=text("name"),
-            layout=text("layout"),
-            dimension=whole("dimension"),
-            multiple=whole("multiple"),
-            licence=text("licence"),
-            source=text("source"),
-            nms_px=whole("nms_px") if _PREFIX + "nms_px" in metadata else None,
-            threshold=real("threshold") if _PREFIX + "threshold" in metadata else None,
-            subpixel_px=whole("subpixel_px") if _PREFIX + "subpixel_px" in metadata else 0,
-            details=whole("details") if _PREFIX + "details" in metadata else 0,
-            distance_scale=(
-                real("distance_scale") if _PREFIX + "distance_scale" in metadata else 1.0
-            ),
-        )
+def _real(key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise FeatureError(f"{key} is '{text:.40}', not a number") from None
+
+
+_READERS: dict[str, Callable[[str, str], Any]] = {
+    "str": lambda key, text: text, "int": _whole, "float": _real,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
