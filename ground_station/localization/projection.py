@@ -16,9 +16,11 @@ from ground_station.map.store import Landmarks
 
 @dataclass(frozen=True)
 class Projected:
-    """N landmarks in view: `landmark` (N,) indices, `pinhole_px` (N, 2), undistorted pixels."""
+    """N landmarks in view: `landmark` (N,) indices; without lens, where they are seen on the plane
+    z = 1, `normalized` (N, 2), and in pixels, `pinhole_px` (N, 2)."""
 
     landmark: Indices
+    normalized: F64
     pinhole_px: F64
 
 
@@ -45,14 +47,14 @@ def project(
     keep = lens.inside(normalized)
     index, normalized = index[keep], normalized[keep]
     if settings.viewing_cone and len(index):
-        keep = in_cone(landmarks, index, np.asarray(wTc)[:3, 3], settings)
+        keep = _in_cone(landmarks, index, np.asarray(wTc)[:3, 3], settings)
         index, normalized = index[keep], normalized[keep]
     camera = lens.camera
     pixels = normalized * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-    return Projected(index, pixels)
+    return Projected(index, normalized, pixels)
 
 
-def in_cone(
+def _in_cone(
     landmarks: Landmarks, index: Indices, position_m: F64, settings: ProjectionSettings
 ) -> Bools:
     """Whether landmarks `index` (N,) are looked at from within their widened cones; (N,).

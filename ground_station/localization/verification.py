@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
-from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import NEAREST_M, Lens
-from ground_station.localization.projection import in_cone
+from ground_station.geometry.lens import Lens
+from ground_station.localization.projection import project
 from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
@@ -101,17 +100,8 @@ class Witness:
 
     def _seen(self, wTc: F64, landmarks: Landmarks, index: Indices) -> tuple[Indices, F64]:
         """Those of the landmarks `index` (M,) that a pose (4, 4) should see, and their pixels."""
-        cTw = poses.inverse(wTc)
-        points = landmarks.position_m[index] @ cTw[:3, :3].T + cTw[:3, 3]
-        ahead = points[:, 2] > NEAREST_M
-        index, points = index[ahead], points[ahead]
-        flat = points[:, :2] / points[:, 2:]
-        seen = self.lens.inside(flat)
-        index, flat = index[seen], flat[seen]
-        if len(index):
-            seen = in_cone(landmarks, index, wTc[:3, 3], _CONES)
-            index, flat = index[seen], flat[seen]
-        return index, self.lens.camera.distort(flat)
+        seen = project(landmarks, wTc, self.lens, _CONES, index)
+        return seen.landmark, self.lens.camera.distort(seen.normalized)
 
     def _near(self, pixel_px: F64, descriptors: F32, mode: Indices | None) -> tuple[Indices, F64]:
         """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).
