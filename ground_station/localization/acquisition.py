@@ -215,7 +215,7 @@ class Acquirer:
             lesser = found.solution.state is None or found.significance <= near.significance
             return near if lesser and near.solution.state is not None else found
 
-        candidates = self._relocalizer.candidates(seen.features, seen.normalized)
+        candidates = self._relocalizer.candidates(seen)
         watch.lap("relocalization")
         if isinstance(candidates, str):
             return unless_near(_nothing(seen, candidates))

@@ -34,10 +34,9 @@ _REACH = 3.0
 
 @dataclass(frozen=True)
 class Described:
-    """A frame's finite features; `normalized` (F, 2) and `pinhole_px` (F, 2) are without lens."""
+    """A frame's finite features; `pinhole_px` (F, 2) are without lens."""
 
     features: Features
-    normalized: F64
     pinhole_px: F64
     taken: Conditions
 
@@ -52,9 +51,7 @@ def describe(features: Features, camera: Camera, taken: Conditions) -> Described
     finite &= np.isfinite(features.descriptors).all(axis=1)
     finite &= camera.uses(features.keypoints_px) & taken.shows(features.keypoints_px, _DESCRIBED_PX)
     features = features.where(finite)
-    normalized = camera.undistort(features.keypoints_px)
-    focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
-    return Described(features, normalized, normalized * focal + centre, taken)
+    return Described(features, camera.undistort_to_pinhole(features.keypoints_px), taken)
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.arrays import F32, F64, Indices
-from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import Lens
+from ground_station.localization.matching import Described, pixel_jacobian
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
 from ground_station.localization.verification import Witness
-from ground_station.map.modes import Modes, described
-from ground_station.map.store import Landmarks, Map
+from ground_station.map.modes import described
+from ground_station.map.store import Map
 
 _BLOCK = 8_000_000
 """Descriptor products held at once: 32 MB."""
@@ -156,34 +156,23 @@ class _Search:
     """One frame in search of its pose."""
 
     def __init__(
-        self,
-        features: Features,
-        normalized: F64,
-        landmarks: Landmarks,
-        lens: Lens,
-        settings: RecoverySettings,
-        seed: int,
-        modes: Modes | None,
+        self, seen: Described, map_: Map, lens: Lens, settings: RecoverySettings, seed: int,
         scale: float,
-    ) -> None:
-        camera = lens.camera
-        self.modes = modes
-        self.camera, self.landmarks, self.settings, self.seed = camera, landmarks, settings, seed
-        self.features = features
-        focal, centre = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
-        self.pinhole_px = normalized * focal + centre
-        self.witness = Witness(features, lens, modes, scale)
+    ) -> None:  # fmt: skip
+        self.seen, self.camera, self.settings, self.seed = seen, lens.camera, settings, seed
+        self.landmarks, self.modes = map_.landmarks, map_.modes
+        self.witness = Witness(seen.features, lens, map_.modes, scale)
 
     def propose(self, candidates: Indices) -> tuple[F64, Indices] | str:
         """wTc and its inliers from matches with some landmarks (M,), or why there is none."""
         settings, lm = self.settings, self.landmarks
         rows, mode = described(lm.descriptor, self.modes, candidates)
-        feature, row = match_all(self.features.descriptors, rows, settings.max_ratio, mode)
+        feature, row = match_all(self.seen.features.descriptors, rows, settings.max_ratio, mode)
         if len(feature) < _MIN_MATCHED:
             return f"{len(feature)} matches"
         found = pose_from_matches(
             lm.position_m[candidates[row]],
-            self.pinhole_px[feature],
+            self.seen.pinhole_px[feature],
             self.camera,
             settings,
             self.seed,
@@ -215,7 +204,7 @@ class _Search:
             )
         if doubt and (len(feature) < _MIN_MATCHED or support.significance < _WEAK):
             return doubt
-        if spread(self.features.keypoints_px[feature], self.camera) < settings.min_spread:
+        if spread(self.seen.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)
         open_by = self._sigma(wTc, landmark)
@@ -223,21 +212,20 @@ class _Search:
 
     def _sigma(self, wTc: F64, landmark: Indices) -> float:
         """Standard deviation of the position over the inliers' depth, at half the threshold."""
-        X, Y, Z = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark]).T
-        x, y, none = X / Z, Y / Z, np.zeros_like(Z)
-        u = np.stack([x * y, -1 - x * x, y, -1 / Z, none, x / Z], axis=1) * self.camera.fx_px
-        v = np.stack([1 + y * y, -x * y, -x, none, -1 / Z, y / Z], axis=1) * self.camera.fy_px
+        points = self.landmarks.position_m[landmark]
+        depth = poses.transform(poses.inverse(wTc), points)[:, 2]
+        u, v = pixel_jacobian(points, wTc, self.camera).swapaxes(0, 1)
         sigma_px = self.settings.max_reprojection_px / 2
         try:
             covariance = np.linalg.inv((u.T @ u + v.T @ v) / sigma_px**2)
         except np.linalg.LinAlgError:
             return float("inf")
-        return float(np.sqrt(np.trace(covariance[3:, 3:])) / np.median(Z))
+        return float(np.sqrt(np.trace(covariance[3:, 3:])) / np.median(depth))
 
     def _residual_px(self, wTc: F64, feature: Indices, landmark: Indices) -> F64:
         points = poses.transform(poses.inverse(wTc), self.landmarks.position_m[landmark])
         projected = points @ self.camera.matrix.T
-        seen = self.pinhole_px[feature]
+        seen = self.seen.pinhole_px[feature]
         offset = projected[:, :2] / projected[:, 2:] - seen
         return np.asarray(np.linalg.norm(offset, axis=1) / self.camera.stretch(seen), np.float64)
 
@@ -245,8 +233,8 @@ class _Search:
         """Least squares over the matches (Levenberg-Marquardt)."""
         cTw = poses.inverse(wTc)
         rvec, tvec = cv2.solvePnPRefineLM(
-            self.landmarks.position_m[landmark], self.pinhole_px[feature], self.camera.matrix,
-            None, cv2.Rodrigues(cTw[:3, :3])[0], cTw[:3, 3:].copy(),
+            self.landmarks.position_m[landmark], self.seen.pinhole_px[feature],
+            self.camera.matrix, None, cv2.Rodrigues(cTw[:3, :3])[0], cTw[:3, 3:].copy(),
         )  # fmt: skip
         return poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], np.ravel(tvec)))
 
@@ -258,47 +246,28 @@ class Relocalizer:
         self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int, scale: float = 1.0
     ) -> None:
         """`scale` of the descriptors' distances, over RootSIFT's."""
-        self._scale = scale
-        self._landmarks, self._modes = map_.landmarks, map_.modes
+        self._map, self._scale = map_, scale
         self._same_m = _SAME * map_.depth_m
         self._lens, self._settings, self._seed = Lens(camera), settings, seed
         self._index: PlaceIndex | None = None
         if len(map_.keyframes):
             self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed, map_.modes)
 
-    def find(self, features: Features, normalized: F64) -> Relocalization | str:
-        """The pose of a frame anywhere in the map, or the reason why there is none.
-
-        Of two places that fit nearly as well, neither is believed. Takes what `candidates` takes.
-        """
-        found = self.candidates(features, normalized)
-        return found if isinstance(found, str) else self.alone(found)
-
-    def candidates(self, features: Features, normalized: F64) -> list[Relocalization] | str:
+    def candidates(self, seen: Described) -> list[Relocalization] | str:
         """The poses that a frame may have anywhere in the map, or the reason why there is none.
 
         Those with a doubt are to be believed only where something else says the same.
 
-        `normalized` (F, 2) are the features undistorted, on the plane z = 1. The most alike
-        keyframes are matched together, so that only what is unlike all the rest counts, and when
-        that fails (in a building that repeats itself) place by place. A map without keyframes is
-        one place. The same frame gives the same answer.
+        The most alike keyframes are matched together, so that only what is unlike all the rest
+        counts, and when that fails (in a building that repeats itself) place by place. A map
+        without keyframes is one place. The same frame gives the same answer.
         """
-        if not len(features):
+        if not len(seen):
             return "no features"
-        search = _Search(
-            features,
-            normalized,
-            self._landmarks,
-            self._lens,
-            self._settings,
-            self._seed,
-            self._modes,
-            self._scale,
-        )
+        search = _Search(seen, self._map, self._lens, self._settings, self._seed, self._scale)
         if self._index is None:
             return _only_place(search)
-        ranked = self._index.ranked(features.descriptors, _RETRIEVED)
+        ranked = self._index.ranked(seen.features.descriptors, _RETRIEVED)
         together = self._try(self._index, search, self._index.seen_by(ranked))
         found = []
         if not isinstance(together, str):
@@ -312,7 +281,10 @@ class Relocalizer:
         return found or f"{together} in the most alike places"
 
     def alone(self, found: list[Relocalization]) -> Relocalization | str:
-        """Which of some candidates is the place, where nothing else is known of it, or why none."""
+        """Which of some candidates is the place, where nothing else is known of it, or why none.
+
+        Of two places that fit nearly as well, neither is believed.
+        """
         sure = [each for each in found if not each.doubt]
         if not sure:
             return f"{found[0].doubt} in the most alike places"

@@ -11,6 +11,8 @@ import pytest
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization.attempt import Conditions
+from ground_station.localization.matching import describe
 from ground_station.localization.relocalization import (
     Relocalization,
     Relocalizer,
@@ -83,7 +85,8 @@ def building(room) -> Building:
 
 def find(map_: Map, features: Features) -> Relocalization | str:
     relocalizer = Relocalizer(map_, THESIS_CAMERA, SETTINGS, 0)
-    return relocalizer.find(features, THESIS_CAMERA.undistort(features.keypoints_px))
+    found = relocalizer.candidates(describe(features, THESIS_CAMERA, Conditions()))
+    return found if isinstance(found, str) else relocalizer.alone(found)
 
 
 def apart(found: Relocalization | str, truth: np.ndarray) -> tuple[float, float]:
@@ -161,9 +164,8 @@ def test_of_two_equal_places_both_are_named_for_who_knows_more(building):
     double = twice(building.map, 20.0)
     relocalizer = Relocalizer(double, THESIS_CAMERA, SETTINGS, 0)
     for wTc in building.path[:4]:
-        features = building.features(wTc)
-        normalized = THESIS_CAMERA.undistort(features.keypoints_px)
-        found = relocalizer.candidates(features, normalized)
+        seen = describe(building.features(wTc), THESIS_CAMERA, Conditions())
+        found = relocalizer.candidates(seen)
         assert len(found) > 1 and min(apart(one, wTc)[0] for one in found) < 0.03
         assert "fit alike" in relocalizer.alone(found)
 
@@ -178,7 +180,7 @@ def test_a_few_landmarks_are_named_but_not_believed_by_themselves(building):
         few = rng.permutation(len(features)) < 24
         mixed = np.where(few[:, None], features.descriptors, other).astype(np.float32)
         faint = replace(features, descriptors=mixed)
-        found = relocalizer.candidates(faint, THESIS_CAMERA.undistort(faint.keypoints_px))
+        found = relocalizer.candidates(describe(faint, THESIS_CAMERA, Conditions()))
         assert not isinstance(found, str) and all(one.doubt for one in found)
         assert apart(found[0], wTc)[0] < 0.1
         assert "landmarks where they should be" in str(relocalizer.alone(found))

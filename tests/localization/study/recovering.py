@@ -20,8 +20,10 @@ from study.metrics import (
 )
 from study.row import Line, Row, Study, seeds
 
+from ground_station.localization.attempt import Conditions
 from ground_station.localization.estimate import State
 from ground_station.localization.extraction import extractor_for
+from ground_station.localization.matching import describe
 from ground_station.localization.relocalization import Relocalizer
 
 BEFORE = 30
@@ -238,9 +240,11 @@ def ask_alone(study: Study, flights: Sequence[Flight]) -> dict[str, Any]:
     accepted, refused, took = [], Counter[str](), []
     for k, frame in chosen:
         features = extractor.extract(frame.image)
-        normalized = flights[k].camera.undistort(features.keypoints_px)
+        seen = describe(features, flights[k].camera, Conditions())
         begin = time.process_time()
-        found = finders[k].find(features, normalized)
+        found = finders[k].candidates(seen)
+        if not isinstance(found, str):
+            found = finders[k].alone(found)
         took.append(1e3 * (time.process_time() - begin))
         if isinstance(found, str):
             refused[without_numbers(found)] += 1
