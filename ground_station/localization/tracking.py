@@ -188,48 +188,44 @@ def _track(
     )
     guess = (expected + keyframe.pixel_px - was).astype(np.float32)
     with np.errstate(invalid="ignore"):
-        inside = ((guess >= 0) & (guess <= [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
-        inside &= camera.uses(guess) & taken.shows(guess, settings.window_px // 2)
-    point = np.flatnonzero(inside)
+        seen = _in_picture(guess, camera) & taken.shows(guess, settings.window_px // 2)
+    point = np.flatnonzero(seen)
     if not len(point):
         return Tracks(point, np.empty((0, 2), np.float32), 0)
     start = keyframe.pixel_px[point]
     even = evenly_lit(image)
     template, start = _bent(keyframe.even, start, guess[point], settings.window_px)
     found, ok, unlike = _follow(template, even, start, guess[point], settings)
-    size = [camera.width_px - 1, camera.height_px - 1]
-    ok &= ((found >= 0) & (found <= size)).all(axis=1) & camera.uses(found)
-    ok &= taken.shows(found, settings.window_px // 2)
+    ok &= _in_picture(found, camera) & taken.shows(found, settings.window_px // 2)
     kept = np.flatnonzero(ok)
-    # Followed back from a guess that is off, or it would only confirm what it was given.
-    back_guess = start[kept] + np.float32(settings.max_return_px)
     aside = _levels(settings, float(np.hypot(settings.max_return_px, settings.max_return_px)))
-    back, returned, _ = _follow(even, template, found[kept], back_guess, aside)
-    off = np.linalg.norm(back - start[kept], axis=1)
-    kept = kept[returned & (off <= settings.max_return_px)]
-    closer, there, less = _closer(template, even, start[kept], found[kept], settings)
-    there &= (
-        (less < _MORE_ALIKE * unlike[kept])
-        & ((closer >= 0) & (closer <= size)).all(axis=1)
-        & camera.uses(closer)
-    )
+    kept = kept[_returns(even, template, found[kept], start[kept], aside)]
+    # By what is next to them alone: a window of which a part lies farther away than the point is
+    # drawn along by both.
+    fine = replace(settings, window_px=min(_FINE_PX, settings.window_px), levels=1)
+    closer, there, less = _follow(template, even, start[kept], found[kept], fine)
+    there &= _returns(even, template, closer, start[kept], fine)
+    there &= (less < _MORE_ALIKE * unlike[kept]) & _in_picture(closer, camera)
     found[kept[there]] = closer[there]
     return Tracks(point[kept], found[kept], len(point))
 
 
-def _closer(
-    before: U8, after: U8, start: F32, found: F32, settings: TrackingSettings
-) -> tuple[F32, Bools, F32]:
-    """Pixels (N, 2) that were found, by what is next to them alone; as `_follow`, there and back.
+def _in_picture(pixel_px: F32, camera: Camera) -> Bools:
+    """Whether pixels (N, 2) lie in the picture, where it is used (N,)."""
+    last = [camera.width_px - 1, camera.height_px - 1]
+    inside = ((pixel_px >= 0) & (pixel_px <= last)).all(axis=1)
+    return np.asarray(inside & camera.uses(pixel_px))
 
-    A window of which a part lies farther away than the point is drawn along by both.
+
+def _returns(after: U8, before: U8, found: F32, start: F32, settings: TrackingSettings) -> Bools:
+    """Whether pixels (N, 2) that were found come back to where they started (N,).
+
+    They are followed from a guess that is off, or it would only confirm what it was given.
     """
-    fine = replace(settings, window_px=min(_FINE_PX, settings.window_px), levels=1)
-    closer, ok, unlike = _follow(before, after, start, found, fine)
     aside = start + np.float32(settings.max_return_px)
-    back, returned, _ = _follow(after, before, closer, aside, fine)
-    off = np.linalg.norm(back - start, axis=1)
-    return closer, ok & returned & (off <= settings.max_return_px), unlike
+    back, returned, _ = _follow(after, before, found, aside, settings)
+    near = np.linalg.norm(back - start, axis=1) <= settings.max_return_px
+    return np.asarray(returned & near)
 
 
 def _bent(template: U8, start: F32, guess: F32, window_px: int) -> tuple[U8, F32]:
