@@ -37,11 +37,6 @@ class MotionModel:
         self._last: tuple[int, F64] | None = None
         self._before: tuple[int, F64] | None = None
 
-    @property
-    def last_time_ns(self) -> int | None:
-        """The time of the last solved pose, or of the given first one."""
-        return self._last[0] if self._last else None
-
     def restart(self, time_ns: int, wTc: F64) -> None:
         """A pose from elsewhere, with no velocity: a given first one or a relocalization."""
         self._last, self._before = (time_ns, wTc), None

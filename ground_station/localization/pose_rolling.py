@@ -134,20 +134,7 @@ def solve_rolling(
 
 def _refused(predicted: Kinematics, observations: LandmarkObservations) -> str:
     """Why these cannot be solved at all, or nothing."""
-    count = len(observations)
-    shapes = {
-        "points_m": (count, 3),
-        "pinhole_px": (count, 2),
-        "row_s": (count,),
-        "sigma_px": (count,),
-        "covariance_m2": (count, 3, 3),
-        "stretch": (count,),
-        "by_focal_m": (count, 3),
-    }
-    for name, shape in shapes.items():
-        values = getattr(observations, name)
-        if values.shape != shape:
-            return f"{name} has the shape {values.shape}, not {shape}"
+    for name, values in vars(observations).items():
         if not np.isfinite(values).all():
             return f"{name} is not finite"
     if not (observations.sigma_px > 0).all():

@@ -29,10 +29,6 @@ _VAGUE = np.array([0.3] * 3 + [1.0] * 3 + [1.0] * 3 + [2.0] * 3)
 """Standard deviations (rad, m, rad/s, m/s) of a start whose covariance can't be used."""
 
 
-class _Refused(Exception):
-    """Numbers that no filter can use; the message says which."""
-
-
 @dataclass(frozen=True)
 class _Node:
     """A state of the graph: its key, and where its factors were made linear."""
@@ -47,15 +43,13 @@ class FixedLagSmoother:
     Each state is one 12-vector of GTSAM: its step from the solution it came with. Factors are
     linear at that solution, a frame's observations as a Hessian, the process as a Jacobian, so that
     ISAM2 never calls back into Python. `failures` counts the updates that could not be used and
-    restarted the graph; `failure` says why the last one could not. States that leave the lag are
-    kept until `smoothed` is called; without `keep` they are forgotten, and what is held never
-    grows."""
+    restarted the graph. States that leave the lag are kept until `smoothed` is called; without
+    `keep` they are forgotten, and what is held never grows."""
 
     def __init__(self, settings: MotionSettings, keep: bool = True) -> None:
         self.settings = settings
         self._keep = keep
         self.failures = 0
-        self.failure = ""
         self._latest: Kinematics | None = None
         self._expected: Step | None = None
         self._left: list[Kinematics] = []
@@ -117,11 +111,9 @@ class FixedLagSmoother:
         self._leave(time_ns)
         try:
             return self._add(latest, state, solution, wild)
-        except (_Refused, RuntimeError, np.linalg.LinAlgError, ValueError) as error:
+        except (RuntimeError, ValueError):
             # GTSAM raises RuntimeError for a singular system, and its graph is then unusable.
             self.failures += 1
-            lines = (line.strip() for line in str(error).splitlines())
-            self.failure = next(filter(None, lines), type(error).__name__)
             if not _finite(state):
                 state = self._advance(latest, time_ns, self.density).state
             self._drain()
@@ -190,11 +182,11 @@ class FixedLagSmoother:
     ) -> Kinematics:
         information = (solution.information + solution.information.T) / 2
         if not (np.isfinite(information).all() and np.isfinite(solution.gradient).all()):
-            raise _Refused("the observations' information is not finite")
+            raise ValueError("the observations' information is not finite")
         step = self._expect(latest, state.time_ns)
         error = process.difference(step.state, state)
         if not (np.isfinite(error).all() and np.isfinite(step.noise).all()):
-            raise _Refused("the step from the last state is not finite")
+            raise ValueError("the step from the last state is not finite")
         if self._adaptation.learn(latest, step, error, information, wild):
             step = self._advance(latest, state.time_ns, self.density)
         by_state, by_latest = _error_jacobians(error, step.transition)
@@ -233,7 +225,7 @@ class FixedLagSmoother:
         covariance = self._graph.marginalCovariance(node.key)
         state = process.moved(node.anchor, step, (covariance + covariance.T) / 2)
         if not (_finite(state) and (np.diag(covariance) > 0).all()):
-            raise _Refused("the graph's estimate is not finite")
+            raise ValueError("the graph's estimate is not finite")
         return state
 
     def _leave(self, time_ns: int) -> None:
@@ -251,7 +243,7 @@ class FixedLagSmoother:
     def _take(self, node: _Node) -> None:
         if not self._keep:
             return
-        with contextlib.suppress(RuntimeError, _Refused, ValueError):
+        with contextlib.suppress(RuntimeError, ValueError):
             self._left.append(self._estimate(node))
 
     def _learn_rest(self, state: Kinematics, dt_s: float) -> None:
