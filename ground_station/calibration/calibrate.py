@@ -91,14 +91,20 @@ class Result:
         used = sum(int(np.count_nonzero(kept)) for kept in self.fit.used)
         return used, sum(len(kept) for kept in self.fit.used) - used
 
+    def rows(self) -> list[tuple[View, float, float, float]]:
+        """Each view with its RMS, px, and the board's tilt, degrees, and distance, metres."""
+        tilts, distances = self.tilts_deg.tolist(), self.distances_m.tolist()
+        return list(zip(self.views, self.fit.view_rms_px(), tilts, distances, strict=True))
+
+    def residuals(self) -> tuple[F64, F64]:
+        """Where corners that count were seen (N, 2), and from where the lens puts them, pixels."""
+        of_each = zip(self.views, self.fit.residuals, self.fit.used, strict=True)
+        seen, off = zip(*((v.seen.px[kept], r[kept]) for v, r, kept in of_each), strict=True)
+        return np.concatenate(seen), np.concatenate(off)
+
     def regions(self) -> list[Region]:
         """The four corners of the picture, and the rest of it."""
-        px = np.concatenate(
-            [v.seen.px[kept] for v, kept in zip(self.views, self.fit.used, strict=True)]
-        )
-        off = np.concatenate(
-            [r[kept] for r, kept in zip(self.fit.residuals, self.fit.used, strict=True)]
-        )
+        px, off = self.residuals()
         rest = np.ones(len(px), bool)
         found = []
         known = at_corners_px(self.fit, self.size_px)
@@ -152,10 +158,22 @@ def _calibrated(
     height_px = size_px[1]
     middle_m = finder.points_m.mean(axis=0)
     usable = selection.sharp(seen)
-    theta = _first(usable, size_px, finder.points_m, model)
-    choose = _Chooser(usable, size_px, finder.points_m, most_views)
-    views, fit = choose(theta, None)
-    fit, views, left_out = _without_poor(fit, views, height_px, None)
+
+    def fitted(theta: F64, readout_s: float | None) -> tuple[Fit, list[View], int]:
+        """A lens fitted to the views that tell most, those, and how many fit it too badly."""
+        points = [view.points(height_px, readout_s) for view in usable]
+        located, poses = _located(theta, points)
+        if len(located) < verdict.MIN_VIEWS:
+            raise CalibrationError("the views fit no camera: is the board flat, its file right?")
+        candidates, points = [usable[k] for k in located], [points[k] for k in located]
+        outline_m = _outline_m(finder.points_m)
+        chosen = selection.informative(
+            candidates, points, theta, poses, size_px, outline_m, most_views
+        )
+        fit = lens.adjust([points[k] for k in chosen], theta, [poses[k] for k in chosen])
+        return _without_poor(fit, [candidates[k] for k in chosen], height_px, readout_s)
+
+    fit, views, left_out = fitted(_first(usable, size_px, finder.points_m, model), None)
     notes = []
     readout: Readout | None = None
     for _ in range(_TURNS):
@@ -163,8 +181,7 @@ def _calibrated(
         if readout is None or not readout.determined:
             break
         # With the skew gone, views in motion tell as much as others.
-        views, fit = choose(fit.theta, readout.readout_s)
-        fit, views, left_out = _without_poor(fit, views, height_px, readout.readout_s)
+        fit, views, left_out = fitted(fit.theta, readout.readout_s)
     verdict.check_determined(fit, usable, size_px, middle_m)
     if left_out:
         notes.append(f"{left_out} views left out: they fit the others' lens badly")
@@ -214,28 +231,6 @@ def _first(usable: Sequence[View], size_px: tuple[int, int], points_m: F64, mode
     return lens.adjust([points[k] for k in few], theta, poses, prior).theta
 
 
-@dataclass(frozen=True)
-class _Chooser:
-    """Chooses the views that tell most, and fits a lens to them."""
-
-    usable: Sequence[View]
-    size_px: tuple[int, int]
-    points_m: F64
-    most: int
-
-    def __call__(self, theta: F64, readout_s: float | None) -> tuple[list[View], Fit]:
-        points = [view.points(self.size_px[1], readout_s) for view in self.usable]
-        located, poses = _located(theta, points)
-        if len(located) < verdict.MIN_VIEWS:
-            raise CalibrationError("the views fit no camera: is the board flat, its file right?")
-        candidates, points = [self.usable[k] for k in located], [points[k] for k in located]
-        chosen = selection.informative(
-            candidates, points, theta, poses, self.size_px, _outline_m(self.points_m), self.most
-        )
-        fit = lens.adjust([points[k] for k in chosen], theta, [poses[k] for k in chosen])
-        return [candidates[k] for k in chosen], fit
-
-
 def _located(theta: F64, points: Sequence[Points]) -> tuple[list[int], list[F64]]:
     """Which views the board has a pose in, and these poses."""
     poses = [lens.locate(theta, one) for one in points]
@@ -243,18 +238,14 @@ def _located(theta: F64, points: Sequence[Points]) -> tuple[list[int], list[F64]
     return [k for k, _ in found], [pose for _, pose in found]
 
 
-def _refit(fit: Fit, views: Sequence[View], height_px: int, readout_s: float | None) -> Fit:
-    points = [view.points(height_px, readout_s) for view in views]
-    return lens.adjust(points, fit.theta, list(fit.poses))
-
-
 def _without_poor(
     fit: Fit, views: list[View], height_px: int, readout_s: float | None
 ) -> tuple[Fit, list[View], int]:
     """The fit without views that hardly fit, or of which most corners do not count."""
     left_out = 0
+    points = [view.points(height_px, readout_s) for view in views]
     while len(views) > verdict.MIN_VIEWS:
-        sigma = np.array([view.points(height_px, readout_s).sigma_px for view in views])
+        sigma = np.array([one.sigma_px for one in points])
         off = np.nan_to_num(np.array(fit.view_rms_px()), nan=np.inf) / sigma
         share = np.array([np.mean(kept) for kept in fit.used])
         poor = (off > _POOR * np.median(off)) | (share < 0.5)
@@ -262,9 +253,8 @@ def _without_poor(
         worst = int(np.argmax(np.where(poor, off + 1e6 * (share < 0.5), -1.0)))
         if not poor[worst]:
             break
-        views = views[:worst] + views[worst + 1 :]
-        fit.poses = np.delete(fit.poses, worst, axis=0)
-        fit = _refit(fit, views, height_px, readout_s)
+        del views[worst], points[worst]
+        fit = lens.adjust(points, fit.theta, list(np.delete(fit.poses, worst, axis=0)))
         left_out += 1
     return fit, views, left_out
 

@@ -210,14 +210,10 @@ class _Hints:
         if self._clock() - self._said_s < _HINTS_S:
             return
         self._said_s = self._clock()
-        from ground_station.calibration.selection import CORNERS, MAX_EDGE_PX, in_corner
+        from ground_station.calibration.selection import MAX_EDGE_PX, empty_corners
 
         sharp = [s for s in gathered.observations if s.edge_px <= MAX_EDGE_PX]
-        empty = [
-            name
-            for name in CORNERS
-            if not any(in_corner(seen.px, gathered.size_px, name).any() for seen in sharp)
-        ]
+        empty = empty_corners(sharp, gathered.size_px)
         left = f"; not yet: {', '.join(empty)}" if empty else "; all corners: Ctrl-C ends it"
         _say(f"{len(sharp)} sharp views in {gathered.frames} frames{left}")
 

@@ -15,6 +15,7 @@ from ground_station.calibration import results
 from ground_station.calibration.board import Board
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
+from ground_station.calibration.views import View
 from ground_station.presentation.pages import shown, write_page
 from ground_station.presentation.theme import Theme, sheet, themed
 
@@ -50,8 +51,7 @@ def magnification(result: Result) -> float:
 def residuals(result: Result, theme: Theme) -> Figure:
     """From where the lens puts each corner to where it was seen, magnified."""
     figure, axes = _picture(result, theme)
-    px = np.concatenate([v.seen.px[k] for v, k in zip(result.views, result.fit.used, strict=True)])
-    off = np.concatenate([r[k] for r, k in zip(result.fit.residuals, result.fit.used, strict=True)])
+    px, off = result.residuals()
     axes.quiver(
         *px.T, *(off * magnification(result)).T, angles="xy", scale_units="xy", scale=1,
         width=0.0014, headwidth=4, color=theme.estimate,
@@ -64,10 +64,7 @@ def per_view(result: Result, theme: Theme) -> Figure:
     figure = sheet((WIDTH_IN, 2.6), theme)
     axes = figure.subplots()
     themed(axes, theme, _SMALL)
-    order = np.lexsort(
-        ([v.seen.index for v in result.views], [v.seen.source for v in result.views])
-    )
-    values = np.array(result.fit.view_rms_px())[order]
+    values = [rms for _, rms, _, _ in _in_order(result)]
     axes.bar(np.arange(1, len(values) + 1), values, color=theme.estimate, width=0.75)
     axes.axhline(float(np.median(values)), color=theme.limit, ls="--", lw=1.2, label="median")
     axes.set_xlabel("view", fontsize=_SMALL)
@@ -77,6 +74,11 @@ def per_view(result: Result, theme: Theme) -> Figure:
     axes.grid(False, axis="x")
     _legend(axes, theme)
     return figure
+
+
+def _in_order(result: Result) -> list[tuple[View, float, float, float]]:
+    """The result's rows in the order of the inputs."""
+    return sorted(result.rows(), key=lambda row: (row[0].seen.source, row[0].seen.index))
 
 
 def _picture(result: Result, theme: Theme) -> tuple[Figure, Axes]:
@@ -125,16 +127,7 @@ def write_report(
             f"{tilt:.0f}",
             f"{distance:.2f}",
         )
-        for view, rms, tilt, distance in sorted(
-            zip(
-                result.views,
-                result.fit.view_rms_px(),
-                result.tilts_deg,
-                result.distances_m,
-                strict=True,
-            ),
-            key=lambda row: (row[0].seen.source, row[0].seen.index),
-        )
+        for view, rms, tilt, distance in _in_order(result)
     ]
     write_page(
         path,

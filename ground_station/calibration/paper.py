@@ -103,18 +103,8 @@ def write_pdf(path: str | Path, board: Board, paper: str) -> None:
 def _outline(board: Board, left: float, top: float) -> Outline:
     """All that is black as one path: no seams between rectangles that touch."""
     x, y, width, height = board.black_mm().T
-    corners = np.stack(
-        [
-            np.stack([x, y], 1),
-            np.stack([x + width, y], 1),
-            np.stack([x + width, y + height], 1),
-            np.stack([x, y + height], 1),
-            np.stack([x, y], 1),
-        ],
-        axis=1,
-    )
-    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
-    return Outline(corners.reshape(-1, 2) + np.array([left, top]), codes * len(x))
+    corners = np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
+    return Outline.make_compound_path_from_polys(corners.transpose(2, 0, 1) + np.array([left, top]))
 
 
 def _ruler(left: float, y: float) -> Outline:

@@ -65,13 +65,7 @@ def document(result: Result, board: Board, inputs: Sequence[str], frames: int) -
         "regions": [asdict(region) for region in result.regions()],
         "readout": None
         if readout is None
-        else {
-            "readout_s": readout.readout_s,
-            "sigma_s": readout.sigma_s,
-            "windows": readout.windows,
-            "rms_px": readout.rms_px,
-            "determined": readout.determined,
-        },
+        else asdict(readout) | {"determined": readout.determined},
         "views": [
             {
                 "input": Path(inputs[view.seen.source]).name,
@@ -81,16 +75,10 @@ def document(result: Result, board: Board, inputs: Sequence[str], frames: int) -
                 "rms_px": rms,
                 "edge_px": view.seen.edge_px,
                 "speed_px_s": view.speed_px_s,
-                "tilt_deg": float(tilt),
-                "distance_m": float(distance),
+                "tilt_deg": tilt,
+                "distance_m": distance,
             }
-            for view, rms, tilt, distance in zip(
-                result.views,
-                result.fit.view_rms_px(),
-                result.tilts_deg,
-                result.distances_m,
-                strict=True,
-            )
+            for view, rms, tilt, distance in result.rows()
         ],
         "notes": result.notes,
     }

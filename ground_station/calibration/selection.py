@@ -13,7 +13,7 @@ import numpy as np
 
 from ground_station.arrays import F64, Bools, Indices
 from ground_station.calibration import lens
-from ground_station.calibration.detection import apply_homography
+from ground_station.calibration.detection import BoardObservation, apply_homography
 from ground_station.calibration.lens import Points
 from ground_station.calibration.views import View
 
@@ -38,6 +38,12 @@ def in_corner(px: F64, size_px: tuple[int, int], name: str) -> Bools:
     across = px[:, 0] < CORNER_SHARE * w if "left" in name else px[:, 0] > (1 - CORNER_SHARE) * w
     down = px[:, 1] < CORNER_SHARE * h if "upper" in name else px[:, 1] > (1 - CORNER_SHARE) * h
     return np.asarray(across & down)
+
+
+def empty_corners(seen: Sequence[BoardObservation], size_px: tuple[int, int]) -> list[str]:
+    """The corners of the picture in which no corner of the board was seen."""
+    px = np.concatenate([np.empty((0, 2)), *(each.px for each in seen)])
+    return [name for name in CORNERS if not in_corner(px, size_px, name).any()]
 
 
 def sharp(views: Sequence[View]) -> list[View]:

@@ -76,12 +76,6 @@ def check_sharp(views: Sequence[View], usable: Sequence[View]) -> None:
         )
 
 
-def empty_corners(views: Sequence[View], size_px: tuple[int, int]) -> list[str]:
-    """The corners of the picture in which no view has a corner of the board."""
-    px = np.concatenate([view.seen.px for view in views]) if views else np.empty((0, 2))
-    return [name for name in selection.CORNERS if not selection.in_corner(px, size_px, name).any()]
-
-
 def check_determined(
     fit: Fit, usable: Sequence[View], size_px: tuple[int, int], middle_m: F64
 ) -> None:
@@ -96,7 +90,7 @@ def check_determined(
     sane = all(0.1 * width < value < 20 * width for value in fit.theta[:2])
     if not (sane and focal <= MAX_FOCAL_SHARE and centre <= MAX_CENTRE_SHARE * width):
         missing.append(_why(fit, focal if sane else math.inf, centre, middle_m))
-    empty = empty_corners(usable, size_px)
+    empty = selection.empty_corners([view.seen for view in usable], size_px)
     if empty:
         them = "it" if len(empty) == 1 else "them"
         missing.append(
