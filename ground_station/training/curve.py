@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -49,16 +48,14 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 def plot(log: Path, out: Path) -> None:
     """Losses and held-out figures over the steps, those of other extractors dashed, as PNG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from ground_station.presentation.theme import LIGHT, sheet, write_png
 
     lines = read(log)
     trained = [line for line in lines if line["kind"] == "train"]
     tried = [line for line in lines if line["kind"] == "validation"]
     others = [line for line in lines if line["kind"] == "baseline"]
-    figure, axes = plt.subplots(1, 4, figsize=(16, 3.6), layout="constrained")
+    figure = sheet((16, 3.6), LIGHT)
+    axes = figure.subplots(1, 4)
     for name in ("blobs", "anywhere", "worth"):
         axes[0].plot([t["step"] for t in trained], [t[name] for t in trained], lw=0.8, label=name)
     axes[0].set(title="loss", yscale="log")
@@ -76,7 +73,4 @@ def plot(log: Path, out: Path) -> None:
         axis.set_xlabel("step")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    plt.close(figure)
-    files.write_bytes(out, buffer.getvalue())
+    write_png(figure, out, 100)

@@ -11,7 +11,7 @@ from ground_station.feature_models import scale
 from ground_station.feature_models.graph import Graph, fold_batch_norm
 from ground_station.features.model_info import ModelInfo
 from ground_station.training.errors import TrainingError
-from ground_station.training.topology import OUTPUTS, Conv, Shape
+from ground_station.training.topology import OUTPUTS, Conv, Operations, Shape
 
 EPSILON = 1e-5
 """Of the batch normalisations, in training and where they are folded."""
@@ -53,7 +53,7 @@ def _folded(layer: Conv, weights: Weights) -> tuple[F32, F32]:
     return fold_batch_norm(weight, None, scale, shift, mean, variance, EPSILON)
 
 
-class _OnnxOperations:
+class _OnnxOperations(Operations):
     """The graph's nodes; batch normalisations are folded into the convolutions before them."""
 
     def __init__(self, graph: Graph, weights: Weights) -> None:

@@ -29,7 +29,7 @@ from ground_station.training.export import export
 from ground_station.training.losses import Losses
 from ground_station.training.network import FeatureNetwork
 from ground_station.training.pairs import Batch
-from ground_station.training.recipe import Recipe, finite, is_due, pairs_seen
+from ground_station.training.recipe import Recipe, finite, is_due
 from ground_station.training.topology import OUTPUTS
 from ground_station.training.trainer import Trainer
 
@@ -116,7 +116,8 @@ def train(
     corpus.make(corpus_folder, recipe.corpus, machine.jobs)
     source = Source(recipe, corpus_folder, device)
     held = held_out(recipe, corpus_folder, _HELD_OUT_PAIRS)
-    run = _Run(recipe, trainer, out, machine, before_s, held, fresh)
+    log = curve.Log(out / "log.jsonl", -1 if fresh else step)
+    run = _Run(recipe, trainer, out, machine, before_s, held, log)
     run.begins(step)
     if fresh:
         run.baselines(step)
@@ -133,12 +134,11 @@ def _recipe_of(start: checkpoint.Checkpoint) -> dict[str, Any]:
 class _Run:
     def __init__(
         self, recipe: Recipe, trainer: Trainer, out: Path, machine: Machine, before_s: float,
-        held: Batch, fresh: bool,
+        held: Batch, log: curve.Log,
     ) -> None:  # fmt: skip
-        self._fresh = fresh
         self.recipe, self.trainer, self.machine, self.held = recipe, trainer, machine, held
         self.out, self.model = out, out / f"{trainer.shape.name}.onnx"
-        self.log: curve.Log | None = None
+        self.log = log
         self._before_s, self._started_s = before_s, time.monotonic()
 
     @property
@@ -146,14 +146,9 @@ class _Run:
         """That this run and those that it goes on from took."""
         return self._before_s + time.monotonic() - self._started_s
 
-    def note(self, step: int) -> curve.Log:
-        if self.log is None:
-            self.log = curve.Log(self.out / "log.jsonl", -1 if self._fresh else step)
-        return self.log
-
     def begins(self, step: int) -> None:
         """Notes what goes on from here: a resumed run may have a larger corpus."""
-        self.note(step).add(
+        self.log.add(
             "recipe", step=step, recipe=self.recipe.as_dict(),
             device=str(self.trainer.device), bfloat16=self.trainer.bfloat16,
         )  # fmt: skip
@@ -166,13 +161,12 @@ class _Run:
         }  # fmt: skip
         for name, extractor in others.items():
             figures = validation.figures(extractor, self.held)
-            self.note(step).add("baseline", step=step, name=name, **asdict(figures))
+            self.log.add("baseline", step=step, name=name, **asdict(figures))
             _say(name, figures)
 
     def go(self, source: Source, step: int) -> dict[str, Any]:
         """The steps that are left; an interrupt ends them after a checkpoint."""
-        recipe, machine = self.recipe, self.machine
-        log = self.note(step)
+        recipe, machine, log = self.recipe, self.machine, self.log
         names = [field.name for field in fields(Losses)]
         sums = torch.zeros(len(names), device=self.trainer.device)
         count, since_s, written = 0, time.monotonic(), step
@@ -222,7 +216,7 @@ class _Run:
 
     def validate(self, step: int) -> dict[str, Any]:
         """Exports the weights' mean, holds the file to torch's outputs, and judges it."""
-        pairs = pairs_seen(self.recipe, step)
+        pairs = self.recipe.batch * step
         source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs"
         weights, shape = self.trainer.weights(), self.trainer.shape
         export(shape, weights, self.model, source)
@@ -232,9 +226,8 @@ class _Run:
         figures = validation.figures(extractor, self.held)
         _say(f"step {step}", figures)
         values = asdict(figures)
-        log = self.note(step)
-        log.add("validation", step=step, **values, seconds=round(self.seconds, 1))
-        curve.plot(log.path, self.out / "curve.png")
+        self.log.add("validation", step=step, **values, seconds=round(self.seconds, 1))
+        curve.plot(self.log.path, self.out / "curve.png")
         return {"model": str(self.model), "step": step, "steps": self.recipe.steps, "pairs": pairs,
                 "seconds": round(self.seconds, 1), **values}  # fmt: skip
 

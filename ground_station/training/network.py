@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ground_station.training.export import EPSILON, Weights
-from ground_station.training.topology import Conv, Shape, layers
+from ground_station.training.topology import Conv, Operations, Shape, layers
 
 _TERMS = {"weight": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
 """Of a batch normalisation: our names and torch's."""
@@ -31,7 +31,7 @@ class FeatureNetwork(nn.Module):
         return descriptors, details, worth
 
 
-class _TorchOperations:
+class _TorchOperations(Operations):
     def __init__(self, modules: nn.ModuleDict) -> None:
         self._modules = modules
 

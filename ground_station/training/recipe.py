@@ -108,11 +108,6 @@ class Recipe:
         return result
 
 
-def pairs_seen(recipe: Recipe, step: int) -> int:
-    """How many pairs the first `step` steps took."""
-    return recipe.batch * step
-
-
 def is_due(step: int, every: int, last: int) -> bool:
     """Whether something that happens each `every` steps, and at the last, happens after `step`."""
     return step % every == 0 or step == last

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from ground_station.training.errors import TrainingError
 
@@ -30,23 +30,29 @@ class Conv:
     norm: bool = True
 
 
-class Operations(Protocol):
-    """What a network is made of. Tensors are whatever the implementation takes for them."""
+class Operations:
+    """What a network is made of. Tensors are whatever a child takes for them; here they stay as
+    they are."""
 
     def conv(self, layer: Conv, x: Any) -> Any:
         """A convolution, normalised if its layer says so."""
+        return x
 
     def relu(self, x: Any) -> Any:
         """max(x, 0)."""
+        return x
 
     def add(self, first: Any, second: Any) -> Any:
         """The sum."""
+        return first
 
     def double(self, x: Any) -> Any:
         """Twice the size, bilinear, pixel centres at half numbers."""
+        return x
 
     def fold(self, x: Any, side: int) -> Any:
         """One channel's squares of `side` pixels as so many channels, row by row."""
+        return x
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ def shape_of(size: str) -> Shape:
     return SHAPES[size]
 
 
-class _Listing:
+class _Listing(Operations):
     """Operations that only remember the layers."""
 
     def __init__(self) -> None:
@@ -119,18 +125,6 @@ class _Listing:
 
     def conv(self, layer: Conv, x: None) -> None:
         self.layers.append(layer)
-
-    def relu(self, x: None) -> None:
-        return None
-
-    def add(self, first: None, second: None) -> None:
-        return None
-
-    def double(self, x: None) -> None:
-        return None
-
-    def fold(self, x: None, side: int) -> None:
-        return None
 
 
 def layers(shape: Shape) -> tuple[Conv, ...]:
