@@ -304,20 +304,15 @@ class Acquirer:
         state: Kinematics,
         estimator: Estimator,
         taken: Conditions,
-    ) -> Callable[[], Acquired]:
-        """The job that makes a tracked frame of a known state the next keyframe."""
-
-        def job() -> Acquired:
-            watch = Stopwatch()
-            seen = self.describe(image, taken)
-            closer_px = self._settings.association.refine_radius_px
-            radius_px = closer_px or self.matcher.radius_px
-            share = self._settings.tracking.max_chance_share
-            found = self._locate_once(seen, state, state, estimator, radius_px, watch, share)
-            found = self._verified(seen, found, watch)
-            return self._acquired(time_ns, image, found, watch, searched=False)
-
-        return job
+    ) -> Acquired:
+        """Makes a tracked frame of a known state the next keyframe."""
+        watch = Stopwatch()
+        seen = self.describe(image, taken)
+        radius_px = self._settings.association.refine_radius_px or self.matcher.radius_px
+        share = self._settings.tracking.max_chance_share
+        found = self._locate_once(seen, state, state, estimator, radius_px, watch, share)
+        found = self._verified(seen, found, watch)
+        return self._acquired(time_ns, image, found, watch, searched=False)
 
     def search(
         self,
@@ -326,16 +321,12 @@ class Acquirer:
         expected: Sequence[Kinematics],
         make: Callable[[], Estimator],
         taken: Conditions,
-    ) -> Callable[[], Acquired]:
-        """The job that finds a frame near its prediction, or else anywhere."""
-
-        def job() -> Acquired:
-            watch = Stopwatch()
-            seen = self.describe(image, taken)
-            found = self.find(seen, time_ns, expected, make(), make, watch)
-            return self._acquired(time_ns, image, found, watch, searched=True)
-
-        return job
+    ) -> Acquired:
+        """Finds a frame near its prediction, or else anywhere."""
+        watch = Stopwatch()
+        seen = self.describe(image, taken)
+        found = self.find(seen, time_ns, expected, make(), make, watch)
+        return self._acquired(time_ns, image, found, watch, searched=True)
 
     def _verified(self, seen: Described, found: Located, watch: Stopwatch) -> Located:
         """What was found, or nothing when the frame shows too little of what it should."""

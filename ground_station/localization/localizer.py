@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -328,25 +329,22 @@ class Localizer:
             or self._judge.doubtful
             or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
         ):
-            state = self._estimator.predict(attempt.time_ns) or followed.solution.state
-            self._worker.submit(
-                self._acquirer.promote(
-                    attempt.time_ns, image, state, self._estimator, attempt.taken
-                ),
-                attempt.time_ns,
-            )
+            time_ns, taken = attempt.time_ns, attempt.taken
+            state = self._estimator.predict(time_ns) or followed.solution.state
+            promote = self._acquirer.promote
+            job = partial(promote, time_ns, image, state, self._estimator, taken)
+            self._worker.submit(job, time_ns)
 
     def _search(self, attempt: Attempt, image: U8) -> None:
         """Asks for this frame to be found, near its prediction or anywhere."""
         whole = attempt.taken.damaged is None
         if self._worker.busy or not whole or not self._may_search(attempt.time_ns):
             return
-        self._last_search_ns = attempt.time_ns
-        expected = [] if self._gone(attempt.time_ns) else self._expected(attempt)
-        self._worker.submit(
-            self._acquirer.search(attempt.time_ns, image, expected, self._fresh, attempt.taken),
-            attempt.time_ns,
-        )
+        time_ns = self._last_search_ns = attempt.time_ns
+        expected = [] if self._gone(time_ns) else self._expected(attempt)
+        search = self._acquirer.search
+        job = partial(search, time_ns, image, expected, self._fresh, attempt.taken)
+        self._worker.submit(job, time_ns)
 
     def _land(self, attempt: Attempt) -> bool:
         """Takes what the job beside the frames brings; whether it was found in the whole map."""
