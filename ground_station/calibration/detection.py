@@ -40,10 +40,6 @@ class BoardObservation:
     edge_px: float
     H: F64
 
-    def plane_px(self, points_m: F64) -> F64:
-        """Where its homography puts board points (N, 2 or 3), pixels."""
-        return apply_homography(self.H, points_m[:, :2])
-
 
 def apply_homography(H: F64, points: F64) -> F64:
     """Points (N, 2) through a homography (3, 3)."""

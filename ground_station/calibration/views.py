@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.arrays import F64
-from ground_station.calibration.detection import BoardObservation
+from ground_station.calibration.detection import BoardObservation, apply_homography
 from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
 
@@ -24,7 +24,7 @@ _LEFT_SHARE = 0.02
 
 @dataclass(frozen=True)
 class View:
-    """An observationing with its corners' places on the board `points_m` (N, 3).
+    """An observation with its corners' places on the board `points_m` (N, 3).
 
     `velocity_px_s` (N, 2) of each corner, None where neighbouring frames do not tell; `speed_px_s`
     is their median, 0 then, `doubt_px_s` how far it may be off. `corner_px` is how far a corner is
@@ -39,14 +39,9 @@ class View:
     corner_px: float
 
     @property
-    def skew_px(self) -> float:
-        """What a rolling shutter may shift a corner, deviation."""
-        return _skew_px(self.speed_px_s, _UNKNOWN_READOUT_S)
-
-    @property
     def sigma_px(self) -> float:
         """How far a corner is expected to be off while the shutter is not known."""
-        return math.hypot(self.corner_px, self.skew_px)
+        return math.hypot(self.corner_px, _skew_px(self.speed_px_s, _UNKNOWN_READOUT_S))
 
     def points(self, height_px: int, readout_s: float | None) -> Points:
         """The corners for the adjustment, as they stood when the middle row was exposed.
@@ -118,5 +113,5 @@ def _slope(observations: list[BoardObservation], k: int, near: range, points_m: 
     """The derivative (N, 2) at the k-th observation of the polynomial through some around it."""
     nodes_s = np.array([(observations[j].time_ns - observations[k].time_ns) / 1e9 for j in near])
     _, slopes = lagrange(nodes_s, np.zeros(1))
-    places = np.array([observations[j].plane_px(points_m) for j in near])
+    places = np.array([apply_homography(observations[j].H, points_m[:, :2]) for j in near])
     return np.asarray(np.einsum("j,jni->ni", slopes[0], places))

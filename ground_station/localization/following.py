@@ -13,7 +13,6 @@ from ground_station.localization.estimate import Counts, Observations
 from ground_station.localization.estimator import Estimator
 from ground_station.localization.kinematics import Kinematics, Solution, no_solution
 from ground_station.localization.matching import Matcher
-from ground_station.localization.settings import LocalizerSettings, PoseSettings
 from ground_station.localization.tracking import Keyframe, track
 
 REMEMBERED = 12
@@ -61,7 +60,8 @@ def follow(
         observations = matcher.observations(
             tracks.pixel_px, landmark, keyframe.sigma_px[tracks.point], predicted, attempt.taken
         )
-        solution = estimator.solve(predicted, observations, _tracked(settings))
+        few = replace(settings.pose, min_inliers=6)
+        solution = estimator.solve(predicted, observations, few)
         solution = believed(solution, settings, int(np.ceil(least)))
     attempt.watch.lap("pose")
     way = np.linalg.norm(tracks.pixel_px - keyframe.pixel_px[tracks.point], axis=1)
@@ -72,10 +72,6 @@ def follow(
         float(np.median(way)) if found else 0.0,
         keyframe.time_ns,
     )
-
-
-def _tracked(settings: LocalizerSettings) -> PoseSettings:
-    return replace(settings.pose, min_inliers=6)
 
 
 def better(landed: Keyframe, present: Keyframe | None, followed: Followed | None) -> Keyframe:
