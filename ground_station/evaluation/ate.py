@@ -6,7 +6,6 @@ Every bound of this project means the RMSE of `position_m`, which is what evo pr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -188,19 +187,11 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_diff_s: float = MAX_DI
     return Evaluation(estimate, truth, found, impossible)
 
 
-def shares(
-    errors: Errors,
-    thresholds: Sequence[tuple[float, float]] = THRESHOLDS,
-    frames: int | None = None,
-) -> list[float]:
-    """The share of frames within each (metres, degrees), 0 to 1.
-
-    Of the pairs, or of `frames` where frames without an estimate are to count as failed.
-    """
-    total = len(errors.position_m) if frames is None else frames
+def shares(errors: Errors) -> list[float]:
+    """The share of pairs within each of `THRESHOLDS`, 0 to 1."""
     return [
-        float(np.sum((errors.position_m <= m) & (errors.rotation_deg <= deg))) / max(total, 1)
-        for m, deg in thresholds
+        float(np.mean((errors.position_m <= m) & (errors.rotation_deg <= deg)))
+        for m, deg in THRESHOLDS
     ]
 
 
