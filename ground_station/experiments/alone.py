@@ -61,7 +61,7 @@ class Alone:
             index,
             State.LOST if wTc is None else State.TRACKING,
             wTc=wTc,
-            counts=Counts(len(features), len(self._points_m), len(feature), inliers),
+            counts=Counts(len(self._points_m), inliers),
             stage_ms={"total": 1e3 * (time.perf_counter() - begun_s)},
         )
 

@@ -53,7 +53,6 @@ class Located:
     solution: Solution
     matches: Matches
     observations: Observations
-    features: int
     relocalized: bool = False
     wild: bool = False
     significance: float = 0.0
@@ -202,9 +201,9 @@ class Acquirer:
         """
         if self._relocalizer is None:
             if not expected:
-                return _nothing(seen, "no first pose")
+                return _nothing("no first pose")
             return self.locate(seen, expected[0], estimator, watch)
-        near = _nothing(seen, "not looked for near")
+        near = _nothing("not looked for near")
         if expected and self.matcher.within_reach(expected[0]):
             near = self._verified(seen, self.locate(seen, expected[0], estimator, watch), watch)
             if near.excess >= self._settings.recovery.min_excess:
@@ -218,7 +217,7 @@ class Acquirer:
         candidates = self._relocalizer.candidates(seen)
         watch.lap("relocalization")
         if isinstance(candidates, str):
-            return unless_near(_nothing(seen, candidates))
+            return unless_near(_nothing(candidates))
         for prediction, found in itertools.product(expected, candidates):
             if found.doubt and not (prediction is expected[0] and self._narrow(prediction)):
                 continue
@@ -229,7 +228,7 @@ class Acquirer:
                 return unless_near(located)
         sole = self._relocalizer.alone(candidates)
         if isinstance(sole, str):
-            return unless_near(_nothing(seen, sole))
+            return unless_near(_nothing(sole))
         estimator = make()
         estimator.restart(time_ns, sole.wTc, self._open(sole))
         alone = estimator.predict(time_ns)
@@ -339,7 +338,7 @@ class Acquirer:
         if sure >= least:
             return replace(found, significance=sure, excess=support.share - support.chance)
         reason = f"only {sure:.1f} sigma more landmarks than by chance"
-        return _nothing(seen, reason)
+        return _nothing(reason)
 
     def _acquired(
         self, time_ns: int, image: U8, found: Located, watch: Stopwatch, *, searched: bool
@@ -389,7 +388,7 @@ class Acquirer:
             )
             solution = believed(estimator.solve(expected, seen_at, settings), self._settings)
         observations = Observations(pixel, matches.landmark, solution.residual_px, solution.inlier)
-        return Located(solution, matches, observations, len(seen))
+        return Located(solution, matches, observations)
 
 
 def believed(solution: Solution, settings: LocalizerSettings, least: int | None = None) -> Solution:
@@ -405,11 +404,7 @@ def believed(solution: Solution, settings: LocalizerSettings, least: int | None 
     return no_solution(total, f"{inliers} inliers of {total} observations", solution.iterations)
 
 
-def _nothing(seen: Described, reason: str) -> Located:
+def _nothing(reason: str) -> Located:
     none = np.empty(0, np.intp)
-    return Located(
-        no_solution(0, reason),
-        Matches(none, none, np.empty(0, np.float32), 0, 0),
-        no_observations(),
-        len(seen),
-    )
+    matches = Matches(none, none, np.empty(0, np.float32), 0)
+    return Located(no_solution(0, reason), matches, no_observations())

@@ -65,7 +65,6 @@ class Attempt:
     def __init__(self, time_ns: int, index: int = 0) -> None:
         self.time_ns, self.index = time_ns, index
         self.watch = Stopwatch()
-        self.entropy = float("nan")
         self.taken = Conditions()
         self.predicted: Kinematics | None = None
         self.counts = Counts()

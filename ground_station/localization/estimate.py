@@ -25,14 +25,10 @@ class State(enum.Enum):
 
 @dataclass(frozen=True)
 class Counts:
-    """Features of the frame, landmarks projected into it, pairs associated, inliers of the pose.
+    """Landmarks projected into the frame, of a tracked one points expected in view; inliers of the
+    pose."""
 
-    Of a tracked frame: points found again (twice), points expected in view, inliers.
-    """
-
-    features: int = 0
     projected: int = 0
-    associated: int = 0
     inliers: int = 0
 
 
@@ -67,12 +63,11 @@ class PoseEstimate:
     `wTc` (4, 4) is only there when the frame was solved from its own observations. `twist` (6,) is
     the velocity in the camera's axes, rotation (rad/s) before translation (m/s); zero where the
     preset does not estimate it. `covariance` (6, 6) is of the right tangent wTc·exp(ξ) in the
-    camera's axes, rotation (rad) before translation (m), as of GTSAM's Pose3. `predicted_wTc` is
-    the motion model's, for drawing only. `stage_ms` has entropy, track, features, projection,
-    association, pose, relocalization, wait, catch_up and total, those that ran; a keyframe's
-    features landed in a frame with `background`, the time they took beside the frames, which is no
-    part of the total. `sharpness` is against the frames before, 0 to 1. `tracked`: solved from a
-    keyframe's points found again in this frame, and not from features of its own.
+    camera's axes, rotation (rad) before translation (m), as of GTSAM's Pose3. `stage_ms`
+    has entropy, track, features, projection, association, pose, relocalization, wait, catch_up and
+    total, those that ran; a keyframe's features landed in a frame with `background`, the time they
+    took beside the frames, which is no part of the total. `tracked`: solved from a keyframe's
+    points found again in this frame, and not from features of its own.
     """
 
     time_ns: int
@@ -82,12 +77,9 @@ class PoseEstimate:
     wTc: F64 | None = None
     twist: F64 | None = None
     covariance: F64 | None = None
-    predicted_wTc: F64 | None = None
     counts: Counts = Counts()
     observations: Observations = field(default_factory=no_observations)
     stage_ms: dict[str, float] = field(default_factory=dict)
-    entropy_bits: float = float("nan")
-    sharpness: float = 1.0
     gated: bool = False
     relocalized: bool = False
     tracked: bool = False

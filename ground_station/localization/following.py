@@ -67,7 +67,7 @@ def follow(
     way = np.linalg.norm(tracks.pixel_px - keyframe.pixel_px[tracks.point], axis=1)
     return Followed(
         solution,
-        Counts(found, tracks.sought, found, int(solution.inlier.sum())),
+        Counts(tracks.sought, int(solution.inlier.sum())),
         Observations(tracks.pixel_px, landmark, solution.residual_px, solution.inlier),
         float(np.median(way)) if found else 0.0,
         keyframe.time_ns,

@@ -163,11 +163,11 @@ class Localizer:
         attempt = Attempt(time_ns, index)
         if (refused := self._refuse(attempt)) is not None:
             return refused
-        attempt.entropy = gate.entropy_bits(image)
+        entropy = gate.entropy_bits(image)
         attempt.watch.lap("entropy")
         self._last_frame_ns = time_ns
         state, motion = self.settings.state, self.settings.motion
-        if reason := gate.low_entropy(attempt.entropy, self.settings.gate):
+        if reason := gate.low_entropy(entropy, self.settings.gate):
             # Skipped is not failed: until the prediction is no more than a held pose.
             return self._gated(attempt, reason, max(state.lost_after_s, motion.coast_s))
         if reason := gate.low_contrast(image, self.settings.gate):
@@ -187,9 +187,9 @@ class Localizer:
         self._idle_since_s = perf_counter()
         return estimate
 
-    def process_features(self, time_ns: int, features: Features, index: int = 0) -> PoseEstimate:
+    def process_features(self, time_ns: int, features: Features) -> PoseEstimate:
         """The same from features that were extracted elsewhere; nothing is gated or followed."""
-        attempt = Attempt(time_ns, index)
+        attempt = Attempt(time_ns)
         if (refused := self._refuse(attempt)) is not None:
             return refused
         self._last_frame_ns = self._last_worked_ns = time_ns
@@ -274,9 +274,7 @@ class Localizer:
         return [state for state in (attempt.predicted, wild) if state is not None]
 
     def _note(self, attempt: Attempt, found: Located) -> None:
-        inliers = int(found.solution.inlier.sum())
-        matches = found.matches
-        attempt.counts = Counts(found.features, matches.projected, matches.associated, inliers)
+        attempt.counts = Counts(found.matches.projected, int(found.solution.inlier.sum()))
         attempt.observations = found.observations
         self._located = found
 
@@ -438,7 +436,6 @@ class Localizer:
 
     def _gated(self, attempt: Attempt, reason: str, patience_s: float) -> PoseEstimate:
         verdict = self._judge.unsolved(attempt.time_ns, patience_s)
-        attempt.predicted = self._estimator.predict(attempt.time_ns)
         self._forget_if_lost(verdict)
         return publish(attempt, verdict, reason, gated=True)
 

@@ -58,14 +58,13 @@ def describe(features: Features, camera: Camera, taken: Conditions) -> Described
 class Matches:
     """N features that are landmarks: `feature` (N,) and `landmark` (N,) indices, nearest first.
 
-    `distance` (N,) of descriptors; `projected` landmarks were looked for and `associated` found.
+    `distance` (N,) of descriptors; `projected` landmarks were looked for.
     """
 
     feature: Indices
     landmark: Indices
     distance: F32
     projected: int
-    associated: int
 
     def __len__(self) -> int:
         return len(self.feature)
@@ -175,7 +174,6 @@ class Matcher:
             projected.landmark[pairs.candidate[best]],
             pairs.distance[best] / np.float32(self.scale),
             len(projected.landmark),
-            len(pairs),
         )
 
     def reach_px(self, step: F64) -> float:

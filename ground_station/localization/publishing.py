@@ -89,7 +89,6 @@ def publish(
     tracked: bool = False,
 ) -> PoseEstimate:
     """The estimate of a frame that was `found`, or that has no pose."""
-    predicted = attempt.predicted
     return PoseEstimate(
         time_ns=attempt.time_ns,
         index=attempt.index,
@@ -98,12 +97,9 @@ def publish(
         wTc=found.wTc if found else None,
         twist=found.twist if found else None,
         covariance=covariance,
-        predicted_wTc=predicted.wTc if predicted else None,
         counts=attempt.counts,
         observations=attempt.observations,
         stage_ms=attempt.watch.finish(),
-        entropy_bits=attempt.entropy,
-        sharpness=attempt.taken.sharpness,
         gated=gated,
         relocalized=relocalized,
         tracked=tracked,

@@ -114,7 +114,7 @@ def test_a_note_has_the_frames_numbers_and_the_poses() -> None:
         estimate(
             covariance=covariance,
             twist=np.array([0, 0, 0, 0.0, 0.0, 2.0]),
-            counts=Counts(features=9, projected=40, associated=30, inliers=20),
+            counts=Counts(projected=40, inliers=20),
             observations=observations(3, 2),
             stage_ms={"total": 12.34567},
             tracked=True,
