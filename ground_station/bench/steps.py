@@ -121,9 +121,6 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     pixels[wrong] += rng.uniform(-40, 40, (len(wrong), 2))
     guess = wTc @ poses.exp([0.02, -0.03, 0.02, 0.08, -0.05, 0.06])
     settings = PoseSettings(sigma_px=2.0, landmark_sigma_m=0.01)
-    data = (guess, points, pixels, camera, settings)
-    direct, graph = solve_direct(*data).wTc, solve_graph(*data).wTc
-    assert direct is not None and graph is not None
     middle = 0.5 * (camera.height_px - 1)
     observations = LandmarkObservations(
         points,
@@ -136,12 +133,14 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
     )
     sigma = np.repeat([0.05, 0.1, 0.5, 0.5], 3)
     predicted = Kinematics(0, guess, np.zeros(6), np.diag(sigma**2))
-    assert solve_rolling(predicted, observations, camera, settings).state is not None
+    data = (predicted, observations, camera, settings)
+    direct, graph = solve_direct(*data).state, solve_graph(*data).state
+    assert direct is not None and graph is not None and solve_rolling(*data).state is not None
     ours, theirs, rolling = medians_ms(
         repetitions,
         lambda: solve_direct(*data),
         lambda: solve_graph(*data),
-        lambda: solve_rolling(predicted, observations, camera, settings),
+        lambda: solve_rolling(*data),
     )
     return {
         "direct_ms": ours,
@@ -149,7 +148,7 @@ def pose(seed: int, repetitions: int) -> dict[str, Any]:
         "rolling_ms": rolling,
         "ratio": theirs / ours,
         "landmark_sigma_m": settings.landmark_sigma_m,
-        "apart_m": float(np.linalg.norm(direct[:3, 3] - graph[:3, 3])),
+        "apart_m": float(np.linalg.norm(direct.wTc[:3, 3] - graph.wTc[:3, 3])),
     }
 
 

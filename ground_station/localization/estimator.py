@@ -9,12 +9,7 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
-from ground_station.localization.kinematics import (
-    Kinematics,
-    LandmarkObservations,
-    Solution,
-    no_solution,
-)
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
 from ground_station.localization.motion import MotionModel
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import solve_graph
@@ -82,18 +77,7 @@ class PoseEstimator:
     ) -> Solution:
         if len(observations):
             settings = dataclasses.replace(settings, sigma_px=float(observations.sigma_px.mean()))
-        found = self._solve(
-            predicted.wTc, observations.points_m, observations.pinhole_px, self._camera, settings
-        )
-        if found.wTc is None or found.covariance is None:
-            return no_solution(len(observations), found.reason, found.iterations)
-        covariance = np.zeros((12, 12))
-        covariance[:6, :6] = found.covariance
-        state = Kinematics(predicted.time_ns, found.wTc, np.zeros(6), covariance)
-        return Solution(
-            state, np.zeros((12, 12)), np.zeros(12), found.residual_px, found.inlier,
-            iterations=found.iterations,
-        )  # fmt: skip
+        return self._solve(predicted, observations, self._camera, settings)
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         assert solution.state is not None

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
-from ground_station.localization.pose_graph import PoseSolution, failure, reprojection_px
+from ground_station.localization.kinematics import (
+    Kinematics,
+    LandmarkObservations,
+    Solution,
+    no_solution,
+)
+from ground_station.localization.pose_graph import pose_alone, reprojection_px
 from ground_station.localization.pose_newton import Reprojection, descend
 from ground_station.localization.settings import PoseSettings
 
 
 def solve_direct(
-    wTc: F64, points_w: F64, pinhole_px: F64, camera: Camera, settings: PoseSettings
-) -> PoseSolution:
-    """The pose that explains undistorted pixels (N, 2) of landmarks (N, 3), from a guess (4, 4).
+    guess: Kinematics, observations: LandmarkObservations, camera: Camera, settings: PoseSettings
+) -> Solution:
+    """The pose that explains N landmarks seen at undistorted pixels, from a guess of it.
 
     The optimum of `solve_graph`, each landmark marginalised: see `pose_newton`. With
     `reject_outliers` it is solved once more from the inliers alone.
     """
-    count = len(points_w)
+    count, points_w, pinhole_px = len(observations), observations.points_m, observations.pinhole_px
+    wTc = guess.wTc
     every = Reprojection(
         points_m=np.array(points_w.T, np.float64),
         offset_px=np.array((pinhole_px - [camera.cx_px, camera.cy_px]).T, np.float64),
@@ -34,17 +40,17 @@ def solve_direct(
     with np.errstate(all="ignore"):  # what is not finite is a failure
         for last in (False, True) if settings.reject_outliers else (True,):
             if (left := int(inlier.sum())) < settings.min_inliers:
-                return failure(count, iterations, f"{left} inliers")
+                return no_solution(count, f"{left} inliers", iterations)
             chosen = every if left == count else every.where(inlier)
             found = descend(chosen, wTc, still, None, settings.max_iterations, rough=not last)
             iterations += found.iterations
             if found.reason:
-                return failure(count, iterations, found.reason)
+                return no_solution(count, found.reason, iterations)
             wTc = found.wTc
             residual = reprojection_px(camera, wTc, points_w, pinhole_px)
             inlier = residual < settings.inlier_px
     information = found.linear.information
     if not np.linalg.cond(information) < 1e14:
-        return failure(count, iterations, "singular")
+        return no_solution(count, "singular", iterations)
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    return PoseSolution(wTc, covariance, residual, inlier, iterations)
+    return pose_alone(guess.time_ns, wTc, covariance, residual, settings.inlier_px, iterations)

@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
-from ground_station.arrays import F64, Bools
+from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
+from ground_station.localization.kinematics import (
+    Kinematics,
+    LandmarkObservations,
+    Solution,
+    no_solution,
+)
 from ground_station.localization.settings import PoseSettings
 
 
-@dataclass(frozen=True)
-class PoseSolution:
-    """What a solver found; `wTc` is None when it failed, and `reason` says why.
-
-    `covariance` (6, 6) is of the right tangent wTc·exp(ξ), rotation (rad) before translation (m),
-    as of GTSAM's Pose3. `residual_px` (N,) belongs to the observations given, `inlier` (N,) too.
-    """
-
-    wTc: F64 | None
-    covariance: F64 | None
-    residual_px: F64
-    inlier: Bools
-    iterations: int
-    reason: str = ""
-
-
-def failure(count: int, iterations: int, reason: str) -> PoseSolution:
-    """A solution that is none."""
-    return PoseSolution(
-        None, None, np.full(count, np.inf), np.zeros(count, bool), iterations, reason
-    )
+def pose_alone(
+    time_ns: int, wTc: F64, covariance: F64, residual_px: F64, inlier_px: float, iterations: int
+) -> Solution:
+    """The solution of a pose (4, 4) with its covariance (6, 6), which knows of no velocity."""
+    full = np.zeros((12, 12))
+    full[:6, :6] = covariance
+    return Solution(
+        Kinematics(time_ns, wTc, np.zeros(6), full), np.zeros((12, 12)), np.zeros(12),
+        residual_px, residual_px < inlier_px, iterations=iterations,
+    )  # fmt: skip
 
 
 def reprojection_px(camera: Camera, wTc: F64, points_w: F64, pinhole_px: F64) -> F64:
@@ -51,15 +44,15 @@ def reprojection_px(camera: Camera, wTc: F64, points_w: F64, pinhole_px: F64) ->
 
 
 def solve_graph(
-    wTc: F64, points_w: F64, pinhole_px: F64, camera: Camera, settings: PoseSettings
-) -> PoseSolution:
-    """The pose that explains undistorted pixels (N, 2) of landmarks (N, 3), from a guess (4, 4).
+    guess: Kinematics, observations: LandmarkObservations, camera: Camera, settings: PoseSettings
+) -> Solution:
+    """The pose that explains N landmarks seen at undistorted pixels, from a guess of it.
 
     Variables are the pose and every landmark. Factors: a pinhole projection with sigma and Huber's
     loss for each observation, and a prior on each landmark. Gauss-Newton. The covariance is the
     pose's marginal of the reweighted graph. A singular graph or no convergence is a failure.
     """
-    n = len(points_w)
+    n, points_w, pinhole_px = len(observations), observations.points_m, observations.pinhole_px
     K = gtsam.Cal3_S2(camera.fx_px, camera.fy_px, 0.0, camera.cx_px, camera.cy_px)
     noise = gtsam.noiseModel.Robust.Create(
         gtsam.noiseModel.mEstimator.Huber.Create(settings.huber_k),
@@ -67,7 +60,7 @@ def solve_graph(
     )
     prior = gtsam.noiseModel.Isotropic.Sigma(3, settings.landmark_sigma_m)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    values.insert(X(0), gtsam.Pose3(wTc))
+    values.insert(X(0), gtsam.Pose3(guess.wTc))
     for i in range(n):
         key = L(i)
         values.insert(key, points_w[i])
@@ -82,13 +75,13 @@ def solve_graph(
         solved = np.asarray(result.atPose3(X(0)).matrix())
         error = graph.error(result)
         if iterations >= settings.max_iterations:
-            return failure(n, iterations, f"not converged in {iterations} iterations")
+            return no_solution(n, f"not converged in {iterations} iterations", iterations)
         if not np.isfinite(solved).all() or not np.isfinite(error):
-            return failure(n, iterations, "not finite")
+            return no_solution(n, "not finite", iterations)
         if error > graph.error(values) * (1 + 1e-6) + 1e-6:
-            return failure(n, iterations, "diverged")
+            return no_solution(n, "diverged", iterations)
         covariance = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(X(0)))
     except RuntimeError:  # GTSAM's way of saying that the system is singular
-        return failure(n, 0, "singular")
+        return no_solution(n, "singular")
     residual = reprojection_px(camera, solved, points_w, pinhole_px)
-    return PoseSolution(solved, covariance, residual, residual < settings.inlier_px, iterations)
+    return pose_alone(guess.time_ns, solved, covariance, residual, settings.inlier_px, iterations)

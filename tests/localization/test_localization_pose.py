@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ground_station.geometry import poses
+from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.pose_direct import solve_direct
 from ground_station.localization.pose_graph import reprojection_px, solve_graph
 from ground_station.localization.settings import PoseSettings
@@ -31,35 +32,47 @@ def _scene(camera, rng, count=300, noise_px=1.0, outliers=0.0, landmark_noise_m=
     return points + rng.normal(0, landmark_noise_m, points.shape), pixels, wrong
 
 
+def run(solve, guess, points, pixels, camera, settings):
+    none = np.zeros(len(points))
+    observations = LandmarkObservations(
+        points, pixels, none, none + settings.sigma_px, np.zeros((len(points), 3, 3)), none + 1,
+        np.zeros_like(points),
+    )  # fmt: skip
+    guess = Kinematics(0, guess, np.zeros(6), np.zeros((12, 12)))
+    return solve(guess, observations, camera, settings)
+
+
 @pytest.mark.parametrize("solve", SOLVERS)
 def test_a_pose_is_found_among_a_fifth_of_outliers(room, solve):
     rng = np.random.default_rng(11)
     points, pixels, wrong = _scene(room.camera, rng, outliers=0.2)
-    solution = solve(GUESS, points, pixels, room.camera, PoseSettings())
-    assert solution.wTc is not None, solution.reason
-    error = poses.log(poses.inverse(TRUE) @ solution.wTc)
+    solution = run(solve, GUESS, points, pixels, room.camera, PoseSettings())
+    assert solution.state is not None, solution.reason
+    error = poses.log(poses.inverse(TRUE) @ solution.state.wTc)
     assert np.linalg.norm(error[:3]) < np.deg2rad(0.1)
     assert np.linalg.norm(error[3:]) < 0.01
     assert solution.inlier[~wrong].mean() > 0.99
     assert solution.inlier[wrong].mean() < 0.2
-    assert np.abs(solution.wTc[:3, :3] @ solution.wTc[:3, :3].T - np.eye(3)).max() < 1e-9
+    assert (
+        np.abs(solution.state.wTc[:3, :3] @ solution.state.wTc[:3, :3].T - np.eye(3)).max() < 1e-9
+    )
 
 
 def test_both_solvers_find_the_same_optimum_when_landmarks_are_certain(room):
     rng = np.random.default_rng(12)
     points, pixels, _ = _scene(room.camera, rng, outliers=0.2)
     settings = PoseSettings(landmark_sigma_m=1e-5)
-    graph, direct = (solve(GUESS, points, pixels, room.camera, settings) for solve in SOLVERS)
-    apart = poses.log(poses.inverse(graph.wTc) @ direct.wTc)
+    graph, direct = (run(solve, GUESS, points, pixels, room.camera, settings) for solve in SOLVERS)
+    apart = poses.log(poses.inverse(graph.state.wTc) @ direct.state.wTc)
     assert np.abs(apart).max() < 1e-4
-    assert np.allclose(graph.covariance, direct.covariance, rtol=0.02, atol=1e-9)
+    assert np.allclose(graph.state.covariance, direct.state.covariance, rtol=0.02, atol=1e-9)
 
 
 def test_the_pose_is_opencvs_when_nothing_is_wrong(room):
     rng = np.random.default_rng(13)
     points, pixels, _ = _scene(room.camera, rng, noise_px=0.3)
     settings = PoseSettings(landmark_sigma_m=1e-5, huber_k=100)
-    ours = solve_direct(GUESS, points, pixels, room.camera, settings).wTc
+    ours = run(solve_direct, GUESS, points, pixels, room.camera, settings).state.wTc
     found, rvec, tvec = cv2.solvePnP(points, pixels, room.camera.matrix, None)
     assert found
     theirs = poses.inverse(poses.pose(cv2.Rodrigues(rvec)[0], tvec.ravel()))
@@ -73,8 +86,8 @@ def test_four_hundred_observations_have_the_optimum_of_the_graph(room, seed):
     points, pixels, _ = _scene(room.camera, rng, 400, outliers=0.2, landmark_noise_m=0.005)
     for landmark_sigma_m, bound_m in ((1e-5, 1e-4), (0.01, 1e-4)):
         settings = PoseSettings(landmark_sigma_m=landmark_sigma_m, sigma_px=2.0)
-        graph, direct = (s(GUESS, points, pixels, room.camera, settings) for s in SOLVERS)
-        assert np.linalg.norm(graph.wTc[:3, 3] - direct.wTc[:3, 3]) < bound_m
+        graph, direct = (run(s, GUESS, points, pixels, room.camera, settings) for s in SOLVERS)
+        assert np.linalg.norm(graph.state.wTc[:3, 3] - direct.state.wTc[:3, 3]) < bound_m
 
 
 @pytest.mark.parametrize(("solve", "runs"), [(solve_graph, 40), (solve_direct, 200)])
@@ -84,9 +97,9 @@ def test_the_covariance_is_that_of_repeated_trials(room, solve, runs):
     for seed in range(runs):
         rng = np.random.default_rng(1000 + seed)
         points, pixels, _ = _scene(room.camera, rng, count=60, landmark_noise_m=0.01)
-        solution = solve(TRUE, points, pixels, room.camera, settings)
-        errors.append(poses.log(poses.inverse(solution.wTc) @ TRUE))
-        stated.append(np.diag(solution.covariance))
+        solution = run(solve, TRUE, points, pixels, room.camera, settings)
+        errors.append(poses.log(poses.inverse(solution.state.wTc) @ TRUE))
+        stated.append(np.diag(solution.state.covariance)[:6])
     ratio = np.square(errors).mean(axis=0) / np.mean(stated, axis=0)
     assert (ratio > 0.45).all() and (ratio < 2.0).all(), ratio
 
@@ -96,11 +109,11 @@ def test_what_has_no_solution_is_a_failure_and_no_exception(room, solve):
     point = poses.transform(TRUE, np.array([[0.0, 0.0, 3.0]]))
     points, pixels = np.repeat(point, 20, axis=0), np.full((20, 2), 200.0)
     settings = PoseSettings(landmark_sigma_m=1e-5)
-    same = solve(TRUE, points, pixels, room.camera, settings)
-    assert same.wTc is None and same.reason
+    same = run(solve, TRUE, points, pixels, room.camera, settings)
+    assert same.state is None and same.reason
     behind = poses.transform(TRUE, np.array([[0.1, 0.0, -3.0]])) + np.zeros((20, 3))
-    solution = solve(TRUE, behind, pixels, room.camera, settings)
-    assert solution.wTc is None and solution.reason
+    solution = run(solve, TRUE, behind, pixels, room.camera, settings)
+    assert solution.state is None and solution.reason
     assert not solution.inlier.any()
 
 
@@ -112,7 +125,10 @@ def test_rejecting_outliers_brings_the_pose_closer(room):
     strict = dataclasses.replace(plain, reject_outliers=True)
     before, after = (
         np.linalg.norm(
-            poses.log(poses.inverse(TRUE) @ solve_direct(GUESS, points, pixels, room.camera, s).wTc)
+            poses.log(
+                poses.inverse(TRUE)
+                @ run(solve_direct, GUESS, points, pixels, room.camera, s).state.wTc
+            )
         )
         for s in (plain, strict)
     )

@@ -276,11 +276,11 @@ def test_with_nothing_predicted_it_is_the_direct_pose():
     settings = dataclasses.replace(SETTINGS, sigma_px=1.0, reject_outliers=False)
     unknown = dataclasses.replace(predicted, covariance=diffuse)
     rolling = solve_rolling(unknown, observations, CAMERA, settings)
-    direct = solve_direct(
-        predicted.wTc, observations.points_m, observations.pinhole_px, CAMERA, settings
+    direct = solve_direct(predicted, observations, CAMERA, settings)
+    assert np.abs(rolling.state.wTc - direct.state.wTc).max() < 1e-5
+    assert np.allclose(
+        rolling.state.covariance[:6, :6], direct.state.covariance[:6, :6], rtol=1e-3, atol=1e-9
     )
-    assert np.abs(rolling.state.wTc - direct.wTc).max() < 1e-5
-    assert np.allclose(rolling.state.covariance[:6, :6], direct.covariance, rtol=1e-3, atol=1e-9)
 
 
 def test_two_observations_do_beside_a_prediction():
