@@ -20,8 +20,7 @@ from ground_station.localization.estimate import PoseEstimate
 from ground_station.localization.extraction import extractor_for
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
 from ground_station.localization.localizer import Localizer
-from ground_station.localization.pose_direct import solve_direct
-from ground_station.localization.pose_graph import solve_graph
+from ground_station.localization.pose_alone import solve_direct, solve_graph
 from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import (
     PRESETS,

@@ -11,8 +11,7 @@ from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
 from ground_station.localization.motion import MotionModel
-from ground_station.localization.pose_direct import solve_direct
-from ground_station.localization.pose_graph import solve_graph
+from ground_station.localization.pose_alone import solve_direct, solve_graph
 from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import LocalizerSettings, PoseSettings
 from ground_station.localization.smoother import FixedLagSmoother

@@ -10,8 +10,7 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
-from ground_station.localization.pose_direct import solve_direct
-from ground_station.localization.pose_graph import reprojection_px, solve_graph
+from ground_station.localization.pose_alone import reprojection_px, solve_direct, solve_graph
 from ground_station.localization.settings import PoseSettings
 
 SOLVERS = [solve_graph, solve_direct]

@@ -13,7 +13,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA as CAMERA
 from ground_station.localization import pose_rolling
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
-from ground_station.localization.pose_direct import solve_direct
+from ground_station.localization.pose_alone import solve_direct
 from ground_station.localization.pose_newton import Prior, Reprojection
 from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import PoseSettings
