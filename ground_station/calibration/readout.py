@@ -23,9 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.arrays import F64
 from ground_station.calibration import lens
-from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
-from ground_station.calibration.views import View
+from ground_station.calibration.views import View, lagrange
 
 FRAMES = 4
 """Of one window. With four, the errors of a cubic's velocity at its frames cancel each other."""

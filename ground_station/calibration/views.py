@@ -9,7 +9,6 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.calibration.detection import BoardObservation, apply_homography
-from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.lens import Points
 
 MAX_GAP_S = 0.15
@@ -115,3 +114,17 @@ def _slope(observations: list[BoardObservation], k: int, near: range, points_m: 
     _, slopes = lagrange(nodes_s, np.zeros(1))
     places = np.array([apply_homography(observations[j].H, points_m[:, :2]) for j in near])
     return np.asarray(np.einsum("j,jni->ni", slopes[0], places))
+
+
+def lagrange(nodes_s: F64, times_s: F64) -> tuple[F64, F64]:
+    """Lagrange's polynomials of M nodes at N times (N, M), and their derivatives (N, M)."""
+    m = len(nodes_s)
+    off = times_s[:, None] - nodes_s  # (N, M)
+    values, slopes = np.empty_like(off), np.zeros_like(off)
+    for k in range(m):
+        others = [j for j in range(m) if j != k]
+        scale = 1 / np.prod(nodes_s[k] - nodes_s[others])
+        values[:, k] = off[:, others].prod(axis=1) * scale
+        for i in others:
+            slopes[:, k] += off[:, [j for j in others if j != i]].prod(axis=1) * scale
+    return values, slopes

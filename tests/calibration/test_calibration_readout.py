@@ -10,9 +10,8 @@ from observed import BOARD, gathered, observed
 from ground_station.calibration.calibrate import _known_readout_s, calibrate
 from ground_station.calibration.detection import BoardFinder
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.interpolation import lagrange
 from ground_station.calibration.readout import readout_of
-from ground_station.calibration.views import views_of
+from ground_station.calibration.views import lagrange, views_of
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
 FINDER = BoardFinder(BOARD, BOARD.points_m())
