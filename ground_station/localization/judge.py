@@ -39,16 +39,12 @@ class Judge:
     def __init__(self, settings: StateSettings) -> None:
         self.settings = settings
         self.state = State.INITIALIZING
-        self._last_solved_ns: int | None = None
+        self.last_solved_ns: int | None = None
+        """The time of the last frame that was solved."""
         self._good = 0
         self._owed = 0
         self._owed_for = ""
         self._doubtful_ns: int | None = None
-
-    @property
-    def last_solved_ns(self) -> int | None:
-        """The time of the last frame that was solved."""
-        return self._last_solved_ns
 
     @property
     def doubtful(self) -> bool:
@@ -70,7 +66,7 @@ class Judge:
 
     def solved(self, time_ns: int, evidence: Evidence) -> tuple[State, str]:
         """The state of a solved frame, and what is wrong with it if it is not TRACKING."""
-        self._last_solved_ns = time_ns
+        self.last_solved_ns = time_ns
         fault = self._fault(time_ns, evidence)
         if fault:
             self._good = 0
@@ -123,8 +119,8 @@ class Judge:
 
     def after_gap(self, time_ns: int, patience_s: float | None = None) -> State:
         """What an unsolved frame would leave behind; changes nothing."""
-        if self._last_solved_ns is None:
+        if self.last_solved_ns is None:
             return State.INITIALIZING
         patience_s = self.settings.lost_after_s if patience_s is None else patience_s
-        recent = time_ns - self._last_solved_ns <= patience_s * 1e9
+        recent = time_ns - self.last_solved_ns <= patience_s * 1e9
         return State.DEGRADED if recent and self.state is not State.LOST else State.LOST

@@ -50,16 +50,12 @@ class FixedLagSmoother:
         self.settings = settings
         self._keep = keep
         self.failures = 0
-        self._latest: Kinematics | None = None
+        self.latest: Kinematics | None = None
+        """The newest state, estimated from its own frame and those before; None before a start."""
         self._expected: Step | None = None
         self._left: list[Kinematics] = []
         self._adaptation = _Adaptation(settings)
         self._clear()
-
-    @property
-    def latest(self) -> Kinematics | None:
-        """The newest state, estimated from its own frame and those before; None before a start."""
-        return self._latest
 
     @property
     def density(self) -> Density:
@@ -83,11 +79,11 @@ class FixedLagSmoother:
         is changed: a frame that gives no solution stretches the next one's prediction.
         Raises `ValueError` when the time is before the newest state's.
         """
-        if self._latest is None:
+        if self.latest is None:
             return None
         if wild:
-            return self._advance(self._latest, time_ns, self._adaptation.limit).state
-        return self._expect(self._latest, time_ns).state
+            return self._advance(self.latest, time_ns, self._adaptation.limit).state
+        return self._expect(self.latest, time_ns).state
 
     def update(self, time_ns: int, solution: Solution, wild: bool = False) -> Kinematics:
         """Adds a solved frame and returns the newest state with its covariance, causal.
@@ -102,7 +98,7 @@ class FixedLagSmoother:
         if state is None:
             raise ValueError("a solution without a state can't be added")
         state = Kinematics(time_ns, state.wTc, state.twist, state.covariance)
-        latest = self._latest
+        latest = self.latest
         if latest is None:
             self._check(state)
             return self._start(state)
@@ -131,7 +127,7 @@ class FixedLagSmoother:
         For a recording's end, or before a restart from elsewhere.
         """
         self._drain()
-        self._latest = None
+        self.latest = None
         return self.smoothed()
 
     @staticmethod
@@ -164,7 +160,7 @@ class FixedLagSmoother:
         state = Kinematics(state.time_ns, state.wTc, state.twist, covariance)
         prior = gtsam.HessianFactor(X(0), information, _ZERO, 0.0)
         self._push(state, [prior])
-        self._latest, self._expected = state, None
+        self.latest, self._expected = state, None
         self._up = state.wTc[2, :3].copy()
         return state
 
@@ -205,7 +201,7 @@ class FixedLagSmoother:
         result = self._estimate(self._newest)
         np.linalg.cholesky(result.covariance)  # raises where it is no covariance
         self._sound = True
-        self._latest, self._expected = result, None
+        self.latest, self._expected = result, None
         self._learn_rest(result, (state.time_ns - latest.time_ns) / 1e9)
         return result
 
