@@ -56,6 +56,9 @@ uninstall-service:  ## Take the service away; configuration and recordings stay
 # In the order that tests/conftest.py makes.
 SPREAD = --dist loadfile --no-loadscope-reorder
 
+# Bytecode of their own asserts is what the phases' eight processes would else make eight times.
+test: export PYTHONDONTWRITEBYTECODE :=
+
 test: setup  ## Run the tests of every room
 	@sh tests/tools.sh
 	@failed=0; \

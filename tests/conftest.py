@@ -38,6 +38,17 @@ def _cache_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
         yield
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Whether a phase of `make test` would leave a folder or file out whole: reading is slow."""
+    phase = config.getoption("markexpr")
+    room, *within = (*collection_path.relative_to(Path(__file__).parent).parts, "")
+    if phase == "alone" and collection_path.suffix == ".py":
+        return "mark.alone" not in collection_path.read_text() or None
+    if phase in ("beside", "not beside and not alone") and any(within):
+        return (room in _ROOMS) != (phase == "beside") or None
+    return None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks what may run beside other tests, all of these rooms but what measures.
 
