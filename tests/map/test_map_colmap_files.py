@@ -80,7 +80,7 @@ def test_what_contradicts_itself_is_refused(
 def test_a_count_that_takes_for_ever_is_refused_when_its_time_is_over(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(colmap_files, "_SECONDS", 3)
+    monkeypatch.setattr(colmap_files, "_SECONDS", 1)
     data = bytearray((copy / "points3D.bin").read_bytes())
     struct.pack_into("<Q", data, 51, 1 << 60)  # of the observations of its one point
     (copy / "points3D.bin").write_bytes(bytes(data))

@@ -129,7 +129,7 @@ def test_what_was_done_is_not_done_again(database, whole, left, monkeypatch):
 def test_a_snapshot_that_was_cut_is_not_taken(database, whole, left):
     newest = sorted((left / "snapshots").iterdir())[-1]
     points = newest / "points3D.bin"
-    points.write_bytes(points.read_bytes()[:-100])
+    points.write_bytes(points.read_bytes()[:-1])  # more, and COLMAP asks for 4 GB first
     (left / "snapshots" / "00-999999.part").mkdir()
     _same(_run(database, left), whole)
 
