@@ -225,38 +225,36 @@ def test_a_share_that_is_none_is_refused(cores: float) -> None:
         pass
 
 
-def test_a_flight_over_a_link_with_a_firmware_held_back_is_flown_and_told() -> None:
+def test_a_flight_over_a_link_with_both_sides_held_back_is_flown_and_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The ground's share is receiver and localizer, and not the firmware, which has its own."""
+    programs: list[list[str]] = []
+
+    @contextlib.contextmanager
+    def told(pid: int, cores: float, spared: tuple[int, ...]) -> Iterator[str]:
+        with throttled(pid, cores, spared) as by:
+            names = []
+            for held in tree(pid, spared):
+                words = Path(f"/proc/{held}/cmdline").read_text().split("\0")
+                names.append(words[2] if words[1] == "-m" else Path(words[1]).name)
+            programs.append(sorted(names))
+            yield by
+
+    monkeypatch.setattr(limits_stand, "throttled", told)
     flight = Flight(ATRIUM / "flight.mcap", ATRIUM, 2.0)
-    under = Conditions({"delay_s": 0.01}, payload_cores=0.9, rate_hz=5.0)
+    under = Conditions({"delay_s": 0.01}, payload_cores=0.9, ground_cores=0.9, rate_hz=5.0)
     measured = measure(flight, under, seed=1)
-    assert measured.why == "" and measured.held_by == method()
+    assert measured.why == "" and measured.held_by == f"{method()}, {method()}"
+    assert programs == [
+        ["ground_station.service.intake", "ground_station.service.localizing", "limits_trial.py"],
+        ["pi_firmware"],
+    ]
     outcome = Outcome(**measured.outcome)
     assert outcome.due >= 1 and outcome.received and outcome.ground_cores
     assert 0.0 <= measured.share == outcome.share <= 1.0
     assert measured.link["received"] == measured.link["delayed"] > 10
     assert measured.others_cores is not None and measured.took_s > 2.0
-
-
-def test_receiver_and_localizer_are_held_back_and_not_the_firmware(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    programs: list[str] = []
-
-    @contextlib.contextmanager
-    def told(pid: int, cores: float, spared: tuple[int, ...]) -> Iterator[str]:
-        with throttled(pid, cores, spared) as by:
-            for held in tree(pid, spared):
-                words = Path(f"/proc/{held}/cmdline").read_text().split("\0")
-                programs.append(words[2] if words[1] == "-m" else Path(words[1]).name)
-            yield by
-
-    monkeypatch.setattr(limits_stand, "throttled", told)
-    under = Conditions(ground_cores=0.9, rate_hz=5.0)
-    measured = measure(Flight(ATRIUM / "flight.mcap", ATRIUM, 2.0), under, seed=1)
-    assert measured.held_by == method() and measured.why == ""
-    assert sorted(programs) == [
-        "ground_station.service.intake", "ground_station.service.localizing", "limits_trial.py",
-    ]  # fmt: skip
 
 
 def test_a_recording_that_is_missing_is_no_limit(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from ground_station.replay.replay import ReplayResult, replay, settings_for
 from ground_station.replay.rig import LOOPBACK, Rig
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
-FLOWN_S = 3.0
+FLOWN_S = 1.5
 
 
 def stepped(*payload: str, preset: str = "default", rig: Rig = LOOPBACK) -> ReplayResult:
