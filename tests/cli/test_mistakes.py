@@ -62,6 +62,8 @@ blimp localize walk.mp4 --map empty --out e
     blimp map build INPUT --out empty
 blimp localize walk.mp4 --map cut-map --out e
     copy the map again, or build it again
+blimp localize walk.mp4 --map other-map --out e
+    is not here (there are: lark, orb, rootsift, wren
 blimp localize upright.mp4 --map atrium --out e
     calibrate with pictures that stand like
 blimp localize wide.mp4 --map atrium --out e
@@ -90,6 +92,10 @@ blimp localize empty.mcap --map atrium --out e
     copy it again
 blimp localize notes.mcap --map atrium --out e
     blimp import makes one of a video
+blimp map build notes.mcap --out m
+    notes.mcap: no MCAP recording
+blimp map build cut.mcap --out m
+    cut.mcap: cut (the file ends before its footer); no whole frame
 blimp map build upright.mp4 --camera camera.toml --out m
     use the file as the camera wrote it
 blimp map build walk.mp4 --camera half.toml --out m
@@ -152,6 +158,8 @@ blimp evaluate poses.txt late.txt
     truth: 100.000 to 102.000 s
 blimp replay
     a RECORDING and --map are needed
+blimp replay nosuch.mcap --map atrium
+    nosuch.mcap: No such file
 blimp replay --compare nosuch atrium
     blimp replay RECORDING --map MAP --out
 blimp replay {ATRIUM}/flight.mcap --map empty
@@ -243,6 +251,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ATRIUM, here / "atrium", ignore=map_files)
     shutil.copytree(here / "atrium", here / "cut-map")
     os.truncate(here / "cut-map/landmarks.safetensors", 1000)
+    shutil.copytree(here / "atrium", here / "other-map")
+    told = (here / "other-map/map.toml").read_text()
+    (here / "other-map/map.toml").write_text(told.replace('name = "rootsift"', 'name = "nobodys"'))
     (here / "empty").mkdir()
     pose = "{} 0 0 0 0 0 0 1\n"
     for name, text in {
@@ -262,6 +273,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }.items():
         (here / name).write_text(text)
     os.truncate(here / "card.img", 8 << 20)
+    with (ATRIUM / "flight.mcap").open("rb") as flight:
+        (here / "cut.mcap").write_bytes(flight.read(100))
     return here
 
 
