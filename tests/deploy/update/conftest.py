@@ -49,9 +49,3 @@ def git(tmp_path: Path) -> Callable[..., str]:
     run("commit", "-qm", "first")
     (tmp_path / "pi_firmware/untracked.py").write_text("not of the release\n")
     return run
-
-
-@pytest.fixture(autouse=True)
-def quick_sync(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole machine's disks are not waited for; that it is called counts, as in `power`."""
-    monkeypatch.setattr(os, "sync", lambda: None)
