@@ -268,6 +268,28 @@ def test_the_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
     assert at(20.0, 9.0) == 0  # reception
 
 
+def test_unsteady_light_and_exposure_are_shown_and_told(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    given = "--exposure-steps 0.2:1,0.4:-1 --light-steps 0.5:0.01 --flicker 0.5"
+    args = parser.parse_args(["--out", "f.mcap", *given.split(), "--longest-exposure-s", "0.002"])
+    asked = command.settings_from(args)
+    names = ("exposure_steps", "light_steps", "flicker", "longest_exposure_s")
+    out = tmp_path / "f.mcap"
+    simulate(quick_settings(out, **{name: getattr(asked, name) for name in names}))
+    reader = RecordingReader(out)
+    info = [frame for _, frame in reader.json(FRAME_INFO_TOPIC)]
+    taken = np.array([frame["exposure_s"] * frame["gain"] for frame in info])
+    assert all(frame["exposure_s"] == 0.002 < 0.002 * frame["gain"] for frame in info)
+    # Auto exposure drifts a little as the camera moves.
+    assert np.log2(taken[1:3] / taken[:2]) == pytest.approx([1, -2], abs=0.3)
+    shown = [picture.mean() for picture in pictures(out)]
+    assert shown[1] > 1.15 * shown[0] and shown[2] < 0.75 * shown[0] and shown[3] < 0.2 * shown[0]
+    reader.topics()
+    simulation = reader.metadata["simulation"]
+    assert [simulation[name] for name in names] == ["0.2:1,0.4:-1", "0.5:0.01", "0.5", "0.002"]
+
+
 def test_the_light_changes_colour_contrast_and_exposure(flight: Path, tmp_path: Path) -> None:
     sunset = tmp_path / "sunset.mcap"
     simulate(quick_settings(sunset, light="sunset"))

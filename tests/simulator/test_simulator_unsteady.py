@@ -1,22 +1,14 @@
-"""Exposure steps, lights that go off and flicker: in the picture, row by row, and in the file."""
+"""Exposure steps, lights that go off and flicker: row by row."""
 
 from __future__ import annotations
-
-import argparse
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.simulator import command
 from ground_station.simulator.imaging import row_offsets_s
 from ground_station.simulator.scene import SimulatorError
-from ground_station.simulator.simulate import simulate
 from ground_station.simulator.unsteady import unsteady
-from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
-from tests.simulator.conftest import quick_settings
-from tests.simulator.test_simulator_recording import pictures
 
 
 def test_steps_hold_from_their_time_on() -> None:
@@ -61,25 +53,3 @@ def test_what_is_meant_is_said(given: tuple[str, ...], said: str) -> None:
     with pytest.raises(SimulatorError) as refused:
         unsteady(*given)  # type: ignore[arg-type]
     assert said in str(refused.value)
-
-
-def test_the_recording_shows_them_and_tells_its_exposures(tmp_path: Path) -> None:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    given = "--exposure-steps 0.2:1,0.4:-1 --light-steps 0.5:0.01 --flicker 0.5"
-    args = parser.parse_args(["--out", "f.mcap", *given.split(), "--longest-exposure-s", "0.002"])
-    asked = command.settings_from(args)
-    names = ("exposure_steps", "light_steps", "flicker", "longest_exposure_s")
-    out = tmp_path / "f.mcap"
-    simulate(quick_settings(out, **{name: getattr(asked, name) for name in names}))
-    reader = RecordingReader(out)
-    info = [frame for _, frame in reader.json(FRAME_INFO_TOPIC)]
-    taken = np.array([frame["exposure_s"] * frame["gain"] for frame in info])
-    assert all(frame["exposure_s"] == 0.002 < 0.002 * frame["gain"] for frame in info)
-    # Auto exposure drifts a little as the camera moves.
-    assert np.log2(taken[1:3] / taken[:2]) == pytest.approx([1, -2], abs=0.3)
-    shown = [picture.mean() for picture in pictures(out)]
-    assert shown[1] > 1.15 * shown[0] and shown[2] < 0.75 * shown[0] and shown[3] < 0.2 * shown[0]
-    reader.topics()
-    simulation = reader.metadata["simulation"]
-    assert [simulation[name] for name in names] == ["0.2:1,0.4:-1", "0.5:0.01", "0.5", "0.002"]
