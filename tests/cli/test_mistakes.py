@@ -188,6 +188,14 @@ blimp record --lan
     blimp keys init && blimp keys ground main
 blimp record --port {UDP}
     blimp doctor says who has it
+blimp record --port 70000
+    'video.port' is 70000; allowed: 0 to 65535
+blimp record --port 0 {ANY} --camera nosuch.toml
+    {CALIBRATE}
+blimp record --port 0 {ANY} --out /proc/nothing/here
+    recording.folder '/proc/nothing/here': No such file or directory
+blimp record --port 0 {ANY} --set video.host=192.0.2.1
+    video on 192.0.2.1 port 0: Cannot assign requested address
 blimp record --seconds 0
     must be more than 0
 blimp command blimp-1 dance
@@ -297,6 +305,7 @@ def test_a_mistake_gets_one_line_that_says_what_to_do(
     places = {
         "ATRIUM": ATRIUM,
         "UDP": taken_port,
+        "ANY": '--set telemetry.listen=["tcp/127.0.0.1:0"]',
         "TCP": LISTEN.format("tcp"),
         "TLS": LISTEN.format("tls"),
     }

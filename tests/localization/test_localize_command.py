@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from ground_station import cli
 from ground_station.errors import CameraError, InputError
 from ground_station.features.extractors import create
 from ground_station.geometry import poses
@@ -209,7 +208,6 @@ def test_an_interrupted_run_writes_what_was_finished(flight, tmp_path, monkeypat
     [
         (["--min-entropy-bits", "9"], "min_entropy_bits"),
         (["--init", "absent.txt"], "absent.txt"),
-        (["--map", "absent"], "absent"),
         (["--range", "90:95"], "90:95"),
         (["--settings", "absent.toml"], "absent.toml"),
     ],
@@ -233,19 +231,6 @@ def test_settings_from_a_file_are_checked(flight, tmp_path):
     file.write_text("[association]\nradius = 3\n")
     with pytest.raises(ConfigError, match=r"association\.radius"):
         command.run(_args(flight, tmp_path, "--settings", str(file)))
-
-
-def test_a_map_of_other_features_ends_the_command_with_status_2(flight, tmp_path, capsys):
-    from shutil import copytree
-
-    other = tmp_path / "map"
-    copytree(flight / "map", other)
-    text = (other / "map.toml").read_text()
-    (other / "map.toml").write_text(text.replace('name = "rootsift"', 'name = "superpoint"'))
-    args = [str(flight / "frames"), "--map", str(other), "--out", str(tmp_path / "e.txt")]
-    assert cli.main(["localize", *args]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and "superpoint" in lines[0] and "rootsift" in lines[0]
 
 
 def test_help_imports_nothing_heavy():

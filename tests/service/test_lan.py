@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -110,13 +109,3 @@ def test_a_recording_without_the_service_hears_what_the_service_would(
     with pytest.raises(Started):
         cli.main(["record", "--lan", "wlan0", "--out", "flights"])
     assert "telemetry tcp 7447 (TLS)" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("words", [["--lan", "nosuch0"], ["--lan", "--demo"]])
-def test_a_refusal_is_one_line(words: list[str], tmp_path: Path) -> None:
-    run = subprocess.run(
-        [BLIMP, "serve", *words], capture_output=True, text=True, timeout=60,
-        env={"XDG_DATA_HOME": str(tmp_path)}, check=False,
-    )  # fmt: skip
-    assert run.returncode == 2 and run.stdout == ""
-    assert run.stderr.count("\n") == 1 and run.stderr.startswith("blimp serve: --"), run.stderr
