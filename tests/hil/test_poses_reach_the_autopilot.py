@@ -2,76 +2,70 @@
 
 from __future__ import annotations
 
-import os
-import pty
-import select
+import contextlib
+import sys
 import threading
-import tty
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
 
 from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
 from ground_station.replay import replay
 
+sys.path.append(str(Path(__file__).parents[1] / "pi_firmware"))
+from vehicle import Vehicle
+
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 
 
-class Vehicle:
-    """An autopilot's end of a serial line, which keeps what it is told; a context manager."""
+@contextlib.contextmanager
+def listening(line: Path) -> Iterator[list[Any]]:
+    """An autopilot's end of a serial line, and the poses that it is told."""
+    vehicle, closing = Vehicle(line), threading.Event()
 
-    def __init__(self) -> None:
-        self.master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.path = os.ttyname(self._slave)
-        self.estimates: list[Any] = []
-        self._coder = mavlink.MAVLink(None)
-        self._coder.robust_parsing = True
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+    def listen() -> None:
+        while not closing.is_set():
+            vehicle.listen()
 
-    def __enter__(self) -> Vehicle:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._closing.set()
-        self._thread.join()
-        os.close(self.master)
-        os.close(self._slave)
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            if select.select([self.master], [], [], 0.05)[0]:
-                for message in self._coder.parse_buffer(os.read(self.master, 4096)) or []:
-                    if message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
-                        self.estimates.append(message)
+    thread = threading.Thread(target=listen, daemon=True)
+    thread.start()
+    poses: list[Any] = []
+    try:
+        yield poses
+    finally:
+        closing.set()
+        thread.join()
+        vehicle.unplug()
+    kinds = ("ODOMETRY", "VISION_POSITION_ESTIMATE")
+    poses += [message for message in vehicle.heard if message.get_type() in kinds]
 
 
-def test_poses_of_the_localizer_reach_the_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_of_the_localizer_reach_the_autopilot(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """They are where the truth is, in the autopilot's frame, and the payload hears of its link."""
     settings = replay.settings_for(
         "default", SAMPLE / "flight.mcap", start_s=2.0, duration_s=3.0, rate_hz=10.0, stepped=True
     )
     config = replay._payload_config
-    with Vehicle() as vehicle:
+    with listening(tmp_path / "line") as told:
         # However slow the machine: a pose that came late is sent all the same.
-        autopilot = {"uri": f"serial:{vehicle.path}?baud=921600", "max_age_s": 5.0}
+        autopilot = {"uri": f"serial:{tmp_path / 'line'}?baud=921600", "max_age_s": 5.0}
         monkeypatch.setattr(
             replay, "_payload_config", lambda *given: config(*given) | {"autopilot": autopilot}
         )
         result = replay.replay(store.load(SAMPLE), settings)
     localized = [frame for frame in result.live.frames if frame.estimate.localized]
     # The last ones meet a payload that has ended, on a slow machine more of them.
-    assert len(localized) >= 15 and 3 <= len(vehicle.estimates) <= len(localized)
+    assert len(localized) >= 15 and 3 <= len(told) <= len(localized)
     by_clock = {frame.clock_ns // 1000: frame for frame in localized}
     truth = trajectory_of(SAMPLE / "flight.mcap")
     speeds: list[tuple[float, float]] = []
-    for message in vehicle.estimates:
+    for message in told:
         frame = by_clock[
             getattr(message, "usec", 0) or message.time_usec
         ]  # of the payload's clock at capture
@@ -88,8 +82,8 @@ def test_poses_of_the_localizer_reach_the_autopilot(monkeypatch: pytest.MonkeyPa
         ahead = np.linalg.norm([message.vx, message.vy, message.vz])
         speeds.append((ahead, speed_mps))
     assert len(speeds) >= 3
-    told, flown = np.array(speeds).T
-    assert abs(np.median(told - flown)) < 0.1
+    said, flown = np.array(speeds).T
+    assert abs(np.median(said - flown)) < 0.1
     health = result.live.payload.health
     assert health is not None and health.round_trip_s is not None and health.round_trip_s < 10
     assert health.lost in (None, 0.0)

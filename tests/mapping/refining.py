@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from built_scene import look_at
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
@@ -21,15 +22,6 @@ from ground_station.mapping.sfm import adjustment
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = MappingSettings(threads=2)
-
-
-def look_at(position, target):
-    """wTc of a camera at `position` that looks at `target`, z up in the world."""
-    forward = np.asarray(target, float) - position
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return poses.pose(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
 def _along(t_s: np.ndarray, speed_m_s: float = 0.8) -> np.ndarray:
@@ -121,7 +113,7 @@ def _localized(flight: FlightObservations, map_: store.Map) -> FlightObservation
     return dataclasses.replace(flight, wTc=np.array(found))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def _world(tmp_path_factory) -> World:
     """Eight keyframes of a room, taken close together: what is far is badly known along the view.
 

@@ -14,7 +14,6 @@ from pi_firmware.settings import BatterySettings
 from pi_firmware.wire.errors import SourceError
 
 NOW = 10**18
-DATASHEET_SHUNT = ina.Shunt(resistance_ohm=0.002, max_A=2**15 * 1e-3)  # 1 mA a bit
 
 
 class Recorder(simulated.FakeBus):

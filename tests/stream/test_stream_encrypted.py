@@ -2,11 +2,13 @@
 
 import json
 import socket
-import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from impaired_link import ImpairedLink
 from numbered_flight import GOP, capture_ns, encoded, number_in, stamped, start_payload
 from receiving import Receiver
 
@@ -25,37 +27,12 @@ FRAMES = 30
 LIMIT_S = 30.0
 
 
-class Eavesdropper:
-    """Relays datagrams to another port of this machine and keeps them; a context manager."""
-
-    def __init__(self, to_port: int) -> None:
-        self.heard: list[bytes] = []
-        self._to = ("127.0.0.1", to_port)
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-        self._socket.bind(("127.0.0.1", 0))
-        self._socket.settimeout(0.05)
-        self.port = self._socket.getsockname()[1]
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> "Eavesdropper":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._closing.set()
-        self._thread.join()
-        self._socket.close()
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            try:
-                datagram = self._socket.recv(65535)
-            except TimeoutError:
-                continue
-            self.heard.append(datagram)
-            self._socket.sendto(datagram, self._to)
+@contextmanager
+def eavesdropper(to_port: int) -> Iterator[tuple[int, list[bytes]]]:
+    """A port whose datagrams go on to another one of this machine, and those so far."""
+    heard: list[bytes] = []
+    with ImpairedLink(to_port, tap=lambda datagram, _: heard.append(datagram)) as air:
+        yield air.port, heard
 
 
 def take(receiver: Receiver, count: int) -> list[ReceivedFrame]:
@@ -91,9 +68,9 @@ def assert_secret(heard: list[bytes], key: bytes) -> None:
 def test_a_link_with_a_key_sends_srtp_within_its_mtu(mtu_bytes: int) -> None:
     with (
         Receiver(0, queue_frames=FRAMES, srtp_keys={"blimp-1": KEY}) as receiver,
-        Eavesdropper(receiver.port) as air,
+        eavesdropper(receiver.port) as (port, air),
     ):
-        link = Link(LinkSettings(port=air.port, mtu_bytes=mtu_bytes), 77, KEY)
+        link = Link(LinkSettings(port=port, mtu_bytes=mtu_bytes), 77, KEY)
         link.start()
         for index, unit in enumerate(encoded(FRAMES)):
             assert link.send(stamped(unit, index), capture_ns(index), idr=index % GOP == 0)
@@ -101,32 +78,32 @@ def test_a_link_with_a_key_sends_srtp_within_its_mtu(mtu_bytes: int) -> None:
         assert link.flush()
         link.stop()
         assert (receiver.ssrc, receiver.payload_id) == (77, "blimp-1")
-        heard = list(air.heard)
+        heard = list(air)
     assert mtu_bytes - 2 <= max(map(len, heard)) <= mtu_bytes
     assert_secret(heard, KEY)
 
 
 def test_a_receiver_joins_a_link_whose_sequence_numbers_began_anew() -> None:
     unit = stamped(encoded(FRAMES)[0], 0)
-    with Eavesdropper(9) as air:
-        link = Link(LinkSettings(port=air.port, mtu_bytes=200), 77, KEY)
+    with eavesdropper(9) as (port, air):
+        link = Link(LinkSettings(port=port, mtu_bytes=200), 77, KEY)
         link.start()
         deadline = time.monotonic() + LIMIT_S
         index = checked = 0
         wrapped = False
-        while not (wrapped and len(air.heard) > checked + 20):
+        while not (wrapped and len(air) > checked + 20):
             assert time.monotonic() < deadline
             if not link.send(unit, capture_ns(index), idr=True):
                 time.sleep(0.001)  # the link's queue is full
                 continue
             index += 1
-            while not wrapped and checked + 1 < len(air.heard):
-                before, after = (int.from_bytes(air.heard[checked + n][2:4]) for n in (0, 1))
+            while not wrapped and checked + 1 < len(air):
+                before, after = (int.from_bytes(air[checked + n][2:4]) for n in (0, 1))
                 wrapped = after < before
                 checked += 1
         link.flush()
         link.stop()
-        late = air.heard[checked + 1 :]
+        late = air[checked + 1 :]
     unprotector = Unprotector({"blimp-1": KEY})
     assert all(unprotector.unprotect(datagram) is not None for datagram in late)
     assert unprotector.tags_searched == 2  # it was the second counter
@@ -227,12 +204,12 @@ def test_a_flight_with_certificates_is_seen_by_its_ground_station_only(
     with (
         Receiver(0, queue_frames=100, srtp_keys=keys) as receiver,
         Receiver(0, queue_frames=100) as stranger,
-        Eavesdropper(receiver.port) as air,
+        eavesdropper(receiver.port) as (port, air),
         TelemetryListener(["tls/127.0.0.1:0"], certificates=ground) as listener,
     ):
         process = start_payload(
             f"camera.uri=replay:{flight}",
-            f"link.port={air.port}",
+            f"link.port={port}",
             f"telemetry.certificates={payload}",
             f"telemetry.connect={json.dumps(listener.endpoints)}",
         )
@@ -246,7 +223,7 @@ def test_a_flight_with_certificates_is_seen_by_its_ground_station_only(
         assert [number_in(frame.image) for frame in frames] == list(range(60))
         assert [frame.time_ns for frame in frames] == [capture_ns(index) for index in range(60)]
         assert receiver.payload_id == "blimp-1"
-        heard = list(air.heard)
+        heard = list(air)
         counters = receiver.counters
         assert counters.packets == len(heard)
         assert counters.refused == counters.replayed == counters.packets_lost == 0

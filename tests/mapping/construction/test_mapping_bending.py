@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from built_scene import look_at
 
 from ground_station.arrays import F64
 from ground_station.geometry import poses
@@ -15,7 +16,6 @@ from ground_station.map import colmap
 from ground_station.map.model import Model
 from ground_station.mapping.construction import bending
 from ground_station.mapping.sfm import adjustment
-from tests.mapping.refining import look_at
 
 SIZE_M = np.array([12.0, 9.0, 3.0])
 

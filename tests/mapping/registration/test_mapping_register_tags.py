@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from built_scene import look_at
 from known_places import in_map, similarity
-from refining import look_at
 
 from ground_station.errors import MapError
 from ground_station.geometry import poses
