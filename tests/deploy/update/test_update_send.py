@@ -21,6 +21,7 @@ from deploy.board.releases.choose import Choice
 from deploy.errors import DeployError
 from deploy.update import bundle as bundles
 from deploy.update import card as remote
+from ground_station.keys.authority import Authority
 
 OLDEST = "0.0.1+git0ldest"
 WELL = "ActiveState=active\nNRestarts=0\nActiveEnterTimestampMonotonic=1\n"
@@ -85,10 +86,10 @@ class Stand:
 
 
 def authority(folder: Path) -> Path:
-    """An authority with a station and the payload blimp-1, as its user makes it."""
-    for words in (["init"], ["ground", "main"], ["payload", "blimp-1"]):
-        command = [sys.executable, "-m", "ground_station.cli", "keys", "--folder", str(folder)]
-        subprocess.run([*command, *words], cwd=CHECKOUT, check=True, timeout=120)
+    """An authority with a station and the payload blimp-1."""
+    made = Authority.create(folder)
+    made.add("ground", "main")
+    made.add("payload", "blimp-1")
     return folder
 
 
