@@ -347,7 +347,7 @@ def test_blimp_record_records_without_the_service(tmp_path: Path) -> None:
         stand.process.wait(20)
         command = [
             sys.executable, "-m", "ground_station.cli", "record", "--out", str(tmp_path / "out"),
-            "--port", str(stand.port), "--seconds", "15", "--camera", str(tmp_path / "camera.toml"),
+            "--port", str(stand.port), "--seconds", "99", "--camera", str(tmp_path / "camera.toml"),
             "--set", f'telemetry.listen=["{stand.endpoint}"]', "--set", "recording.min_free_MB=0",
         ]  # fmt: skip
         said = tmp_path / "said.txt"
@@ -355,10 +355,13 @@ def test_blimp_record_records_without_the_service(tmp_path: Path) -> None:
             eventually(lambda: "recording-started" in said.read_text())
             payload = stand.payload("blimp-1")
             eventually(lambda: "ssrc" in payload.written())
-            time.sleep(3)
+            time.sleep(1)
             ended = payload.end().counts
+            eventually(lambda: "payload-gone" in said.read_text())
+            recording.terminate()
             assert recording.wait(60) == 0
-        text = said.read_text()
-        assert f"{ended['sent']} sent" in text and "payload-gone" in text
+        assert f"{ended['sent']} sent" in said.read_text()
         (path,) = recorded(tmp_path / "out")
         assert sequences(path) == list(range(ended["sent"]))
+        command[command.index("99")] = "0.2"  # nobody flies: it ends by itself, and says so
+        assert subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 1

@@ -352,7 +352,7 @@ def test_a_bad_setting_is_one_line(flight: Path, setting: str, named: str) -> No
 def test_a_name_without_an_address_is_told_and_stops_nothing(flight: Path) -> None:
     """Wi-Fi may come later than the camera: frames are discarded until it has an address."""
     process = start_payload(
-        f"camera.uri=replay:{flight}",
+        f"camera.uri=replay:{flight}?speed=4",
         "telemetry.enabled=false",
         "link.host=no.such.host.invalid",
         "link.encrypted=false",
