@@ -1,7 +1,4 @@
-"""Pictures of an evaluation: the path over the floor plan, errors and latency over time.
-
-In a light and a dark theme; lines differ in style as well as in colour.
-"""
+"""Pictures of an evaluation: the path and errors over time, and what other pictures are made of."""
 
 from __future__ import annotations
 
@@ -18,95 +15,10 @@ from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend, sheet, themed
+from ground_station.presentation.theme import LIGHT, Theme, legend, sheet, themed
 
 GAP_S = 1.0
 """A pause longer than this breaks a line: nothing was estimated there."""
-
-
-def trajectory_plot(
-    truth: Trajectory | None,
-    estimate: Trajectory | None,
-    floorplan: FloorPlan | None = None,
-    theme: Theme = LIGHT,
-) -> Figure:
-    """The path seen from above, x to the right and y up, metres."""
-    figure, (axes,) = figure_of(1, (8.0, 5.6), theme)
-    if floorplan is not None:
-        show_floorplan(axes, floorplan, theme)
-    if truth is not None and len(truth):
-        x, y = broken_path(truth)
-        axes.plot(x, y, color=theme.truth, linewidth=2.6, alpha=0.55, label="true path")
-    if estimate is not None and len(estimate):
-        x, y = broken_path(estimate)
-        axes.plot(x, y, color=theme.estimate, linewidth=1.1, label="estimated path")
-        axes.plot(
-            *estimate.position_m[0, :2], "o", color=theme.estimate, markersize=6, label="first pose"
-        )
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("y, m")
-    if axes.get_legend_handles_labels()[1]:  # above the plan, not over it
-        axes.legend(
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=3,
-            frameon=False,
-            labelcolor=theme.ink,
-            fontsize=9,
-        )
-    return figure
-
-
-def error_plot(
-    time_s: npt.ArrayLike,
-    position_m: npt.ArrayLike,
-    rotation_deg: npt.ArrayLike,
-    *,
-    position_limit_m: float | None = None,
-    rotation_limit_deg: float | None = None,
-    theme: Theme = LIGHT,
-) -> Figure:
-    """Position error (cm) over rotation error (°), both over time (s); limits are RMSE bounds."""
-    figure, (upper, lower) = figure_of(2, (8.0, 4.4), theme)
-    limit_cm = None if position_limit_m is None else position_limit_m * 100
-    rows = (
-        (upper, np.asarray(position_m) * 100, limit_cm, "position error, cm", theme.estimate),
-        (lower, np.asarray(rotation_deg), rotation_limit_deg, "rotation error, °", theme.second),
-    )
-    for axes, values, limit, label, colour in rows:
-        axes.plot(*broken(time_s, values), color=colour, linewidth=1.1)
-        axes.set_ylabel(label)
-        if limit is not None:
-            axes.axhline(
-                limit, color=theme.limit, linestyle="--", lw=1.2, label="bound of the RMSE"
-            )
-            legend(axes, theme)
-        axes.set_ylim(0, 1.3 * max(float(np.nanmax(values, initial=0.0)), limit or 0.0, 1e-3))
-    lower.set_xlabel("time, s")
-    return figure
-
-
-def latency_plot(
-    time_s: npt.ArrayLike,
-    latency_ms: npt.ArrayLike,
-    *,
-    median_ms: float | None = None,
-    p99_ms: float | None = None,
-    theme: Theme = LIGHT,
-) -> Figure:
-    """Capture-to-pose latency of each frame (ms) over time (s)."""
-    figure, (axes,) = figure_of(1, (8.0, 3.0), theme)
-    axes.plot(time_s, latency_ms, ".", color=theme.estimate, markersize=4)
-    axes.set_xlabel("time, s")
-    axes.set_ylabel("latency, ms")
-    for value, name, style in ((median_ms, "median", "-"), (p99_ms, "99th percentile", "--")):
-        if value is not None:
-            label = f"{name}, {value:.0f} ms"
-            axes.axhline(value, color=theme.limit, linestyle=style, linewidth=1.2, label=label)
-    axes.set_ylim(0, 1.5 * max(float(np.nanmax(np.asarray(latency_ms), initial=1.0)), p99_ms or 0))
-    legend(axes, theme)
-    return figure
 
 
 def evaluation(result: Evaluation, align: str = "none") -> Figure:

@@ -19,9 +19,6 @@ examples:
 
 The firmware runs as a process of its own; video crosses RTP and telemetry Zenoh, on loopback."""
 
-OUTCOME = "outcome"
-"""The folder in --out with every frame, which --accept and --compare take."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
@@ -93,14 +90,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from ground_station.evaluation.report import summary_table, write_report
     from ground_station.files import write_json
     from ground_station.map import store
     from ground_station.replay import flight_report
-    from ground_station.replay.cases.outcome import write_outcome
-    from ground_station.replay.cases.taken import outcome_of
     from ground_station.replay.replay import replay, settings_for
-    from pi_firmware.wire.recording import RecordingReader
 
     settings = settings_for(
         args.preset,
@@ -112,26 +105,18 @@ def _replay(args: argparse.Namespace) -> int:
         duration_s=args.duration_s,
         stepped=args.stepped,
     )
-    simulation = RecordingReader(args.recording).metadata_table("simulation")
     map_ = store.load(args.map)
     args.out.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
     result = replay(map_, settings)
-    plan = args.map / "floorplan.yaml"
-    data = flight_report.report_data(
+    report = flight_report.report_of(
         f"Replay of {args.recording.name}",
         result,
         map_,
-        simulated=bool(simulation),
-        floorplan=plan if plan.is_file() else None,
+        seconds=time.monotonic() - began_s,
         seeds={"localizer": result.localizer.seed},
     )
-    write_json(args.out / "results.json", result.document())
     if args.json:
-        write_json(args.json, result.document())
-    write_report(args.out / "report.html", data)
-    outcome = outcome_of(result, map_, seconds=time.monotonic() - began_s)
-    write_outcome(args.out / OUTCOME, outcome)
-    print(summary_table(data))
-    print(f"\n{args.out / 'report.html'}")
+        write_json(args.json, report.document)
+    flight_report.publish(args.out, report)
     return 0

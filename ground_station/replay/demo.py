@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ground_station.errors import InputError
-from ground_station.evaluation.report import summary_table, write_report
-from ground_station.files import write_json
 from ground_station.map.store import Map
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.inputs import open_inputs
@@ -33,7 +31,7 @@ LIMITS = {
 def run(
     out: Path, *, preset: str, init: str | None, rate_hz: float | None, sample: Path = SAMPLE
 ) -> int:
-    """Builds, flies, writes results.json and report.html to `out`; 1 when a bound is missed."""
+    """Builds, flies, writes results and report to `out`; 1 when a bound is missed."""
     mapping, flight = sample / "mapping.mcap", sample / "flight.mcap"
     for path in (mapping, flight, sample / "mapping.toml", sample / "PAIRS.csv"):
         if not path.is_file():
@@ -47,34 +45,32 @@ def run(
     print(
         f"2 of 3: the other flight, streamed by the firmware at {settings.rate_hz:g} Hz", flush=True
     )
+    start_s = time.monotonic()
     result = replay(map_, settings)
+    flown_s = time.monotonic() - start_s
     print("3 of 3: the report\n", flush=True)
-    seeds = {
-        "mapping flight": _seed(mapping),
-        "localization flight": _seed(flight),
-        "map": int(map_.info.built["settings"]["seed"]),
-        "localizer": result.localizer.seed,
-    }
-    data = flight_report.report_data(
+    report = flight_report.report_of(
         "Demo: a flight through the sample atrium",
         result,
         map_,
+        seconds=flown_s,
         bounds=flight_report.judge(result, LIMITS),
-        simulated=True,
-        floorplan=sample / "floorplan.yaml",
-        seeds=seeds,
+        seeds={
+            "mapping flight": _seed(mapping),
+            "localization flight": _seed(flight),
+            "map": int(map_.info.built["settings"]["seed"]),
+            "localizer": result.localizer.seed,
+        },
     )
-    document = result.document() | {
-        "seeds": seeds,
-        "map": {"build_s": map_s, **map_.info.built, "registration": map_.info.registration},
-        "bounds": [asdict(bound) for bound in data.bounds],
-        "simulated": True,
-    }
-    write_json(out / "results.json", document)
-    write_report(out / "report.html", data)
-    print(summary_table(data))
-    print(f"\n{out / 'report.html'}\n{out / 'results.json'}")
-    return 0 if data.passed and result.live.complete else 1
+    flight_report.publish(
+        out,
+        report,
+        seeds=report.seeds,
+        map={"build_s": map_s, **map_.info.built, "registration": map_.info.registration},
+        bounds=[asdict(bound) for bound in report.bounds],
+        simulated=True,
+    )
+    return 0 if report.passed and result.live.complete else 1
 
 
 def build(mapping: Path, sample: Path, folder: Path) -> Map:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ground_station.evaluation.figures import digits
+from ground_station.geometry.trajectory import Trajectory
 from ground_station.presentation.pages import Shown, shown, write_page
 from ground_station.replay.cases import measure, pictures
 from ground_station.replay.cases.compare import Comparison, Line
@@ -158,35 +159,46 @@ def _place(c: Comparison) -> np.ndarray | None:
 
 
 def _of_case(case: Judged) -> list[Shown]:
-    if case.outcome is None or not len(case.outcome.frames):
+    if case.outcome is None:
         return []
-    outcome, frames = case.outcome, case.outcome.frames
+    bounds = {row.name: row.bound for row in case.rows}
+    return of_run(
+        case.outcome,
+        None if case.reference is None else case.reference.poses,
+        position_m=bounds.get("position_max_m"),
+        latency_ms=bounds.get("latency_p99_ms_max"),
+    )
+
+
+def of_run(
+    outcome: Outcome,
+    truth: Trajectory | None,
+    *,
+    position_m: float | None = None,
+    rotation_deg: float | None = None,
+    latency_ms: float | None = None,
+) -> list[Shown]:
+    """Path, errors against the truth, latency and states of a run; bounds are drawn as lines."""
+    frames = outcome.frames
+    if not len(frames):
+        return []
     start_ns = int(frames.time_ns.min())
     seconds = (frames.time_ns - start_ns) / 1e9
     panels: list[tuple[str, Sequence[Series], float | None]] = []
-    bounds = {row.name: row.bound for row in case.rows}
-    off = np.full(len(frames), np.nan)
-    if case.reference is not None:
-        errors = measure.errors(outcome, case.reference.poses)
-        off[errors.frame] = errors.position_m
-        limit = bounds.get("position_max_m")
-        panels.append(
-            (
-                "error, cm",
-                [Series("error", seconds[errors.frame], 100 * errors.position_m)],
-                None if limit is None else 100 * limit,
-            )
-        )
-    latency = np.where(np.isfinite(frames.latency_ms), frames.latency_ms, np.nan)
-    if np.isfinite(latency).any():
-        panels.append(
-            (
-                "latency, ms",
-                [Series("latency", seconds, latency)],
-                bounds.get("latency_p99_ms_max"),
-            )
-        )
-    shown_off = off if case.reference is not None else np.zeros(len(frames))
+    off_m = np.zeros(len(frames))
+    if truth is not None:
+        errors = measure.errors(outcome, truth)
+        off_m = np.full(len(frames), np.nan)
+        off_m[errors.frame] = errors.position_m
+        limit_cm = None if position_m is None else 100 * position_m
+        for label, values, limit in (
+            ("error, cm", 100 * errors.position_m, limit_cm),
+            ("error, °", errors.rotation_deg, rotation_deg),
+        ):
+            panels.append((label, [Series("error", seconds[errors.frame], values)], limit))
+    if np.isfinite(frames.latency_ms).any():
+        series = Series("latency", seconds, frames.latency_ms)
+        panels.append(("latency, ms", [series], latency_ms))
     under = [] if outcome.truth is None else [("truth", outcome.truth)]
     return [
         shown(
@@ -194,7 +206,7 @@ def _of_case(case: Judged) -> list[Shown]:
             "The path from above, coloured by its error",
             lambda theme: pictures.path(
                 frames.position_m[frames.finite],
-                shown_off[frames.finite],
+                off_m[frames.finite],
                 under=under,
                 floorplan=outcome.floorplan,
                 label="error, cm",

@@ -19,7 +19,7 @@ from ground_station.evaluation import plots
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, sheet, themed
+from ground_station.presentation.theme import LIGHT, Theme, figure_of, sheet, themed
 
 WIDTH_IN = 6.6
 """Narrow, so that what is written in a picture can be read on a narrow screen."""
@@ -69,9 +69,12 @@ def path(
     (3,) where two runs part. Where nothing is off a colour scale would only mislead: it ends at a
     millimetre at least.
     """
-    figure = plots.trajectory_plot(None, None, floorplan, theme)
-    figure.set_size_inches(WIDTH_IN, 4.9)
-    axes = figure.axes[0]
+    figure, (axes,) = figure_of(1, (WIDTH_IN, 4.9), theme)
+    if floorplan is not None:
+        plots.show_floorplan(axes, floorplan, theme)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
     for k, (name, trajectory) in enumerate(under):
         x, y = plots.broken_path(trajectory)
         style = "-" if k == 0 else "--"
