@@ -17,14 +17,21 @@ class FlightModel:
     semi_length_m: float
     semi_width_m: float
     mass_kg: float
+    """Hull, payload and trim, without the helium: neutral."""
     added_axial: float
+    """Added mass over displaced mass along the nose."""
     added_lateral: float
     drag_axial: float
+    """On the frontal area."""
     drag_lateral: float
+    """On the side area."""
     weight_below_m: float
+    """Centre of gravity below centre of buoyancy."""
     thrust_below_m: float
+    """Propellers below the centre of buoyancy: thrust pitches the hull."""
     thrust_limit_N: float
     swing_damping: float
+    """Damping ratio of pitch and roll."""
     air_kg_m3: float
     helium_kg_m3: float
     camera_forward_m: float

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
+from ground_station.simulator.scene import Footprint, KnownPoint, Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 24.0, 16.0, 9.0
 BAY_M = 3.0
@@ -315,9 +315,9 @@ class _Atrium:
                 self.b.rectangle(
                     [x - 0.2, y - 0.2, 6.5], [0.4, 0, 0], [0, 0.4, 0], "metal", rgb=_WHITE
                 )
-                self.b.lamps.append(Lamp((x, y, 6.1)))
+                self.b.lamps.append((x, y, 6.1))
         for x in (3.0, 9.0, 15.0, 21.0):
-            self.b.lamps.append(Lamp((x, 14.6, 3.2)))
+            self.b.lamps.append((x, 14.6, 3.2))
 
     def outside(self) -> None:
         """What the windows show: pavement, trees, the sky."""

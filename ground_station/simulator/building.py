@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.arrays import F64
-from ground_station.simulator.scene import Footprint, KnownPoint, Lamp, Scene
+from ground_station.simulator.scene import Footprint, KnownPoint, Scene
 from ground_station.simulator.surfaces import Surface
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
@@ -26,7 +26,7 @@ class SceneBuilder:
         self.surfaces: list[Surface] = []
         self.footprints: list[Footprint] = []
         self.known: list[KnownPoint] = []
-        self.lamps: list[Lamp] = []
+        self.lamps: list[tuple[float, float, float]] = []
 
     def rectangle(
         self,

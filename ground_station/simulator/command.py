@@ -135,9 +135,11 @@ def run(args: argparse.Namespace) -> int:
     with Progress(f"{args.out.name}, frames", None) as progress:
         result = simulate(settings, lambda done, total: progress.step(total))
     if args.json is not None:
+        from dataclasses import asdict
+
         from ground_station.files import write_json
 
-        write_json(args.json, result.as_dict())
+        write_json(args.json, asdict(result))
     print(
         f"{result.out}: {result.frames} frames, {result.duration_s:g} s,"
         f" {result.bytes / 1e6:.2f} MB, seed {result.seed};"
@@ -151,15 +153,12 @@ def run(args: argparse.Namespace) -> int:
 
 def settings_from(args: argparse.Namespace) -> SimulationSettings:
     """The settings that the arguments say."""
+    from dataclasses import fields
+
     from ground_station.geometry.camera import load_camera
     from ground_station.simulator.simulate import SimulationSettings
 
-    return SimulationSettings(
-        out=args.out, scene=args.scene, plan=args.plan, light=args.light, seed=args.seed,
-        duration_s=args.duration_s, rate_hz=args.rate_hz, crf=args.crf,
-        bitrate_kbps=args.bitrate_kbps, truth=args.truth, points=args.points, build=args.build,
-        draught_m_s=args.draught_m_s, lens_error=args.lens_error,
-        exposure_steps=args.exposure_steps, light_steps=args.light_steps, flicker=args.flicker,
-        longest_exposure_s=args.longest_exposure_s,
-        camera=None if args.camera is None else load_camera(args.camera),
-    )  # fmt: skip
+    names = {field.name for field in fields(SimulationSettings)}
+    said = {name: value for name, value in vars(args).items() if name in names}
+    camera = None if args.camera is None else load_camera(args.camera)
+    return SimulationSettings(**said | {"camera": camera})

@@ -8,7 +8,7 @@ along the corridor, z up; the origin is the south-west corner on the floor. Plan
 from __future__ import annotations
 
 from ground_station.simulator.building import SceneBuilder
-from ground_station.simulator.scene import Lamp, Scene
+from ground_station.simulator.scene import Scene
 
 BAYS, BAY_M = 7, 4.0
 LENGTH_M, WIDTH_M, HEIGHT_M = BAYS * BAY_M, 4.0, 3.0
@@ -50,7 +50,7 @@ def build_corridor(texels_per_m: float) -> Scene:
         x = BAY_M * number
         _bay(b, x, number)
         for dx in (1.0, 3.0):
-            b.lamps.append(Lamp((x + dx, WIDTH_M / 2, HEIGHT_M - 0.12)))
+            b.lamps.append((x + dx, WIDTH_M / 2, HEIGHT_M - 0.12))
             b.box([x + dx - 0.6, WIDTH_M / 2 - 0.1, HEIGHT_M - 0.1],
                   [x + dx + 0.6, WIDTH_M / 2 + 0.1, HEIGHT_M - 0.02], "metal", rgb=_WHITE,
                   print=_DOOR + 20)  # fmt: skip

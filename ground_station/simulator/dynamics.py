@@ -9,58 +9,32 @@ Masses, sizes and coefficients are a build's, from `hw/builds.toml`.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from ground_station.simulator.motion import Motion, Mount
 from ground_station.simulator.plans import Reference
-from hw.flight import flight_model
+from hw.flight import FlightModel, flight_model
 
 GRAVITY_M_S2 = 9.81
 _STEP_S = 1 / 200
 
 
-def _built(name: str) -> Any:
-    """A field whose default is the number of the build that the simulator flies."""
-    return field(default_factory=lambda: getattr(flight_model(), name))
-
-
 @dataclass(frozen=True)
-class Blimp:
-    """A hull with semi-axes a, b, b, and what hangs under it; by default the build `atrium`."""
+class Blimp(FlightModel):
+    """A build in its air: a hull with semi-axes a, b, b, and what hangs under it."""
 
-    semi_length_m: float = _built("semi_length_m")
-    semi_width_m: float = _built("semi_width_m")
-    mass_kg: float = _built("mass_kg")
-    """Hull, payload and trim, without the helium: neutral."""
-    added_axial: float = _built("added_axial")
-    """Added mass over displaced mass along the nose."""
-    added_lateral: float = _built("added_lateral")
-    drag_axial: float = _built("drag_axial")
-    """On the frontal area."""
-    drag_lateral: float = _built("drag_lateral")
-    """On the side area."""
-    weight_below_m: float = _built("weight_below_m")
-    """Centre of gravity below centre of buoyancy."""
-    thrust_below_m: float = _built("thrust_below_m")
-    """Propellers below the centre of buoyancy: thrust pitches the hull."""
-    thrust_limit_N: float = _built("thrust_limit_N")
-    swing_damping: float = _built("swing_damping")
-    """Damping ratio of pitch and roll."""
-    air_kg_m3: float = _built("air_kg_m3")
-    helium_kg_m3: float = _built("helium_kg_m3")
-    camera_forward_m: float = _built("camera_forward_m")
-    camera_up_m: float = _built("camera_up_m")
-    camera_tilt_down_deg: float = _built("camera_tilt_down_deg")
     draught_m_s: float = 0.05
     """Deviation of the air's speed along each axis; ASHRAE 55 allows 0.2 m/s where people sit."""
     draught_time_s: float = 4.0
 
     @classmethod
-    def of_build(cls, name: str) -> Blimp:
-        """Another build of `hw/builds.toml`; raises `HardwareError` with one line."""
+    def of_build(cls, name: str | None = None) -> Blimp:
+        """A build of `hw/builds.toml`; None: the one that the simulator flies.
+
+        Raises `HardwareError` with one line.
+        """
         return cls(**asdict(flight_model(name)))
 
     @property
@@ -160,10 +134,9 @@ def fly(
     duration_s: float,
     rng: np.random.Generator,
     blimp: Blimp | None = None,
-    mount: Mount | None = None,
 ) -> Motion:
     """Flies a plan to its end, from 8 s before time 0, so that the start's swing has settled."""
-    blimp = blimp or Blimp()
+    blimp = blimp or Blimp.of_build()
     lead_s = 8.0
     count = math.ceil((lead_s + duration_s + 0.5) / _STEP_S)
     times = np.arange(count) * _STEP_S - lead_s
@@ -206,4 +179,4 @@ def fly(
             want_turn[k] - state.rates_rad_s[0]
         )
         step(blimp, state, thrust, spin, (wind[0], wind[1], wind[2]), _STEP_S)
-    return Motion(times, rows[:, :3], rows[:, 3:], mount or blimp.mount)
+    return Motion(times, rows[:, :3], rows[:, 3:], blimp.mount)

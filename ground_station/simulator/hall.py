@@ -10,7 +10,7 @@ origin is the south-west corner on the floor. Light falls in through the roof.
 from __future__ import annotations
 
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Footprint, Lamp, Scene
+from ground_station.simulator.scene import Footprint, Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 18.0, 12.0, 5.4
 PANEL_M, ROW_M = 1.5, 1.35
@@ -95,7 +95,7 @@ def _panels(b: SceneBuilder, wall: _Wall) -> None:
         b.box(*foot, "wood", rgb=_DARK, print=_STRIP + 1)
 
 
-def _roof(b: SceneBuilder) -> list[Lamp]:
+def _roof(b: SceneBuilder) -> list[tuple[float, float, float]]:
     """Equal tiles, rooflights in a grid and the sky in them, beams across."""
     for i in range(9):
         for j in range(6):
@@ -126,7 +126,7 @@ def _roof(b: SceneBuilder) -> list[Lamp]:
         b.rectangle([x, y, 0], [*side, 0], [0, 0, z], "metal", detail=0.1)
     b.rectangle([0, WIDTH_M, z + 3], [LENGTH_M, 0, 0], [0, -WIDTH_M, 0], "sky", detail=0.2,
                 outside=True)  # fmt: skip
-    return [Lamp((4.5 * i, y, HEIGHT_M - 0.5)) for i in (1, 2, 3) for y in (3.0, 9.0)]
+    return [(4.5 * i, y, HEIGHT_M - 0.5) for i in (1, 2, 3) for y in (3.0, 9.0)]
 
 
 def build_hall(texels_per_m: float) -> Scene:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Lamp, Scene, SimulatorError
+from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.surfaces import Surface
 
 Rng = np.random.Generator
@@ -267,7 +267,7 @@ def _built(room: _Room, name: str, **more: Any) -> Scene:
         part()
     length, width, height = room.size
     room.b.lamps = [
-        Lamp((x + w / 2, y + h / 2, height - 0.4))
+        (x + w / 2, y + h / 2, height - 0.4)
         for x, w in _pieces(length, 3.5)
         for y, h in _pieces(width, 3.5)
     ]

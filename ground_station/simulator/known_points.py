@@ -23,6 +23,7 @@ _RANGE_M = (1.0, 12.0)
 _FLOW_LIMIT_PX_S = 90.0  # over half a readout of 10 ms: within a pixel of a global shutter
 _MIN_FACING = 0.3  # cosine of the angle between view and normal
 _MIN_PARALLAX_DEG = 13.0
+_MOST_POINTS, _MOST_FRAMES = 18, 5
 
 
 def frame_name(index: int) -> str:
@@ -90,12 +91,8 @@ def choose_observations(
     times_s: F64,
     points: Sequence[KnownPoint],
     rng: np.random.Generator,
-    *,
-    max_points: int = 18,
-    max_observations: int = 5,
 ) -> list[PointObservation]:
-    """Up to `max_points` points spread over the hall, each in 3 to `max_observations` distant
-    frames.
+    """Up to `_MOST_POINTS` points spread over the hall, each in 3 to `_MOST_FRAMES` distant frames.
 
     Raises `SimulatorError` when fewer than 4 points are seen often enough to register a map.
     """
@@ -120,7 +117,7 @@ def choose_observations(
             seen[i].append((frame, pixels[i], wTc[:3, 3]))
     chosen: dict[int, list[tuple[int, F64, F64]]] = {}
     for i, observations in enumerate(seen):
-        picked = _far_apart(observations, max_observations)
+        picked = _far_apart(observations, _MOST_FRAMES)
         if len(picked) >= 3 and _parallax_deg(picked, position[i]) >= _MIN_PARALLAX_DEG:
             chosen[i] = picked
     if len(chosen) < 4:
@@ -129,7 +126,7 @@ def choose_observations(
             " fly longer"
         )
     result = []
-    for index in _spread(list(chosen), position, max_points):
+    for index in _spread(list(chosen), position, _MOST_POINTS):
         for frame, pixel, _ in sorted(chosen[index], key=lambda s: s[0]):
             u, v = pixel + _CLICK_NOISE_PX * rng.standard_normal(2)
             result.append(PointObservation(points[index], frame, (float(u), float(v))))

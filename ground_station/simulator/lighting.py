@@ -216,8 +216,8 @@ def _lamps(scene: Scene, light: Light, maps: SceneRenderer, p: F32, n: F32) -> F
     result = np.zeros_like(p)
     pinhole = Pinhole(_MAP_PX, _MAP_PX, 0.5 * _MAP_PX / 2.2)  # 131° wide, straight down
     rgb = np.asarray(light.lamp_rgb, np.float32) * np.float32(light.lamp_level)
-    for lamp in scene.lamps:
-        wTc = looking(np.array([0.0, 0.0, 1.0]), lamp.position_m, 0.0)
+    for position_m in scene.lamps:
+        wTc = looking(np.array([0.0, 0.0, 1.0]), position_m, 0.0)
         depth = maps.depth(wTc, pinhole)
         local = (p - wTc[:3, 3].astype(np.float32)) @ wTc[:3, :3].astype(np.float32)
         z = np.maximum(local[:, 2], 1e-3)

@@ -9,7 +9,7 @@ notices. The plans' paths keep clear of everything above 1.5 m, as in the atrium
 from __future__ import annotations
 
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Lamp, Scene
+from ground_station.simulator.scene import Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 22.0, 14.0, 4.6
 BAY_M = 2.75
@@ -41,7 +41,7 @@ class _Office:
                        faces=("-x", "+x", "-z"), rgb=_WHITE, detail=0.7)  # fmt: skip
             for y in (2.0, 6.9, 10.6):  # strip lights between the trays
                 self.b.box([x + 0.7, y - 0.1, 4.4], [x + 2.0, y + 0.1, 4.5], "metal", rgb=_WHITE)
-                self.b.lamps.append(Lamp((x + 1.35, y, 4.38)))
+                self.b.lamps.append((x + 1.35, y, 4.38))
 
     def south(self) -> None:
         """Parapet, windows and lintel, bay after bay."""

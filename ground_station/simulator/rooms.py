@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Lamp, Scene
+from ground_station.simulator.scene import Scene
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.6, 9.6, 2.7
 PASSAGE_Y_M = (4.0, 5.4)
@@ -188,5 +188,5 @@ def build_rooms(texels_per_m: float) -> Scene:
         along = _UPRIGHT[facing]
         right = [width * along[0], width * along[1], 0]
         b.sign(f"picture-{text.lower()}", [x, y, 1.25], right, [0, 0, height], text)
-    b.lamps = [Lamp(((xa + xb) / 2, (ya + yb) / 2, HEIGHT_M - 0.2)) for xa, ya, xb, yb in floors]
+    b.lamps = [((xa + xb) / 2, (ya + yb) / 2, HEIGHT_M - 0.2) for xa, ya, xb, yb in floors]
     return b.scene("rooms", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED, walks=(_SHORT, _LONG))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from ground_station.arrays import F64
 from ground_station.errors import GroundStationError
 from ground_station.simulator.surfaces import Surface
 
@@ -33,13 +34,6 @@ class KnownPoint:
 
 
 @dataclass(frozen=True)
-class Lamp:
-    """A lamp that shines downwards from a position, metres."""
-
-    position_m: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
 class Scene:
     """A building: surfaces, its plan, surveyed points, lamps, and the seed of its textures."""
 
@@ -48,13 +42,15 @@ class Scene:
     surfaces: tuple[Surface, ...]
     footprints: tuple[Footprint, ...]
     known_points: tuple[KnownPoint, ...]
-    lamps: tuple[Lamp, ...]
+    lamps: tuple[tuple[float, float, float], ...]
+    """Where they are, metres; they shine downwards."""
     texture_seed: int
     walks: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Closed ways on foot by their corners (x, y), metres, through the middles of doorways."""
     ring_m: tuple[float, float] | None = None
     """Half axes, along x and y, of an ellipse about the middle that is kept free of things."""
-    centre_m: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "centre_m", tuple(np.asarray(self.size_m) / 2))
+    @property
+    def centre_m(self) -> F64:
+        """The middle (3,)."""
+        return np.asarray(self.size_m) / 2

@@ -172,7 +172,7 @@ def rms_error(
 
 def drifting(seed: int, duration_s: float = 7.0) -> list[Kinematics]:
     """The simulator's blimp with its motors off: it swings freely and slows down in the draught."""
-    rng, blimp, step_s = np.random.default_rng(seed), dynamics.Blimp(), 1 / 200
+    rng, blimp, step_s = np.random.default_rng(seed), dynamics.Blimp.of_build(), 1 / 200
     state = dynamics.BlimpState(
         [0.0, 0.0, 2.0], rng.normal(0, [0.5, 0.1, 0.1]).tolist(),
         [rng.uniform(-3, 3), *rng.normal(0, 0.06, 2)], rng.normal(0, [0.15, 0.08, 0.15]).tolist(),

@@ -9,7 +9,6 @@ import pytest
 
 from ground_station.simulator import scenes
 from ground_station.simulator.dynamics import Blimp, fly
-from ground_station.simulator.motion import Mount
 from ground_station.simulator.plans import Reference, plan_named
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, prepare_flight
@@ -30,7 +29,7 @@ where they differ the sample is of another vehicle, and has to be made again."""
 
 def test_the_build_gives_the_flown_numbers_to_the_last_bit() -> None:
     assert {name: getattr(flight_model(), name) for name in FLOWN} == FLOWN
-    assert {name: getattr(Blimp(), name) for name in FLOWN} == FLOWN
+    assert {name: getattr(Blimp.of_build(), name) for name in FLOWN} == FLOWN
 
 
 def test_a_flight_with_the_build_is_the_flight_with_the_flown_numbers() -> None:
@@ -38,7 +37,7 @@ def test_a_flight_with_the_build_is_the_flight_with_the_flown_numbers() -> None:
     reference = Reference(plan, 0.3)
     times = np.linspace(0, 3, 31)
     built = fly(reference, 3.0, np.random.default_rng(2)).wTc(times)
-    flown = fly(reference, 3.0, np.random.default_rng(2), Blimp(**FLOWN), Mount()).wTc(times)
+    flown = fly(reference, 3.0, np.random.default_rng(2), Blimp(**FLOWN)).wTc(times)
     assert np.array_equal(built, flown)
 
 
@@ -51,7 +50,7 @@ def test_the_builds_parts_make_its_mass_and_hang_where_it_was_flown() -> None:
 
 
 def test_another_build_flies_otherwise_or_is_refused_by_name(tmp_path: Path) -> None:
-    assert Blimp.of_build("atrium") == Blimp()
+    assert Blimp.of_build("atrium") == Blimp.of_build()
     with pytest.raises(HardwareError, match=r"its hull has shape 'pillow'; allowed: 'ellipsoid'"):
         Blimp.of_build("zero-w-ina219")
     with pytest.raises(HardwareError, match=r"build 'nope' is unknown; there are: zero-w-ina219"):

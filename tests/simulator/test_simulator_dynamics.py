@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,11 +31,11 @@ def plan_of(name: str, scene: Scene, seed: int = 0) -> Plan:
 
 
 def test_the_blimp_is_neutral_within_two_grams() -> None:
-    assert abs(Blimp().net_lift_N) < 0.002 * GRAVITY_M_S2
+    assert abs(Blimp.of_build().net_lift_N) < 0.002 * GRAVITY_M_S2
 
 
 def test_left_alone_in_still_air_it_hovers() -> None:
-    blimp, state = Blimp(), at_rest()
+    blimp, state = Blimp.of_build(), at_rest()
     for _ in range(round(5 / DT_S)):
         step(blimp, state, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), DT_S)
     assert np.hypot(*state.position_m[:2]) == 0
@@ -43,7 +44,7 @@ def test_left_alone_in_still_air_it_hovers() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_its_terminal_speed_is_where_drag_equals_thrust(axis: int) -> None:
-    blimp, state = Blimp(), at_rest()
+    blimp, state = Blimp.of_build(), at_rest()
     thrust = [0.0, 0.0, 0.0]
     thrust[axis] = 0.1
     for _ in range(round(60 / DT_S)):
@@ -57,14 +58,14 @@ def test_its_terminal_speed_is_where_drag_equals_thrust(axis: int) -> None:
 
 
 def test_a_draught_carries_it_to_the_airs_speed() -> None:
-    blimp, state = Blimp(), at_rest()
+    blimp, state = Blimp.of_build(), at_rest()
     for _ in range(round(120 / DT_S)):
         step(blimp, state, (0.0, 0.0, 0.0), 0.0, (0.0, 0.3, 0.0), DT_S)
     assert state.velocity_m_s[1] == pytest.approx(0.3, rel=0.1)
 
 
 def test_it_swings_at_the_frequency_of_its_pendulum() -> None:
-    blimp, state = Blimp(swing_damping=0.0), at_rest()
+    blimp, state = replace(Blimp.of_build(), swing_damping=0.0), at_rest()
     state.angles_rad[1] = 0.1
     angles = []
     for _ in range(round(30 / DT_S)):
