@@ -187,10 +187,14 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_diff_s: float = MAX_DI
     return Evaluation(estimate, truth, found, impossible)
 
 
-def shares(errors: Errors) -> list[float]:
-    """The share of pairs within each of `THRESHOLDS`, 0 to 1."""
+def shares(errors: Errors) -> list[dict[str, float]]:
+    """The share of the pairs, 0 to 1, within each of `THRESHOLDS`."""
     return [
-        float(np.mean((errors.position_m <= m) & (errors.rotation_deg <= deg)))
+        {
+            "position_m": m,
+            "rotation_deg": deg,
+            "share": float(np.mean((errors.position_m <= m) & (errors.rotation_deg <= deg))),
+        }
         for m, deg in THRESHOLDS
     ]
 

@@ -118,11 +118,11 @@ def table(result: Evaluation, names: list[str]) -> str:
     lines += [f"{n}: impossible, {result.impossible[n]}" for n in names if n in result.impossible]
     if "sim3" in names and "sim3" in result.errors:
         lines += ["", f"scale of sim3   {result.errors['sim3'].alignment.scale:.6f}"]
-    within = ate.shares(result.errors[names[0]])
     shares = [
-        [f"within {metres * 100:g} cm, {degrees:g}°", f"{share:.1%}", f"of the pairs ({names[0]})"]
-        for (metres, degrees), share in zip(ate.THRESHOLDS, within, strict=True)
-    ]
+        [f"within {100 * one['position_m']:g} cm, {one['rotation_deg']:g}°", f"{one['share']:.1%}",
+         f"of the pairs ({names[0]})"]
+        for one in ate.shares(result.errors[names[0]])
+    ]  # fmt: skip
     lines += ["", *columns(shares)]
     return "\n".join(lines)
 
@@ -133,7 +133,6 @@ def _document(
     from ground_station.evaluation import ate
 
     name = args.align or "none"
-    within = ate.shares(result.errors[name])
     return {
         "estimate": str(args.estimate),
         "truth": str(args.truth),
@@ -146,8 +145,5 @@ def _document(
         "statistics": {key: e.statistics() for key, e in result.errors.items()},
         "scale": result.errors["sim3"].alignment.scale if "sim3" in result.errors else None,
         "shares_align": name,
-        "shares": [
-            {"position_m": metres, "rotation_deg": degrees, "share": share}
-            for (metres, degrees), share in zip(ate.THRESHOLDS, within, strict=True)
-        ],
+        "shares": ate.shares(result.errors[name]),
     }

@@ -86,8 +86,8 @@ class LiveResult:
             "localized": sum(frame.estimate.localized for frame in self.frames),
         }
 
-    def latency_ms(self) -> F64:
-        """Capture to pose of every frame, (N,), milliseconds, both on the ground's clock.
+    def captured_ns(self) -> list[int]:
+        """When each frame was captured, by the ground's clock.
 
         Of frames that came before the payload's clock had answered by its first answer; if it never
         did (`clock` is None) both clocks are taken for one.
@@ -95,10 +95,13 @@ class LiveResult:
         known = ((f.capture_ns, f.clock_ns) for f in self.frames if f.capture_ns is not None)
         capture_ns, clock_ns = next(known, (0, 0))
         ahead_ns = capture_ns - clock_ns
-        captured = (
+        return [
             f.clock_ns + ahead_ns if f.capture_ns is None else f.capture_ns for f in self.frames
-        )
-        pairs = zip(self.frames, captured, strict=True)
+        ]
+
+    def latency_ms(self) -> F64:
+        """Capture to pose of every frame, (N,), milliseconds."""
+        pairs = zip(self.frames, self.captured_ns(), strict=True)
         return np.array([(frame.done_ns - captured_ns) / 1e6 for frame, captured_ns in pairs])
 
 

@@ -93,13 +93,6 @@ class ReplayResult:
         latency = self.live.latency_ms()
         times = sorted(frame.estimate.time_ns for frame in self.live.frames)
         span_s = (times[-1] - times[0]) / 1e9 if len(times) > 1 else 0.0
-        within = None
-        if self.evaluation is not None and "none" in self.evaluation.errors:
-            shares = ate.shares(self.evaluation.errors["none"])
-            within = [
-                {"position_m": m, "rotation_deg": deg, "share": share}
-                for (m, deg), share in zip(ate.THRESHOLDS, shares, strict=True)
-            ]
         estimates = [frame.estimate for frame in self.live.frames]
         return {
             "recording": self.settings.recording.name,
@@ -109,7 +102,7 @@ class ReplayResult:
             "frames": self.live.accounts(),
             "complete": self.live.complete,
             "ate": self.evaluation.ate() if self.evaluation else None,
-            "shares": within,
+            "shares": ate.shares(self.evaluation.errors["none"]) if self.evaluation else None,
             "latency_ms": results.percentiles(latency.tolist()),
             "clock_offset": self.live.clock,
             "rate_hz": (len(times) - 1) / span_s if span_s > 0 else 0.0,

@@ -190,14 +190,14 @@ def test_trajectories_that_never_meet_are_told_with_their_times() -> None:
             ate.evaluate(truth, truth, bad)
 
 
-def test_shares_count_both_limits() -> None:
+def test_shares_count_both_limits_and_frames_without_an_estimate() -> None:
     truth = path_of_n(4, 1)
     errors = ate.errors(truth, truth)
     errors = ate.Errors(
         np.array([0.01, 0.03, 0.2, 0.01]), np.array([0.5, 1.5, 0.1, 9.0]),
         errors.position_zhang_m, errors.alignment,
     )  # fmt: skip
-    assert ate.shares(errors) == [0.25, 0.5, 0.5]
+    assert [one["share"] for one in ate.shares(errors)] == [0.25, 0.5, 0.5]
 
 
 def test_coverage_is_the_share_of_frames_with_a_pose() -> None:

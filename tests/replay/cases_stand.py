@@ -12,8 +12,10 @@ import numpy as np
 from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.replay.cases import frames
 from ground_station.replay.cases.outcome import Accounts, Outcome, Run
+from ground_station.replay.live import LiveFrame
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
@@ -38,32 +40,34 @@ def truth(n: int = 60) -> Trajectory:
     return Trajectory.from_poses(times, [true_pose(k) for k in range(n)])
 
 
-def row(k: int, **changes: Any) -> frames.FrameRow:
+def row(k: int, **changes: Any) -> LiveFrame:
     """Frame k, TRACKING in its true place, 40 ms after its capture."""
     taken_ns = CLOCK_NS + k * STEP_NS
-    usual: dict[str, Any] = {
-        "sequence": k,
-        "time_ns": START_NS + k * STEP_NS,
-        "captured_ns": taken_ns,
-        "arrival_ns": taken_ns + 15_000_000,
-        "done_ns": taken_ns + 40_000_000,
-        "state": "TRACKING",
-        "wTc": true_pose(k),
-    }
-    return frames.FrameRow(**(usual | changes))
+    captured_ns = changes.pop("captured_ns", taken_ns)
+    sequence = changes.pop("sequence", k)
+    done_ns = changes.pop("done_ns", taken_ns + 40_000_000)
+    usual: dict[str, Any] = {"time_ns": START_NS + k * STEP_NS, "wTc": true_pose(k)}
+    state = State(changes.pop("state", "TRACKING"))
+    estimate = PoseEstimate(index=k, state=state, **(usual | changes))
+    return LiveFrame(sequence, taken_ns, taken_ns + 15_000_000, done_ns, estimate, captured_ns)
 
 
-def off(k: int, dx_m: float, **changes: Any) -> frames.FrameRow:
+def table(rows: Sequence[LiveFrame]) -> frames.Frames:
+    """Of frames made so."""
+    return frames.table(rows, [int(row.capture_ns or 0) for row in rows])
+
+
+def off(k: int, dx_m: float, **changes: Any) -> LiveFrame:
     """Frame k, that far off its true place along y."""
     wTc = true_pose(k)
     wTc[1, 3] += dx_m
     return row(k, wTc=wTc, **changes)
 
 
-def outcome(rows: Sequence[frames.FrameRow] | None = None, **changes: Any) -> Outcome:
+def outcome(rows: Sequence[LiveFrame] | None = None, **changes: Any) -> Outcome:
     """A run of which nothing was lost; `changes` are of `Run`, `accounts` of some of its counts."""
-    table = frames.table([row(k) for k in range(60)] if rows is None else rows)
-    n, localized = len(table), int(table.localized.sum())
+    made = table([row(k) for k in range(60)] if rows is None else rows)
+    n, localized = len(made), int(made.localized.sum())
     counts = {"captured": n, "sent": n, "received": n, "localized": localized}
     usual: dict[str, Any] = {
         "title": "by hand",
@@ -80,7 +84,7 @@ def outcome(rows: Sequence[frames.FrameRow] | None = None, **changes: Any) -> Ou
         "settings": {"localizer": {"seed": 1}},
         "versions": {"ground_station": "0.1.0"},
     }
-    return Outcome(Run(**(usual | changes)), table, truth(n) if n else None)
+    return Outcome(Run(**(usual | changes)), made, truth(n) if n else None)
 
 
 def only(made: Outcome, keep: Sequence[int]) -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -168,7 +167,7 @@ def test_recovery_is_from_an_outages_end_to_a_tracking_pose_of_a_frame_taken_aft
     # it was taken before, and is no recovery.
     made = [stand.row(k) for k in range(60) if not 15 <= k < 30]
     made[14] = stand.row(14, done_ns=at_s(1.05))
-    made = [dataclasses.replace(r, state="DEGRADED") if 30 <= r.sequence < 36 else r for r in made]
+    made = [stand.row(r.sequence, state="DEGRADED") if 30 <= r.sequence < 36 else r for r in made]
     run = stand.outcome(made, outages=outages((0.5, 1.0)))
     taken_s = 36 * stand.STEP_NS / 1e9
     rows = rows_of(run, recovery_s_max=0.25)
@@ -324,7 +323,7 @@ def test_a_case_is_judged_by_the_truth_that_it_names(tmp_path: Path) -> None:
     found = {}
     for name, truth in kinds.items():
         case = load_case(case_of(tmp_path, truth=truth, bounds=bounds))
-        rows = {row.name: row for row in judge.judge(run, case, "process")}
+        rows = {row.name: row for row in judge.judged(run, case, "process").rows}
         found[name] = rows["position_rmse_m_max"]
     assert found["recording"].value == pytest.approx(0.03) and found["recording"].holds is False
     assert found["survey"].value == pytest.approx(0.0, abs=1e-8) and found["survey"].holds is True
@@ -347,5 +346,5 @@ def test_a_case_whose_run_was_never_accepted_fails_and_says_how(tmp_path: Path) 
 
 def test_golden_without_a_bound_still_needs_its_file(tmp_path: Path) -> None:
     case = load_case(case_of(tmp_path, truth={"kind": "golden", "file": "c.golden.txt"}))
-    rows = judge.judge(stand.outcome(), case, "process")
+    rows = judge.judged(stand.outcome(), case, "process").rows
     assert [row.name for row in rows if row.holds is False] == ["truth"]

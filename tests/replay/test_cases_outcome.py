@@ -86,7 +86,7 @@ def test_every_bit_of_a_position_survives_the_file(positions: list[list[float]])
         wTc = np.eye(4)
         wTc[:3, 3] = position
         rows.append(stand.row(k, wTc=wTc))
-    made = frames.table(rows)
+    made = stand.table(rows)
     with tempfile.TemporaryDirectory() as folder:
         frames.write_csv(Path(folder, "frames.csv"), made)
         read = frames.read_csv(Path(folder, "frames.csv"))
@@ -103,8 +103,8 @@ def test_the_smallest_change_of_a_pose_is_another_pose() -> None:
     other[0, 1] = np.nextafter(other[0, 1], 1.0)
     assert frames.digest(wTc) == frames.digest(wTc.copy()) != frames.digest(other)
     found = first_difference(
-        frames.table([stand.row(k) for k in range(5)]),
-        frames.table([stand.row(k, wTc=other if k == 3 else stand.true_pose(k)) for k in range(5)]),
+        stand.table([stand.row(k) for k in range(5)]),
+        stand.table([stand.row(k, wTc=other if k == 3 else stand.true_pose(k)) for k in range(5)]),
     )
     assert found.count == 1 and found.time_ns == stand.START_NS + 3 * stand.STEP_NS
     assert "frame 3 is 0 m off" in found.told  # not a nanometre: the bits say it
@@ -128,7 +128,7 @@ def test_a_damaged_table_is_refused_by_its_line(
     tmp_path: Path, column: int, text: str, says: str
 ) -> None:
     path = tmp_path / "frames.csv"
-    frames.write_csv(path, frames.table([stand.row(k) for k in range(3)]))
+    frames.write_csv(path, stand.table([stand.row(k) for k in range(3)]))
     lines = path.read_text().splitlines()
     cells = lines[2].split(",")
     cells[column] = text
@@ -142,7 +142,7 @@ def test_a_damaged_table_is_refused_by_its_line(
 
 def test_a_table_cut_anywhere_is_refused_or_shorter(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
-    frames.write_csv(path, frames.table([stand.row(k) for k in range(3)]))
+    frames.write_csv(path, stand.table([stand.row(k) for k in range(3)]))
     whole = path.read_bytes()
     for size in range(0, len(whole), 7):
         path.write_bytes(whole[:size])
@@ -155,10 +155,10 @@ def test_a_table_cut_anywhere_is_refused_or_shorter(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"", "not JSON"),
+        (b"", "not a JSON object"),
         (b"[1]", "not a JSON object"),
-        (b"[" * 100_000, "not JSON"),
-        (b'{"seconds": NaN}', "not JSON"),
+        (b"[" * 100_000, "not a JSON object"),
+        (b'{"seconds": NaN}', "not a JSON object"),
         (b'{"sconds": 1}', "unknown key 'sconds'"),
         (b'{"schema": "blimp.outcome/2"}', "'schema' is 'blimp.outcome/2'"),
         (b'{"accounts": {"sent": 1.5}}', "'accounts.sent' must be a whole number"),
@@ -180,7 +180,7 @@ def test_a_result_that_is_none_is_refused_in_one_line(
 
 def test_a_quaternion_that_is_none_is_no_pose(tmp_path: Path) -> None:
     """As another's program, or a flipped bit, may have written it."""
-    frames.write_csv(tmp_path / "f.csv", frames.table([stand.row(k) for k in range(3)]))
+    frames.write_csv(tmp_path / "f.csv", stand.table([stand.row(k) for k in range(3)]))
     lines = (tmp_path / "f.csv").read_text().splitlines()
     cells = lines[2].split(",")
     cells[11:15] = ["0.0"] * 4

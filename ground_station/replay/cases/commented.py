@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Collection, Mapping
 from typing import Any
 
 import tomli_w
 
-_WIDTH = 98
+_LINES = textwrap.TextWrapper(98, break_long_words=False, break_on_hyphens=False)
 _FEW = 6
 """More choices than this stand in a comment nowhere: the key's description says what they are."""
 
@@ -41,7 +42,7 @@ def _table(
     for item, value in plain:
         if name in brief and (value is None or value is False):
             continue
-        lines += [f"# {line}" for line in _wrapped(_about(item))]
+        lines += [f"# {line}" for line in _LINES.wrap(_about(item))]
         lines += _remark(remarks, prefix + item.name)
         lines.append(f"# {item.name} =" if value is None else f"{item.name} = {toml(value)}")
     for item, value in tables:
@@ -81,14 +82,3 @@ def _about(item: dataclasses.Field[Any]) -> str:
 
 def _short(value: float) -> str:
     return str(int(value)) if value == int(value) else repr(value)
-
-
-def _wrapped(text: str) -> list[str]:
-    lines, line = [], ""
-    for word in text.split():
-        if line and len(line) + 1 + len(word) > _WIDTH:
-            lines.append(line)
-            line = word
-        else:
-            line = f"{line} {word}".strip()
-    return [*lines, line]

@@ -20,6 +20,7 @@ from ground_station.files import write_text
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
+from ground_station.replay.live import LiveFrame
 from pi_firmware.wire.text import printable
 
 UNKNOWN = -1
@@ -92,41 +93,27 @@ class Frames:
         return Trajectory(self.time_ns[k], self.position_m[k], self.quaternion_xyzw[k])
 
 
-@dataclass(frozen=True)
-class FrameRow:
-    """One frame on its way into the table; `wTc` (4, 4) or None."""
-
-    sequence: int
-    time_ns: int
-    captured_ns: int
-    arrival_ns: int
-    done_ns: int
-    state: str
-    reason: str = ""
-    relocalized: bool = False
-    wTc: F64 | None = None
-
-
-def table(rows: Sequence[FrameRow]) -> Frames:
-    """The table of some frames."""
-    n = len(rows)
-    position, quaternion = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
-    digests = [""] * n
-    for k, row in enumerate(rows):
-        if row.wTc is None:
-            continue
-        digests[k] = digest(row.wTc)
-        position[k] = row.wTc[:3, 3]
-        if np.isfinite(row.wTc).all():
-            quaternion[k] = poses.to_quaternion(row.wTc)
+def table(rows: Sequence[LiveFrame], captured_ns: Sequence[int]) -> Frames:
+    """The table of some frames, and when each was captured by the ground's clock."""
+    estimates = [row.estimate for row in rows]
+    position, quaternion = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
+    for k, estimate in enumerate(estimates):
+        if estimate.wTc is not None:
+            position[k] = estimate.wTc[:3, 3]
+            if np.isfinite(estimate.wTc).all():
+                quaternion[k] = poses.to_quaternion(estimate.wTc)
+    times = [
+        [row.sequence, row.estimate.time_ns, captured, row.arrival_ns, row.done_ns]
+        for row, captured in zip(rows, captured_ns, strict=True)
+    ]
     return Frames(
-        **_columns([[getattr(row, name) for name in _TIMES] for row in rows]),
-        state=tuple(row.state for row in rows),
-        reason=tuple(row.reason for row in rows),
-        relocalized=np.array([row.relocalized for row in rows], dtype=bool),
+        **_columns(times),
+        state=tuple(estimate.state.value for estimate in estimates),
+        reason=tuple(estimate.reason for estimate in estimates),
+        relocalized=np.array([estimate.relocalized for estimate in estimates], dtype=bool),
         position_m=position,
         quaternion_xyzw=quaternion,
-        digest=tuple(digests),
+        digest=tuple("" if e.wTc is None else digest(e.wTc) for e in estimates),
     )
 
 

@@ -51,14 +51,6 @@ class Judged:
         return not self.error and not self.missed
 
 
-def judge(outcome: Outcome, case: Case, kind: str, again: Outcome | None = None) -> list[Row]:
-    """All rows of a run: what must always hold, the case's bounds, then what nobody asked.
-
-    `again` is a second run for `bounds.identical`. A truth that cannot be read fails what needs it.
-    """
-    return rows(outcome, case.limits(kind), _reference(case), again)
-
-
 def judged(
     outcome: Outcome,
     case: Case,
@@ -66,10 +58,16 @@ def judged(
     *,
     again: Outcome | None = None,
     seconds: float = 0.0,
-    notes: Sequence[str] = (),
 ) -> Judged:
-    """A case's judgement with all that its page shows."""
-    reference = _reference(case)
+    """A case's judgement with all that its page shows; `again` is for `bounds.identical`.
+
+    A truth that cannot be read fails what needs it.
+    """
+    reference: Reference | str | None
+    try:
+        reference = reference_of(case)
+    except BlimpError as error:
+        reference = str(error)
     return Judged(
         case.name,
         case.title,
@@ -78,16 +76,9 @@ def judged(
         outcome,
         reference if isinstance(reference, Reference) else None,
         seconds,
-        notes=[*outcome.run.notes, *notes],
+        notes=outcome.run.notes,
         again=again,
     )
-
-
-def _reference(case: Case) -> Reference | str | None:
-    try:
-        return reference_of(case)
-    except BlimpError as error:
-        return str(error)
 
 
 def rows(
@@ -96,7 +87,10 @@ def rows(
     reference: Reference | str | None,
     again: Outcome | None = None,
 ) -> list[Row]:
-    """The same of bounds and a truth; `reference` in words is why there is none."""
+    """All rows of a run: what must always hold, the bounds, then what nobody asked.
+
+    `reference` in words is why there is no truth.
+    """
     figures = measure.figures(outcome, reference)
     golden = reference.golden if isinstance(reference, Reference) else None
     return [

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import yaml
 
 from ground_station.errors import InputError
@@ -183,22 +183,15 @@ def _read_run(path: Path) -> Run:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
-        document = json.loads(path.read_bytes(), parse_constant=_refuse)
+        document = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
     except FileNotFoundError:
         made = f"blimp replay RECORDING --map MAP --out {path.parent}"
         raise InputError(f"{path.parent}: no run's outcome is there; {made} writes one") from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, RecursionError):
-        raise InputError(f"{path}: not JSON") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: not a JSON object")
+    except (msgspec.DecodeError, RecursionError):
+        raise InputError(f"{path}: not a JSON object") from None
     return config.from_mapping(document, Run, where=str(path))
-
-
-def _refuse(constant: str) -> None:
-    """JSON has no NaN, though Python's parser takes it."""
-    raise ValueError(constant)
 
 
 def _write_floorplan(folder: Path, plan: FloorPlan) -> None:

@@ -14,42 +14,26 @@ from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.store import Map
 from ground_station.replay.cases import frames, program
 from ground_station.replay.cases.outcome import Accounts, Outage, Outcome, Run, map_sha256
-from ground_station.replay.live import LiveResult
 from ground_station.replay.replay import ReplayResult
 from ground_station.replay.resources import Side
 from pi_firmware.wire import messages
 
 
 def outcome_of(
-    result: ReplayResult,
-    map_: Map,
-    *,
-    title: str = "",
-    case: str = "",
-    payload: str = "process",
-    link: str = "loopback",
-    seconds: float = 0.0,
-    outages: Sequence[Outage] = (),
-    link_counts: dict[str, int] | None = None,
-    truth: Trajectory | None = None,
-    notes: Sequence[str] = (),
+    result: ReplayResult, map_: Map, *, outages: Sequence[Outage] = (), **more: Any
 ) -> Outcome:
-    """What a replay found, ready to be written, judged and compared.
+    """What a replay found, ready to be written, judged and compared; `more` is of `Run`.
 
-    `truth` stands in place of the recording's own. `outages` are by this machine's wall clock. Of a
-    payload elsewhere whose resources nobody measured, its health message tells.
+    `outages` are by this machine's wall clock. Of a payload elsewhere whose resources nobody
+    measured, its health message tells.
     """
     settings, live = result.settings, result.live
     payload_side, health = result.payload_side, live.payload.health
     if payload_side is None and health is not None:
         payload_side = Side(health.memory_MB, health.cpu, "its health message")
-    truth = result.truth if truth is None else truth
-    table = table_of(live)
+    captured_ns = live.captured_ns() if live.clock else [frames.UNKNOWN] * len(live.frames)
+    table = frames.table(live.frames, captured_ns)
     run = Run(
-        title=title or f"Replay of {settings.recording.name}",
-        case=case,
-        payload=payload,
-        link=link,
         recording=settings.recording.name,
         map=map_.info.name,
         map_sha256=map_sha256(map_),
@@ -59,11 +43,9 @@ def outcome_of(
         rate_hz=settings.rate_hz,
         seed=result.localizer.seed,
         began=datetime.now(UTC).isoformat(timespec="seconds"),
-        seconds=seconds,
         complete=live.complete,
         accounts=Accounts(**live.accounts()),
         stream=live.payload.stream,
-        link_counts=dict(link_counts or {}),
         clock_offset=live.clock,
         outages=[dataclasses.asdict(outage) for outage in outages],
         battery=_document(live.payload.battery),
@@ -77,29 +59,9 @@ def outcome_of(
             "localizer": dataclasses.asdict(result.localizer),
             "camera": result.camera.as_dict(),
         },
-        notes=list(notes),
+        **{"title": f"Replay of {settings.recording.name}"} | more,
     )
-    return Outcome(run, table, within(truth, table), floorplan_of(map_))
-
-
-def table_of(live: LiveResult) -> frames.Frames:
-    """The frames of a live session as a table."""
-    known = live.clock is not None
-    rows = [
-        frames.FrameRow(
-            sequence=frame.sequence,
-            time_ns=frame.estimate.time_ns,
-            captured_ns=frame.done_ns - round(1e6 * late_ms) if known else frames.UNKNOWN,
-            arrival_ns=frame.arrival_ns,
-            done_ns=frame.done_ns,
-            state=frame.estimate.state.value,
-            reason=frame.estimate.reason,
-            relocalized=frame.estimate.relocalized,
-            wTc=frame.estimate.wTc,
-        )
-        for frame, late_ms in zip(live.frames, live.latency_ms().tolist(), strict=True)
-    ]
-    return frames.table(rows)
+    return Outcome(run, table, within(result.truth, table), floorplan_of(map_))
 
 
 def within(truth: Trajectory | None, table: frames.Frames) -> Trajectory | None:
