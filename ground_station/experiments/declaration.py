@@ -134,30 +134,35 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Case:
-    """One row: a map, a flight and settings; each preset localizes it, once for each seed."""
+class Row:
+    """What an experiment, or a case of it on top, may say: a map, a flight and settings."""
 
-    experiment: str
-    name: str
-    title: str
-    map: MapSpec
-    flight: FlightDeclaration
-    alter: Alteration
-    localizer: Table
-    presets: tuple[str, ...]
-    thesis: Figures
+    title: str = config.key("", "as shown")
+    question: str = config.key("", "what is asked")
+    thesis_source: str = config.key("", "where the thesis has its figures")
+    thesis_times: Times = config.table(Times)
+    level: str = config.key("", "what the cases vary, where that is a number")
+    presets: list[str] = config.key(list(PRESETS), "which of the localizer's", choices=PRESETS)
+    map: MapSpec = config.table(MapSpec)
+    flight: FlightDeclaration = config.table(FlightDeclaration)
+    alter: Alteration = config.table(Alteration)
+    localizer: dict[str, Any] = config.key({}, "checked by its settings, when a preset is known")
+    thesis: Figures = config.table(Figures)
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """A table: `level` names what its cases vary, where that is a number."""
+class Case(Row):
+    """One row of a table: each preset localizes its flight, once for each seed."""
 
-    name: str
-    title: str
-    question: str
-    thesis: str
-    level: str
-    times: Times
+    experiment: str = ""
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Experiment(Row):
+    """A table."""
+
+    name: str = ""
     cases: list[Case] = field(default_factory=list)
 
 
@@ -171,68 +176,45 @@ class Declaration:
 
 
 @dataclass(frozen=True)
-class _Row:
-    """What an experiment, or a case of it on top, may say."""
+class _File:
+    """What stands under `default` holds for every case unless its experiment or itself says
+    otherwise; a map flies as its case does unless `map.flight` says otherwise.
+    """
 
-    title: str = config.key("", "as shown")
-    question: str = config.key("", "what is asked")
-    thesis_source: str = config.key("", "where the thesis has its figures")
-    thesis_times: Times = config.table(Times)
-    level: str = config.key("", "what the cases vary")
-    presets: list[str] = config.key(list(PRESETS), "which of the localizer's", choices=None)
-    map: MapSpec = config.table(MapSpec)
-    flight: FlightDeclaration = config.table(FlightDeclaration)
-    alter: Alteration = config.table(Alteration)
-    thesis: Figures = config.table(Figures)
+    seeds: list[int] = config.key([1, 2, 3, 4, 5], "of the flights", low=0, high=2**31 - 1)
+    default: dict[str, Any] = config.key({}, "a `Row`")
+    experiment: dict[str, Any] = config.key({}, "a `Row` with a table `case` of such by name")
+    claim: dict[str, Any] = config.key({}, "a `Claim` each")
+
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError("'seeds' must be a list of different whole numbers")
 
 
 def load(path: str | Path = SHIPPED, only: list[str] | None = None) -> Declaration:
-    """Reads experiments; `only` names those wanted. Raises `ConfigError` or `InputError`.
-
-    What stands under `[default]` holds for every case unless its experiment or itself says
-    otherwise; a map flies as its case does unless `map.flight` says otherwise.
-    """
-    document = config.read(path)
-    where = str(path)
-    for key in sorted(set(document) - _TOP):
-        known = ", ".join(sorted(_TOP))
-        raise ConfigError(f"{where}: unknown key '{key}' (known here: {known})")
-    seeds = document.get("seeds", [1, 2, 3, 4, 5])
-    if not (
-        isinstance(seeds, list)
-        and seeds
-        and all(type(seed) is int and 0 <= seed < 2**31 for seed in seeds)
-        and len(set(seeds)) == len(seeds)
-    ):
-        raise ConfigError(f"{where}: 'seeds' must be a list of different whole numbers")
-    declared = _table(document, "experiment", where)
-    names = list(declared) if only is None else only
+    """Reads experiments; `only` names those wanted. Raises `ConfigError` or `InputError`."""
+    file, where = config.load(path, _File), str(path)
+    names = list(file.experiment) if only is None else only
     for name in names:
-        if name not in declared:
-            known = ", ".join(declared)
+        if name not in file.experiment:
+            known = ", ".join(file.experiment)
             raise InputError(f"there is no experiment '{name:.60}' (there are: {known})")
-    default = _table(document, "default", where)
-    experiments = [_experiment(name, declared[name], default, where) for name in names]
-    claims = _claims(_table(document, "claim", where), declared, where)
-    return Declaration(tuple(seeds), experiments, claims)
+    experiments = [_experiment(file, name, where) for name in names]
+    return Declaration(tuple(file.seeds), experiments, _claims(file, where))
 
 
-_TOP = {"seeds", "default", "experiment", "claim"}
-
-
-def _claims(tables: Table, declared: Table, where: str) -> list[Claim]:
+def _claims(file: _File, where: str) -> list[Claim]:
     """Claims in the order of the file; raises `ConfigError` for one of a row that is not there."""
+    rows = set(file.experiment)
+    for name in file.experiment:
+        experiment = _table(file.experiment, name, f"{where}: experiment")
+        rows |= {f"{name}.{case}" for case in _table(experiment, "case", where)}
     found = []
-    for name, table in tables.items():
+    for name in file.claim:
         at = f"{where}: claim '{name}'"
-        if not isinstance(table, Mapping):
-            raise ConfigError(f"{at} must be a table")
-        claim = config.from_mapping(table, Claim, where=at)
+        claim = config.from_mapping(_table(file.claim, name, f"{where}: claim"), Claim, where=at)
         for key, row in (("row", claim.row), ("against", claim.against)):
-            experiment, dot, case = row.partition(".")
-            known = case in _table(_table(declared, experiment, where), "case", where)
-            known |= bool(row) and not dot and experiment in declared
-            if (row or key == "row") and not known:
+            if row not in rows and (row or key == "row"):
                 raise ConfigError(f"{at}: '{key}' names '{row:.60}', and there is no such row")
         if (claim.most is None) == (claim.least is None):
             raise ConfigError(f"{at}: one of 'most' and 'least' must be given")
@@ -283,48 +265,33 @@ def with_features(declared: Declaration, names: list[str]) -> Declaration:
     return dataclasses.replace(declared, experiments=experiments, claims=[])
 
 
-def _experiment(name: str, table: Any, default: Table, where: str) -> Experiment:
+def _experiment(file: _File, name: str, where: str) -> Experiment:
+    own = dict(_table(file.experiment, name, f"{where}: experiment"))
     where = f"{where}: experiment '{name}'"
-    if not isinstance(table, Mapping):
-        raise ConfigError(f"{where} must be a table")
-    cases = _table(table, "case", where) or {"": {}}
-    own = {key: value for key, value in table.items() if key != "case"}
-    base = merged(default, own)
-    head = config.from_mapping(_without_localizer(base), _Row, where=where)
-    experiment = Experiment(
-        name, head.title or name, head.question, head.thesis_source, head.level, head.thesis_times
-    )
-    for case, changes in cases.items():
-        if not isinstance(changes, Mapping):
-            raise ConfigError(f"{where}, case '{case}' must be a table")
-        experiment.cases.append(_case(experiment, case, merged(base, changes), changes, where))
-    return experiment
+    cases = _table(own, "case", where) or {"": {}}
+    base = merged(file.default, {key: value for key, value in own.items() if key != "case"})
+    head = config.from_mapping(base, Row, where=where)
+    title = head.title or name
+    made = [
+        _case(base, case, _table(cases, case, f"{where}, case"), name, title, where)
+        for case in cases
+    ]
+    return Experiment(**vars(head) | {"title": title}, name=name, cases=made)
 
 
-def _case(experiment: Experiment, name: str, whole: Table, changes: Table, where: str) -> Case:
+def _case(base: Table, name: str, changes: Table, experiment: str, title: str, where: str) -> Case:
     where = f"{where}, case '{name}'"
-    mapped = dict(_table(whole, "map", where))
+    whole = merged(base, changes)
+    mapped = _table(whole, "map", where)
     # A map is of the case's own surroundings, but not of its alterations, bit rate or pace.
     flown = {k: v for k, v in _table(whole, "flight", where).items() if k in _OF_THE_PLACE}
-    mapped["flight"] = merged(flown, _table(mapped, "flight", where))
-    document = _without_localizer(whole) | {"map": mapped}
-    row = config.from_mapping(document, _Row, where=where)
-    unknown = [preset for preset in row.presets if preset not in PRESETS]
-    if unknown:
-        raise ConfigError(
-            f"{where}: 'presets' names '{unknown[0]:.60}'; allowed: {', '.join(PRESETS)}"
-        )
-    return Case(
-        experiment=experiment.name,
-        name=name,
-        title=str(changes.get("title", "")) or name or experiment.title,
-        map=row.map,
-        flight=row.flight,
-        alter=row.alter,
-        localizer=_table(whole, "localizer", where),
-        presets=tuple(preset for preset in PRESETS if preset in row.presets),
-        thesis=row.thesis,
-    )
+    flight = merged(flown, _table(mapped, "flight", where))
+    row = config.from_mapping(whole | {"map": {**mapped, "flight": flight}}, Row, where=where)
+    more = {
+        "title": str(changes.get("title", "")) or name or title,
+        "presets": [preset for preset in PRESETS if preset in row.presets],
+    }
+    return Case(**vars(row) | more, experiment=experiment, name=name)
 
 
 _OF_THE_PLACE = ("scene", "folder", "truth", "camera")
@@ -351,8 +318,3 @@ def _table(document: Table, key: str, where: str) -> Table:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{where}: '{key}' must be a table")
     return value
-
-
-def _without_localizer(document: Table) -> dict[str, Any]:
-    """The localizer's keys are checked by its own settings, when a preset is known."""
-    return {key: value for key, value in document.items() if key != "localizer"}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ground_station.arrays import F64
+from ground_station.errors import InputError
 from ground_station.evaluation import ate
 from ground_station.experiments.alone import FEATURES, Alone
 from ground_station.experiments.alter import altered, arrivals, scaled_camera
@@ -107,15 +108,14 @@ def measure(
 
 
 def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory, start_ns: int) -> dict[str, Any]:
-    found = _pairs(results.trajectory(estimates), truth)
-    nothing = ("position_m", "rotation_deg", "position_zhang_m", "aligned_m", "p95_m")
+    found = _against(results.trajectory(estimates), truth)
     if found is None:
+        nothing = ("position_m", "rotation_deg", "position_zhang_m", "aligned_m", "p95_m")
         return dict.fromkeys(nothing) | {"series": {}}
-    estimate, true = found
-    errors = ate.errors(estimate, true)
+    estimate, errors, aligned = found.estimate, found.errors["none"], found.ate()["se3"]
     return {
         **errors.rmse(),
-        "aligned_m": _aligned_m(estimate, true),
+        "aligned_m": aligned and aligned["position_m"],
         "p95_m": float(np.percentile(errors.position_m, 95)),
         "series": {
             "time_s": _rounded((estimate.time_ns - start_ns) / 1e9),
@@ -127,15 +127,13 @@ def _errors(estimates: Sequence[PoseEstimate], truth: Trajectory, start_ns: int)
     }
 
 
-def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory] | None:
-    if not len(estimate):
+def _against(estimate: Trajectory, truth: Trajectory) -> ate.Evaluation | None:
+    """The errors, `se3` as a comparison without a common frame sees them; None where no pose has a
+    true one of its time."""
+    try:
+        return ate.evaluate(estimate, truth, _SAME_S)
+    except InputError:
         return None
-    near = np.array(
-        [abs(int(truth.time_ns[truth.nearest(int(t))]) - int(t)) for t in estimate.time_ns]
-    )
-    if not (near <= _SAME_S * 1e9).any():
-        return None
-    return ate.synchronize(estimate, truth, _SAME_S)
 
 
 def _registration_m(map_: Map, truth: Trajectory) -> float | None:
@@ -143,16 +141,6 @@ def _registration_m(map_: Map, truth: Trajectory) -> float | None:
     truth."""
     off_m = displacement(map_, truth.position_m)
     return None if off_m is None else float(np.sqrt(np.mean(np.square(off_m))))
-
-
-def _aligned_m(estimate: Trajectory, truth: Trajectory) -> float | None:
-    """RMSE after SE(3): what a comparison without a common frame would have seen."""
-    from ground_station.errors import GeometryError
-
-    try:
-        return ate.errors(estimate, truth, "se3").rmse()["position_m"]
-    except GeometryError:
-        return None
 
 
 def _off(e: PoseEstimate, truth: Trajectory) -> F64 | None:
@@ -186,12 +174,10 @@ _CHI2_95_6 = 12.591587
 
 
 def _smoothed(states: Sequence[Kinematics], truth: Trajectory) -> dict[str, Any]:
-    if not states:
-        return {"smoothed_m": None}
     ordered = sorted(states, key=lambda state: state.time_ns)
     times = [state.time_ns for state in ordered]
-    found = _pairs(Trajectory.from_poses(times, [state.wTc for state in ordered]), truth)
-    return {"smoothed_m": None if found is None else ate.errors(*found).rmse()["position_m"]}
+    found = _against(Trajectory.from_poses(times, [state.wTc for state in ordered]), truth)
+    return {"smoothed_m": None if found is None else found.errors["none"].rmse()["position_m"]}
 
 
 def _recovery_s(

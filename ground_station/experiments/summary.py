@@ -40,8 +40,8 @@ def summarise(
                 "name": experiment.name,
                 "title": experiment.title,
                 "question": experiment.question,
-                "thesis_source": experiment.thesis,
-                "thesis_times": asdict(experiment.times),
+                "thesis_source": experiment.thesis_source,
+                "thesis_times": asdict(experiment.thesis_times),
                 "level": experiment.level,
                 "cases": cases,
             }

@@ -134,7 +134,7 @@ def test_a_claim_of_nothing_is_refused_by_name(tmp_path, text, words):
     with pytest.raises(ConfigError, match=words):
         declaration.load(path)
     path.write_text("claim.c = 3\n[experiment.light.case.noon]\n")
-    with pytest.raises(ConfigError, match="claim 'c' must be a table"):
+    with pytest.raises(ConfigError, match="claim: 'c' must be a table"):
         declaration.load(path)
 
 

@@ -48,11 +48,11 @@ def test_a_case_is_the_default_with_its_experiments_and_its_own_words_on_top(tmp
     assert (light.title, light.question) == ("Light", "Which?")
     assert (noon.title, noon.presets, noon.thesis.position_m) == (
         "noon",
-        ("thesis", "default"),
+        ["thesis", "default"],
         0.1,
     )
     assert (noon.flight.scene, noon.flight.light, noon.flight.rate_hz) == ("office", "noon", 10.0)
-    assert (sunset.title, sunset.presets) == ("at sunset", ("default",))
+    assert (sunset.title, sunset.presets) == ("at sunset", ["default"])
     assert sunset.flight.light == "sunset" and sunset.thesis.position_m is None
     assert sunset.localizer == {"gate": {"min_entropy_bits": 7.0}} and noon.localizer == {}
 
@@ -95,7 +95,11 @@ def test_the_shipped_file_holds_every_experiment_of_the_thesis():
             "bitrate_kbps' is -1; allowed",
         ),
         ("flight.bitrate_kbps = 300", "flight.rate_hz = nan", "finite"),
-        ('presets = ["default"]', 'presets = ["best"]', "'presets' names 'best'; allowed: thesis"),
+        (
+            'presets = ["default"]',
+            'presets = ["best"]',
+            "'presets'.0. is 'best'; allowed: 'thesis'",
+        ),
         ("images = 50", 'images = "many"', "'map.images' must be a whole number"),
         ("thesis.position_m = 0.1", "thesis = 3", "'thesis' must be a table"),
     ],
