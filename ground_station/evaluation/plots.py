@@ -15,7 +15,7 @@ from ground_station.evaluation.ate import Evaluation
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, legend, sheet, themed
+from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend
 
 GAP_S = 1.0
 """A pause longer than this breaks a line: nothing was estimated there."""
@@ -24,8 +24,7 @@ GAP_S = 1.0
 def evaluation(result: Evaluation, align: str = "none") -> Figure:
     """Path, position error and rotation error of one alignment on one sheet."""
     errors = result.errors[align]
-    figure = sheet((8.0, 9.6), LIGHT)
-    path, upper, lower = figure.subplots(3, 1, height_ratios=[3, 1, 1])
+    figure, (path, upper, lower) = figure_of((8.0, 9.6), LIGHT, 3, height_ratios=[3, 1, 1])
     aligned = _aligned(result.estimate, errors.alignment)
     seconds = (result.estimate.time_ns - result.estimate.time_ns[0]) / 1e9
     path.plot(
@@ -45,8 +44,6 @@ def evaluation(result: Evaluation, align: str = "none") -> Figure:
     lower.plot(*broken(seconds, errors.rotation_deg), color=LIGHT.second, lw=1.1)
     lower.set_ylabel("rotation, °")
     lower.set_xlabel("time, s")
-    for axes in (path, upper, lower):
-        themed(axes, LIGHT)
     upper.set_ylim(bottom=0)
     lower.set_ylim(bottom=0)
     legend(path, LIGHT)

@@ -11,11 +11,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from ground_station.arrays import F64
-from ground_station.evaluation.plots import show_floorplan
+from ground_station.evaluation.plots import broken, show_floorplan
 from ground_station.experiments.tables import NAMES
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import Theme, sheet, themed
+from ground_station.presentation.theme import Theme, figure_of, legend
 
 _MOST_PATHS = 6
 _LEAST_M, _MOST_M = 0.002, 0.5
@@ -40,7 +39,7 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, theme: Theme)
     panel_m = plan.size_m if plan is not None else _extent([series for _, series in shown])
     wide = _WIDTH_IN / columns - _LABELS_IN
     tall = min(wide * panel_m[1] / panel_m[0], _HIGHEST_IN) + _LABELS_IN
-    figure, axes = _figure(rows, columns, (_WIDTH_IN, tall * rows + _BAR_IN), theme)
+    figure, axes = figure_of((_WIDTH_IN, tall * rows + _BAR_IN), theme, rows, columns, label_size=8)
     points = None
     for one, (title, series) in zip(axes, shown, strict=False):
         if plan is not None:
@@ -69,19 +68,19 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, theme: Theme)
 
 def over_time(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     """Position error of each case's first seed over time: thesis dashed, alone dotted."""
-    figure, (axes,) = _figure(1, 1, (8.0, 3.2), theme)
+    figure, (axes,) = figure_of((8.0, 3.2), theme, label_size=8)
     for hue, case in zip(_hues(len(cases)), cases, strict=True):
         for preset, style in _STYLES.items():
             series = first_series(case, preset)
             if not series:
                 continue
-            t, e = _broken(series["time_s"], 100 * np.asarray(series["position_m"]))
+            t, e = broken(series["time_s"], 100 * np.asarray(series["position_m"]))
             label = str(case["title"]) if preset == "default" else None
             axes.plot(t, e, style, color=hue, linewidth=1.0, label=label)
     _logarithmic(axes, y=True)
     axes.set_xlabel("time, s")
     axes.set_ylabel("position error, cm")
-    _legend(axes, theme)
+    legend(axes, theme, loc="best", fontsize=8)
     return figure
 
 
@@ -90,7 +89,7 @@ def distribution(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
 
     Frames that were not localized count: a line that ends below 1 has lost the rest.
     """
-    figure, (axes,) = _figure(1, 1, (8.0, 3.4), theme)
+    figure, (axes,) = figure_of((8.0, 3.4), theme, label_size=8)
     for hue, case in zip(_hues(len(cases)), cases, strict=True):
         for preset, style in _STYLES.items():
             runs = [r for r in case["presets"].get(preset, {}).get("runs", []) if "failed" not in r]
@@ -107,13 +106,13 @@ def distribution(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("position error, cm")
     axes.set_ylabel("share of frames")
-    _legend(axes, theme)
+    legend(axes, theme, loc="best", fontsize=8)
     return figure
 
 
 def sweep(cases: Sequence[dict[str, Any]], level: str, theme: Theme) -> Figure:
     """Position error and share localized over what the cases vary, mean and spread."""
-    figure, (upper, lower) = _figure(2, 1, (8.0, 4.6), theme)
+    figure, (upper, lower) = figure_of((8.0, 4.6), theme, 2, label_size=8, sharex=True)
     places = np.arange(len(cases))
     for (preset, style), hue in zip(
         _STYLES.items(), (theme.second, theme.limit, theme.estimate), strict=True
@@ -133,7 +132,7 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, theme: Theme) -> Figure:
     lower.set_ylim(0, 104)
     lower.set_xticks(places, [str(case["title"]) for case in cases])
     lower.set_xlabel(level)
-    _legend(upper, theme)
+    legend(upper, theme, loc="best", fontsize=8)
     return figure
 
 
@@ -173,30 +172,3 @@ def _value(found: dict[str, float] | None, key: str) -> float:
 
 def _hues(count: int) -> list[str]:
     return [_HUES[k % len(_HUES)] for k in range(count)]
-
-
-def _broken(time_s: Sequence[float], values: F64) -> tuple[F64, F64]:
-    """With a NaN where more than two frames are missing: no line over a gap."""
-    t = np.asarray(time_s, np.float64)
-    steps = np.diff(t)
-    gaps = np.flatnonzero(steps > 3.5 * np.median(steps)) + 1 if len(steps) else np.empty(0, int)
-    return np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan)
-
-
-def _figure(
-    rows: int, columns: int, size_inches: tuple[float, float], theme: Theme
-) -> tuple[Figure, list[Axes]]:
-    figure = sheet(size_inches, theme)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex="col" if columns == 1 else False)
-    axes = list(grid.ravel())
-    for one in axes:
-        themed(one, theme, 8)
-    return figure, axes
-
-
-def _legend(axes: Axes, theme: Theme) -> None:
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(
-            loc="best", fontsize=8, facecolor=theme.paper, edgecolor=theme.grid,
-            labelcolor=theme.ink, framealpha=0.85,
-        )  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -44,13 +45,19 @@ def sheet(size_inches: tuple[float, float], theme: Theme) -> Figure:
 
 
 def figure_of(
-    rows: int, size_inches: tuple[float, float], theme: Theme
+    size_inches: tuple[float, float],
+    theme: Theme,
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    label_size: float | None = None,
+    **grid: Any,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure in that theme and its axes, one below the other with the same x."""
+    """A figure in that theme and its axes, row by row; `grid` is as `Figure.subplots` takes it."""
     figure = sheet(size_inches, theme)
-    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    axes = list(figure.subplots(rows, columns, squeeze=False, **grid).ravel())
     for one in axes:
-        themed(one, theme)
+        themed(one, theme, label_size)
     return figure, axes
 
 
@@ -69,17 +76,19 @@ def themed(axes: Axes, theme: Theme, label_size: float | None = None) -> None:
         spine.set_color(theme.ink)
 
 
-def legend(axes: Axes, theme: Theme) -> None:
-    """A legend in that theme, where anything has a label."""
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(
-            loc="upper right",
-            facecolor=theme.paper,
-            edgecolor=theme.grid,
-            labelcolor=theme.ink,
-            fontsize=9,
-            framealpha=0.9,
-        )
+ABOVE: dict[str, Any] = {
+    "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4, "frameon": False,
+    "handlelength": 1.6, "borderpad": 0.0, "columnspacing": 1.2,
+}  # fmt: skip
+"""A legend over the axes, not in them."""
+
+
+def legend(axes: Axes, theme: Theme, **where: Any) -> None:
+    """A legend in that theme, where anything has a label; `where` as `Axes.legend` takes it."""
+    usual = {"loc": "upper right", "fontsize": 9, "framealpha": 0.9, "facecolor": theme.paper,
+             "edgecolor": theme.grid, "labelcolor": theme.ink}  # fmt: skip
+    if axes.get_legend_handles_labels()[1] or "handles" in where:
+        axes.legend(**usual | where)
 
 
 def png(figure: Figure, dpi: int = _DPI) -> bytes:

@@ -45,7 +45,7 @@ def write_plan(folder: Path, image: np.ndarray, origin: list[float]) -> Path:
 
 
 def drawn(plan: FloorPlan) -> Figure:
-    figure, (axes,) = figure_of(1, (8.0, 5.6), LIGHT)
+    figure, (axes,) = figure_of((8.0, 5.6), LIGHT)
     plots.show_floorplan(axes, plan, LIGHT)
     axes.set_aspect("equal")
     return figure

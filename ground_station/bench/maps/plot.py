@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ground_station.presentation.theme import LIGHT, figure_of
+from ground_station.presentation.theme import LIGHT, figure_of, legend
 
 _SIGNS = "osD^vXP"
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -21,7 +21,7 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
     `rows` as `scale.measured` gives them; a line each for threads and for so many processes. A
     dashed line shows time that grows as the images do, another the memory allowed.
     """
-    figure, (upper, lower) = figure_of(2, (8.0, 7.2), LIGHT)
+    figure, (upper, lower) = figure_of((8.0, 7.2), LIGHT, 2, sharex=True)
     for k, processes in enumerate(dict.fromkeys(row["processes"] for row in rows)):
         mine = [row for row in rows if row["processes"] == processes]
         x = [row["images"] for row in mine]
@@ -43,7 +43,7 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylabel(name)
-        axes.legend(frameon=False, labelcolor=LIGHT.ink, fontsize=8)
+        legend(axes, LIGHT, loc="best", frameon=False, fontsize=8)
     lower.set_xticks(x, [str(size) for size in x])
     lower.xaxis.set_minor_formatter(NullFormatter())
     lower.set_xlabel("images of a simulated campus")

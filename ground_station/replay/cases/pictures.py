@@ -19,7 +19,7 @@ from ground_station.evaluation import plots
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.map.floorplan import FloorPlan
-from ground_station.presentation.theme import LIGHT, Theme, figure_of, sheet, themed
+from ground_station.presentation.theme import ABOVE, LIGHT, Theme, figure_of, legend
 
 WIDTH_IN = 6.6
 """Narrow, so that what is written in a picture can be read on a narrow screen."""
@@ -69,7 +69,7 @@ def path(
     (3,) where two runs part. Where nothing is off a colour scale would only mislead: it ends at a
     millimetre at least.
     """
-    figure, (axes,) = figure_of(1, (WIDTH_IN, 4.9), theme)
+    figure, (axes,) = figure_of((WIDTH_IN, 4.9), theme)
     if floorplan is not None:
         plots.show_floorplan(axes, floorplan, theme)
     axes.set_aspect("equal")
@@ -99,7 +99,7 @@ def path(
         axes.plot(*first_m[:2], "o", mfc="none", mec=theme.second, ms=13, mew=2, zorder=4,
                   label="first difference")  # fmt: skip
     _zoom(axes, [points_m, *(t.position_m for _, t in under)])
-    _legend_above(axes, theme)
+    legend(axes, theme, **ABOVE, fontsize=_SMALL)
     return figure
 
 
@@ -125,10 +125,11 @@ def over_time(
     shaded. Times are seconds from the flight's first frame."""
     rows = len(panels) + bool(strips)
     heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)] * bool(strips)
-    figure = sheet((WIDTH_IN, sum(heights) + 0.7), theme)
-    grid = figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    figure, grid = figure_of(
+        (WIDTH_IN, sum(heights) + 0.7), theme, rows, label_size=_SMALL, sharex=True,
+        height_ratios=heights,
+    )  # fmt: skip
     for axes, (label, series, bound) in zip(grid, panels, strict=False):
-        themed(axes, theme, _SMALL)
         # Of what is nothing at all the axis shows a usual span, not the rounding.
         top = max(_LEAST.get(label.rpartition(", ")[2], 1e-6), bound or 0.0)
         for one in series:
@@ -142,7 +143,7 @@ def over_time(
         axes.set_ylabel(label, fontsize=_SMALL)
         _shade(axes, outages_s, theme)
         if len(series) > 1 or bound is not None or outages_s:
-            _legend_above(axes, theme)
+            legend(axes, theme, **ABOVE, fontsize=_SMALL)
     if strips:
         _draw_strips(grid[-1], strips, theme)
         _shade(grid[-1], outages_s, theme)
@@ -154,10 +155,10 @@ def distributions(
     panels: Sequence[tuple[str, Sequence[tuple[str, F64]]]], theme: Theme = LIGHT
 ) -> Figure:
     """Cumulative distributions side by side: each panel a label and (name, values) of A and B."""
-    figure = sheet((WIDTH_IN, 2.9), theme)
-    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    figure, grid = figure_of(
+        (WIDTH_IN, 2.9), theme, columns=len(panels), label_size=_SMALL, sharey=True
+    )
     for axes, (label, sets) in zip(grid, panels, strict=True):
-        themed(axes, theme, _SMALL)
         for k, (name, values) in enumerate(sets):
             known = np.sort(values[np.isfinite(values)])
             if not len(known):
@@ -168,13 +169,12 @@ def distributions(
         axes.set_xlim(left=0)
         axes.set_ylim(0, 1.02)
         axes.set_xlabel(label, fontsize=_SMALL)
-        _legend_above(axes, theme)
+        legend(axes, theme, **ABOVE, fontsize=_SMALL)
     grid[0].set_ylabel("share of frames", fontsize=_SMALL)
     return figure
 
 
 def _draw_strips(axes: Axes, strips: Sequence[Strip], theme: Theme) -> None:
-    themed(axes, theme, _SMALL)
     axes.grid(False)
     seen: set[str] = set()
     for row, strip in enumerate(strips):
@@ -184,11 +184,8 @@ def _draw_strips(axes: Axes, strips: Sequence[Strip], theme: Theme) -> None:
     axes.set_yticks([-row for row in range(len(strips))], [strip.label for strip in strips])
     axes.tick_params(axis="y", length=0, labelsize=_SMALL)
     axes.spines["left"].set_visible(False)
-    axes.legend(
-        handles=[Patch(color=_STATES[name], label=name) for name in _STATES if name in seen],
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
-        labelcolor=theme.ink, fontsize=_SMALL - 1, handlelength=1.0, borderpad=0.0,
-    )  # fmt: skip
+    handles = [Patch(color=_STATES[name], label=name) for name in _STATES if name in seen]
+    legend(axes, theme, **ABOVE, handles=handles, fontsize=_SMALL - 1)
 
 
 def _stretches(strip: Strip) -> list[tuple[str, float, float]]:
@@ -215,12 +212,3 @@ def _shade(axes: Axes, outages_s: Sequence[tuple[float, float]], theme: Theme) -
     for number, (begin_s, end_s) in enumerate(outages_s):
         label = "out" if number == 0 else None
         axes.axvspan(begin_s, end_s, color=theme.ink, alpha=0.13, lw=0, label=label)
-
-
-def _legend_above(axes: Axes, theme: Theme) -> None:
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False,
-            labelcolor=theme.ink, fontsize=_SMALL, handlelength=1.6, borderpad=0.0,
-            columnspacing=1.2,
-        )  # fmt: skip

@@ -38,7 +38,7 @@ def picture(measures: Sequence[Measure], settled_s: float, title: str) -> Figure
     chosen = [[m for m in measures if m.kind == kind and m.points] for kind in kinds]
     lines = sum(len(some) for some in chosen)
     size = (9.0, 1.0 + 2.2 * max(1, len(kinds)) + 0.17 * lines)
-    figure, panels = figure_of(max(1, len(kinds)), size, LIGHT)
+    figure, panels = figure_of(size, LIGHT, max(1, len(kinds)), sharex=True)
     for axes, kind, some in zip(panels, kinds, chosen, strict=False):
         _panel(axes, kind, some, settled_s)
     panels[-1].set_xlabel("hours from the start")
