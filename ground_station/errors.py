@@ -1,5 +1,7 @@
 """The ground station's exception family, a branch of the one that both sides share."""
 
+from argparse import Namespace
+
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -25,3 +27,13 @@ class MapError(GroundStationError):
 
 class KeysError(GroundStationError):
     """An authority, certificate or key that cannot be made, read or used."""
+
+
+def check_options(args: Namespace, **allowed: tuple[float, float]) -> None:
+    """Refuses a command's numbers, or lists of them, out of range; None is what was not given."""
+    for name, (low, high) in allowed.items():
+        said = getattr(args, name)
+        for value in said if isinstance(said, list) else [said]:
+            if value is not None and not low <= value <= high:
+                option = name.replace("_", "-")
+                raise InputError(f"--{option} is {value}; allowed: {low} to {high}")

@@ -37,18 +37,12 @@ def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `InputError` for a value out of range."""
     from ground_station.bench import steps
     from ground_station.bench.machine import machine
-    from ground_station.errors import InputError
+    from ground_station.errors import InputError, check_options
     from ground_station.files import write_json
     from ground_station.localization import growth
     from ground_station.map import store
 
-    for name, value, low in (
-        ("--frames", args.frames, 2),
-        ("--repetitions", args.repetitions, 3),
-        ("--seed", args.seed, 0),
-    ):
-        if value < low:
-            raise InputError(f"{name} is {value}; at least {low} is needed")
+    check_options(args, frames=(2, 10**6), repetitions=(3, 10**6), seed=(0, 2**32 - 1))
     small, large = args.landmarks
     if not 100 <= small < large:
         raise InputError(f"--landmarks: 100 <= {small} < {large} is needed")

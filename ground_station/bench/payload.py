@@ -36,17 +36,11 @@ def run(args: argparse.Namespace) -> int:
 
     from ground_station.bench import figures
     from ground_station.bench.machine import machine
-    from ground_station.errors import InputError
-    from ground_station.files import write_json
+    from ground_station.errors import check_options
+    from ground_station.files import check_outputs, write_json
 
-    for name, value, low in (
-        ("--repetitions", args.repetitions, 1),
-        ("--seconds", args.seconds, 0.5),
-    ):
-        if not low <= value <= 3600:
-            raise InputError(f"{name} is {value:g}; allowed are {low:g} to 3600")
-    if args.json and not args.json.absolute().parent.is_dir():
-        raise InputError(f"--json {args.json}: there is no folder {args.json.parent}")
+    check_options(args, repetitions=(1, 3600), seconds=(0.5, 3600))
+    check_outputs(args.json)
 
     def progress(text: str) -> None:
         if sys.stderr.isatty():

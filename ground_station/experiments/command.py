@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from ground_station.bench.machine import machine
-    from ground_station.errors import InputError
+    from ground_station.errors import InputError, check_options
     from ground_station.experiments import (
         claims,
         declaration,
@@ -67,8 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.files import write_json
     from ground_station.mapping.settings import load_settings
 
-    if not 0 <= args.jobs <= 256:
-        raise InputError(f"--jobs is {args.jobs}; allowed: 0 to 256")
+    check_options(args, jobs=(0, 256))
     declared = declaration.load(args.file or declaration.SHIPPED, args.names or None)
     if args.features:
         if args.accept:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ground_station.bench.features import homographies, table, timing
+from ground_station.bench.features import command, homographies, timing
 from ground_station.bench.features.homographies import Pair, Score, score
 from ground_station.errors import InputError
 from ground_station.feature_models.homographic import Found, project
@@ -166,7 +166,7 @@ def test_the_table_has_a_column_where_there_is_a_figure_and_a_dash_where_not():
             },
         },
     }  # fmt: skip
-    head, first, second = table.table(rows)
+    head, first, second = command.table(rows)
     assert "graf" not in head and "leuven" in head
     assert first.split() == ["orb", "256", "-", "-", "-", "-", "7.0", "0.05"]
     assert "55.4 %" in second and "85.1 %" in second and "80, 100, 100 %" in second

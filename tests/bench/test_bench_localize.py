@@ -77,7 +77,7 @@ def test_the_command_prints_and_writes_every_table(run):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--frames", "1"], "--frames is 1; at least 2"),
+        (["--frames", "1"], "--frames is 1; allowed: 2 to"),
         (["--map", "nowhere"], "nowhere: there is no such map"),
         (["--landmarks", "5", "4"], "100 <= 5 < 4"),
     ],

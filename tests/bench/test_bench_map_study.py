@@ -66,12 +66,12 @@ def test_a_fold_is_silent_unless_the_build_doubts_or_keeps_parts_apart():
     folded = walk()
     folded[25:, 0, 3] -= 4.0
     judged = judge(NAMES, in_map_units(folded), walk(), 0.2 * DEPTH_M)
-    assert is_silent_fold(judged, said({}))
-    assert is_silent_fold(judged, said({"left_out": ["frame-000003"]}))
-    assert not is_silent_fold(judged, said({"doubts": ["two places look alike"]}))
-    assert not is_silent_fold(judged, said({"parts": [{"images": 4}]}))
+    assert is_silent_fold(judged.misplaced, said({}))
+    assert is_silent_fold(judged.misplaced, said({"left_out": ["frame-000003"]}))
+    assert not is_silent_fold(judged.misplaced, said({"doubts": ["two places look alike"]}))
+    assert not is_silent_fold(judged.misplaced, said({"parts": [{"images": 4}]}))
     true = judge(NAMES, in_map_units(walk()), walk(), 0.2 * DEPTH_M)
-    assert not is_silent_fold(true, said({}))
+    assert not is_silent_fold(true.misplaced, said({}))
 
 
 def _row(features: str, registered: int, silent: bool) -> dict:

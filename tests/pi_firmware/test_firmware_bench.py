@@ -52,9 +52,9 @@ def test_a_program_that_fails_says_why() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--seconds", "nan"], "--seconds is nan; allowed are 0.5 to 3600"),
-        (["--repetitions", "0"], "--repetitions is 0; allowed are 1 to 3600"),
-        (["--json", "no-such-folder/f.json", "--seconds", "1"], "no folder no-such-folder"),
+        (["--seconds", "nan"], "--seconds is nan; allowed: 0.5 to 3600"),
+        (["--repetitions", "0"], "--repetitions is 0; allowed: 1 to 3600"),
+        (["--json", "no-such-folder/f.json", "--seconds", "1"], "its folder does not exist"),
     ],
 )
 def test_a_bad_value_is_one_line(arguments, said, capsys) -> None:

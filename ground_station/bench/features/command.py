@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ground_station.presentation.text import columns
+
 if TYPE_CHECKING:
     from ground_station.features.extractor import Extractor
 
+Rows = dict[str, dict[str, Any]]
+"""By an extractor: its name, hash and dimension, and where measured `homographies` and `time`."""
 KINDS = ("homographies", "times")
+_NONE = "-"
 
 EPILOG = """\
 examples:
@@ -43,21 +49,14 @@ def run(args: argparse.Namespace) -> int:
 
     What has no data is left out with a line that names it; asked for by `--only`, it is an error.
     """
-    from ground_station.bench.features.table import table
     from ground_station.bench.machine import machine
-    from ground_station.errors import InputError
+    from ground_station.errors import InputError, check_options
     from ground_station.files import write_json
 
-    for name, value, low, high in (
-        ("--max-features", args.max_features, 50, 20000),
-        ("--threads", args.threads, 0, 64),
-        ("--repetitions", args.repetitions, 3, 10000),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"{name} is {value}; allowed: {low} to {high}")
+    check_options(args, max_features=(50, 20000), threads=(0, 64), repetitions=(3, 10000))
     threads = args.threads or machine()["cores"]
     made = _extractors(args.extractors, args.max_features, threads)
-    rows: dict[str, dict[str, Any]] = {
+    rows: Rows = {
         name: {"name": name, "sha256": extractor.sha256, "dimension": extractor.dimension}
         for name, extractor in made.items()
     }
@@ -97,9 +96,6 @@ def _extractors(names: list[str] | None, most: int, threads: int) -> dict[str, E
     }
 
 
-Rows = dict[str, dict[str, Any]]
-
-
 def _homographies(args: argparse.Namespace, made: dict[str, Extractor], rows: Rows) -> None:
     from ground_station.bench.features import homographies
     from ground_station.progress import Progress
@@ -125,3 +121,34 @@ def _times(args: argparse.Namespace, made: dict[str, Extractor], rows: Rows) -> 
 
 
 _MEASURE: dict[str, Callable[..., None]] = {"homographies": _homographies, "times": _times}
+
+
+def table(rows: Rows) -> list[str]:
+    """Lines of the table: one row an extractor, a column only where some extractor has a figure."""
+    scenes = dict.fromkeys(
+        scene for row in rows.values() for scene in row.get("homographies", {}).get("scenes", {})
+    )
+    head = ["features", "numbers", "repeated", "correct at 3 px", *scenes, "homography 1, 3, 5 px",
+            "ms", "of RootSIFT's"]  # fmt: skip
+    lines = [head]
+    for row in rows.values():
+        found, time = row.get("homographies", {}), row.get("time", {})
+        by_scene = [found.get("scenes", {}).get(scene) for scene in scenes]
+        shares = [found.get("repeatability"), found.get("accuracy"), *by_scene]
+        near = ", ".join(f"{100 * share:.0f}" for share in found.get("homography", {}).values())
+        lines.append(
+            [
+                str(row["name"]),
+                str(row["dimension"]),
+                *(_cell(share, ".1%").replace("%", " %") for share in shares),
+                f"{near} %" if near else _NONE,
+                _cell(time.get("ms"), ".1f"),
+                _cell(time.get("ratio"), ".2f"),
+            ]
+        )
+    used = [k for k in range(len(head)) if any(line[k] != _NONE for line in lines[1:])]
+    return columns([[line[k] for k in used] for line in lines])
+
+
+def _cell(value: float | None, form: str) -> str:
+    return _NONE if value is None or not math.isfinite(value) else format(value, form)

@@ -43,10 +43,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `BlimpError` for what a person can fix."""
-    _check(args)
-    if args.study:
-        return _study(args)
-    return _campus(args)
+    from ground_station.errors import InputError, check_options
+    from ground_station.files import check_outputs
+
+    check_options(
+        args, seeds=(1, 100), seed=(0, 2**31 - 101), images=(2, 10_000), campus=(50, 100_000),
+        processes=(0, 256),
+    )  # fmt: skip
+    if bool(args.study) == bool(args.campus):
+        raise InputError("bench map measures --study SET or --campus N; give one of them")
+    check_outputs(args.json, args.plot)
+    return _study(args) if args.study else _campus(args)
 
 
 def _campus(args: argparse.Namespace) -> int:
@@ -85,8 +92,6 @@ def _study(args: argparse.Namespace) -> int:
     for name in args.study:
         if name not in there:
             raise InputError(f"--study has '{name}'; allowed: {', '.join(there)}")
-    if args.images is not None and not 2 <= args.images <= 10_000:
-        raise InputError(f"--images is {args.images}; allowed: 2 to 10000")
     seeds = range(args.seed, args.seed + args.seeds)
     rows = study.run(
         args.study, args.features, seeds, load_settings(), args.real, args.work, args.images
@@ -96,20 +101,3 @@ def _study(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, {"machine": machine(), "seeds": list(seeds), "rows": rows})
     return int(any(row["ours"].get("silent_fold", False) for row in rows))
-
-
-def _check(args: argparse.Namespace) -> None:
-    from ground_station.errors import InputError
-    from ground_station.files import check_outputs
-
-    for name, value, low, high in (
-        ("--seeds", args.seeds, 1, 100),
-        ("--seed", args.seed, 0, 2**31 - 101),
-        *(("--campus", each, 50, 100_000) for each in args.campus or ()),
-        *(("--processes", each, 0, 256) for each in args.processes),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"{name} is {value}; allowed: {low} to {high}")
-    if bool(args.study) == bool(args.campus):
-        raise InputError("bench map measures --study SET or --campus N; give one of them")
-    check_outputs(args.json, args.plot)

@@ -45,9 +45,6 @@ class Judgement:
     bound_m: float
     misplaced: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def judge(names: list[str], wTc: F64, true: F64, depth: float, seed: int = 0) -> Judgement:
     """Poses `wTc` (K, 4, 4) of the images `names` against the true ones, (K, 4, 4), metres.
@@ -96,9 +93,9 @@ def said(built: Mapping[str, Any]) -> dict[str, int]:
     return {key: len(built.get(key) or ()) for key in ("doubts", "parts", "left_out")}
 
 
-def is_silent_fold(judged: Judgement, told: Mapping[str, int]) -> bool:
+def is_silent_fold(misplaced: Sequence[str], told: Mapping[str, int]) -> bool:
     """Whether images are misplaced and the build has neither a doubt nor kept parts of it apart."""
-    return bool(judged.misplaced) and not (told["doubts"] or told["parts"])
+    return bool(misplaced) and not (told["doubts"] or told["parts"])
 
 
 SIMULATED: dict[str, dict[str, Any]] = {
@@ -184,7 +181,7 @@ def _judged(
             kept.append(name)
             true.append(truth.wTc[near])
     judged = judge(kept, wTc[rows], np.array(true).reshape(-1, 4, 4), depth, seed)
-    return judged.as_dict() | {"registered": len(names), "judged": len(kept), "of": judged}
+    return asdict(judged) | {"registered": len(names), "judged": len(kept)}
 
 
 def ours(pictures: Pictures, settings: MappingSettings, work: Path) -> dict[str, Any]:
@@ -200,7 +197,7 @@ def ours(pictures: Pictures, settings: MappingSettings, work: Path) -> dict[str,
     kf = map_.keyframes
     row = _judged(pictures, kf.names, kf.wTc, map_.depth_m, settings.seed)
     told = said(map_.info.built)
-    silent = is_silent_fold(row.pop("of"), told)
+    silent = is_silent_fold(row["misplaced"], told)
     models = len(map_.info.built.get("model_sizes", ())) or 1
     return row | {"models": models, "said": told, "silent_fold": silent, "seconds": seconds}
 
@@ -221,7 +218,6 @@ def colmaps(pictures: Pictures, seed: int, threads: int, work: Path) -> dict[str
     largest = models[0]
     names = [name.removesuffix(".png") for name in largest.names]
     row = _judged(pictures, names, largest.wTc, largest.depth, seed)
-    del row["of"]
     return row | {"models": len(models), "seconds": seconds}
 
 
