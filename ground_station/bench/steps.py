@@ -12,9 +12,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64
+from ground_station.evaluation import ate
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.geometry.trajectory import Trajectory
+from ground_station.localization import results
 from ground_station.localization.association import associate
 from ground_station.localization.estimate import PoseEstimate
 from ground_station.localization.extraction import extractor_for
@@ -169,6 +171,8 @@ def frames(map_: Map, recording: Path, count: int) -> dict[str, Any]:
         estimates = _fly(map_, camera, preset, pictures, truth)
         stages = dict.fromkeys(stage for e in estimates for stage in e.stage_ms)
         total = [e.stage_ms["total"] for e in estimates]
+        estimate = results.trajectory(estimates)
+        errors = ate.evaluate(estimate, truth).errors["none"] if len(estimate) else None
         result["presets"][preset] = {
             "localized": sum(e.localized for e in estimates),
             "mean_ms": {
@@ -177,7 +181,7 @@ def frames(map_: Map, recording: Path, count: int) -> dict[str, Any]:
             },
             "p50_ms": float(np.median(total)),
             "p99_ms": float(np.percentile(total, 99)),
-            "position_rmse_m": _rmse_m(estimates, truth),
+            "position_rmse_m": errors.rmse()["position_m"] if errors else float("nan"),
         }
     means = {preset: result["presets"][preset]["mean_ms"]["total"] for preset in PRESETS}
     result["ratio"] = means["thesis"] / means["default"]
@@ -192,13 +196,3 @@ def _fly(
     first = pictures[0].time_ns
     localizer.set_initial_pose(truth.wTc[truth.nearest(first)], first)
     return [localizer.process(frame.time_ns, frame.image, frame.index) for frame in pictures]
-
-
-def _rmse_m(estimates: list[PoseEstimate], truth: Trajectory) -> float:
-    """Unaligned, over the frames that were solved; NaN when none was."""
-    apart = [
-        np.linalg.norm(e.wTc[:3, 3] - truth.wTc[truth.nearest(e.time_ns), :3, 3])
-        for e in estimates
-        if e.wTc is not None
-    ]
-    return float(np.sqrt(np.mean(np.square(apart)))) if apart else float("nan")

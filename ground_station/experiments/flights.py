@@ -8,13 +8,13 @@ from ground_station.experiments.declaration import FlightDeclaration
 from ground_station.simulator.simulate import SimulationSettings, simulate
 
 
-def file_name(flight: FlightDeclaration, seed: int) -> str:
-    """What a simulated flight's recording is called: all that it depends on but the program."""
+def stem(flight: FlightDeclaration, seed: int) -> str:
+    """How a simulated flight's recording is called: all that it depends on but the program."""
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
     return (
         f"{flight.scene}-{flight.plan}-{flight.light}-{seed}"
-        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}.mcap"
+        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}"
     )
 
 

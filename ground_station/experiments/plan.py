@@ -18,7 +18,7 @@ from ground_station.experiments.declaration import (
     MapSpec,
     changed,
 )
-from ground_station.experiments.flights import file_name
+from ground_station.experiments.flights import stem
 from ground_station.experiments.program import code_sha256
 from ground_station.features import extractors
 from ground_station.localization.settings import LocalizerSettings, load_preset
@@ -105,15 +105,10 @@ def _runs(
     seeds = declaration.seeds if flight.simulated else declaration.seeds[:1]
     keys = []
     for seed in seeds:
-        needs = [map_job.key]
-        recording = None
-        if flight.simulated:
-            flown = _flight(plan, flight, seed)
-            recording = flown.name
-            needs.append(flown.key)
+        of_flight, recording, needs = _flown(plan, flight, seed, data)
         depends = {
             "map": map_job.key,
-            "flight": needs[1] if flight.simulated else _real(flight, data),
+            "flight": of_flight,
             "seed": seed,
             "alter": asdict(case.alter),
             "preset": preset,
@@ -123,20 +118,15 @@ def _runs(
         key = _key("run", depends)
         name = f"{case.experiment}: {case.title}, {preset}, seed {seed}"
         job = RunJob(key, name, map_job.key, flight, recording, seed, case.alter, preset, settings)
-        _add(plan, job, tuple(needs))
+        _add(plan, job, (map_job.key, *needs))
         keys.append(key)
     return keys
 
 
 def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> MapJob:
-    needs: list[str] = []
-    recording = None
-    if spec.flight.simulated:
-        flown = _flight(plan, spec.flight, spec.seed)
-        recording = flown.name
-        needs.append(flown.key)
+    of_flight, recording, needs = _flown(plan, spec.flight, spec.seed, data)
     depends = {
-        "flight": needs[0] if needs else _real(spec.flight, data),
+        "flight": of_flight,
         "spec": asdict(spec),
         "features": _sha256(spec.features),
         "settings": asdict(mapping),
@@ -149,17 +139,21 @@ def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> Map
         mapping,
         recording,
     )
-    _add(plan, job, tuple(needs))
+    _add(plan, job, needs)
     return job
 
 
-def _flight(plan: Plan, flight: FlightDeclaration, seed: int) -> FlightJob:
-    name = file_name(flight, seed)
+def _flown(
+    plan: Plan, flight: FlightDeclaration, seed: int, data: Path
+) -> tuple[str, str | None, tuple[str, ...]]:
+    """On what of a flight a result depends, its recording's name, and the job that makes it."""
+    if not flight.simulated:
+        return _real(flight, data), None, ()
     depends = {"flight": asdict(flight), "seed": seed, "code": code_sha256("flight")}
     key = _key("flight", depends)
-    job = FlightJob(key, f"{name.removesuffix('.mcap')}-{key[:8]}.mcap", flight, seed)
+    job = FlightJob(key, f"{stem(flight, seed)}-{key[:8]}.mcap", flight, seed)
     _add(plan, job, ())
-    return job
+    return key, job.name, (key,)
 
 
 def _add(plan: Plan, job: Job, needs: tuple[str, ...]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ground_station.experiments.declaration import Case, Declaration, FlightDeclaration, MapSpec
+from ground_station.experiments.declaration import Declaration, FlightDeclaration, MapSpec
 from ground_station.recording.frames import FrameRange
 from ground_station.recording.open import parse_range
 
@@ -17,22 +17,18 @@ IMAGES = 100
 def shortened(declaration: Declaration) -> Declaration:
     """One seed, the first seconds of every flight, maps of few images; the rows stay as they are.
 
-    Maps that differ in nothing else are then the same; of buildings there is the first.
+    Maps that differ in nothing else are then the same. Of cases whose maps are registered by hand,
+    each of a building of its own, there is the first.
     """
-    experiments = [
-        replace(experiment, cases=[_case(case) for case in _buildings_once(experiment.cases)])
-        for experiment in declaration.experiments
-    ]
+    experiments = []
+    for experiment in declaration.experiments:
+        cases = [
+            replace(case, flight=_first_seconds(case.flight), map=_thinned(case.map))
+            for k, case in enumerate(experiment.cases)
+            if k == 0 or not case.map.flight.clicked
+        ]
+        experiments.append(replace(experiment, cases=cases))
     return replace(declaration, seeds=declaration.seeds[:1], experiments=experiments)
-
-
-def _case(case: Case) -> Case:
-    return replace(case, flight=_first_seconds(case.flight), map=_thinned(case.map))
-
-
-def _buildings_once(cases: list[Case]) -> list[Case]:
-    """One of the cases whose maps are registered by hand: each is of a building of its own."""
-    return [case for k, case in enumerate(cases) if k == 0 or not case.map.flight.clicked]
 
 
 def _first_seconds(flight: FlightDeclaration) -> FlightDeclaration:

@@ -72,14 +72,8 @@ class _Atrium:
         for i in range(12):
             for j in range(8):
                 x, y, z = 2.0 * i, 2.0 * j, HEIGHT_M
-                if i in (2, 4, 7, 9) and j in (2, 3, 4):  # rooflights
-                    h = 0.5  # their curbs
-                    self.b.rectangle([x + 2, y, z], [-2, 0, 0], [0, 0, h], "plaster", rgb=_WHITE)
-                    self.b.rectangle([x, y + 2, z], [2, 0, 0], [0, 0, h], "plaster", rgb=_WHITE)
-                    self.b.rectangle([x, y, z], [0, 2, 0], [0, 0, h], "plaster", rgb=_WHITE)
-                    self.b.rectangle(
-                        [x + 2, y + 2, z], [0, -2, 0], [0, 0, h], "plaster", rgb=_WHITE
-                    )
+                if i in (2, 4, 7, 9) and j in (2, 3, 4):
+                    self.b.rooflight(x, y, z, 2, 0.5, _WHITE)
                     for k in (0.66, 1.33):
                         self.b.box(
                             [x + k - 0.03, y, z + 0.3], [x + k + 0.03, y + 2, z + 0.4], "metal",
@@ -189,10 +183,9 @@ class _Atrium:
                     self.b.rectangle(
                         [x + 0.9, y1 - 0.03, z0], [1.1, 0, 0], [0, 0, 2.2], "door", text=number
                     )
-                self.b.box([x + 0.8, y1 - 0.06, z0], [x + 0.9, y1, z0 + 2.3], "wood", upright=True,
-                           faces=("-y", "-x", "+x"))  # fmt: skip
-                self.b.box([x + 2.0, y1 - 0.06, z0], [x + 2.1, y1, z0 + 2.3], "wood", upright=True,
-                           faces=("-y", "-x", "+x"))  # fmt: skip
+                for left, right in ((0.8, 0.9), (2.0, 2.1)):
+                    self.b.box([x + left, y1 - 0.06, z0], [x + right, y1, z0 + 2.3], "wood",
+                               upright=True, faces=("-y", "-x", "+x"))  # fmt: skip
             # Under the balcony, wainscot and a notice in every bay.
             for a, c in ((x, x + 0.8), (x + 2.1, x + 3)):
                 self.b.box([a, y1 - 0.04, 0], [c, y1, 1.05], "wood", faces=("-y", "+z"),
@@ -201,14 +194,11 @@ class _Atrium:
                              text="NOTICE", detail=1.6)  # fmt: skip
             # A frieze of chequers above the upper doors.
             for q in range(4):
-                self.b.rectangle(
-                    [x + 0.75 * q, y1 - 0.01, 7.2], [0.75, 0, 0], [0, 0, 0.75], "plaster",
-                    rgb=_TEAL if (q + k) % 2 else _OCHRE,
-                )  # fmt: skip
-                self.b.rectangle(
-                    [x + 0.75 * q, y1 - 0.01, 7.95], [0.75, 0, 0], [0, 0, 0.75], "plaster",
-                    rgb=_OCHRE if (q + k) % 2 else _TEAL,
-                )  # fmt: skip
+                for row, z in enumerate((7.2, 7.95)):
+                    self.b.rectangle(
+                        [x + 0.75 * q, y1 - 0.01, z], [0.75, 0, 0], [0, 0, 0.75], "plaster",
+                        rgb=_TEAL if (q + k + row) % 2 else _OCHRE,
+                    )  # fmt: skip
             # The slab.
             self.b.rectangle([x, 13, BALCONY_Z_M], [3, 0, 0], [0, 3, 0], "wood", detail=0.7)
             self.b.rectangle(

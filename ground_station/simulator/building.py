@@ -101,6 +101,17 @@ class SceneBuilder:
         self.box(low_m, high_m, material, **options)
         self.footprints.append(Footprint((low_m[0], low_m[1], high_m[0], high_m[1]), "furniture"))
 
+    def rooflight(
+        self, x: float, y: float, z: float, side_m: float, curb_m: float, rgb: tuple[float, ...]
+    ) -> None:
+        """Adds the curbs, seen from below, of a square hole in a ceiling: its low corner."""
+        s = side_m
+        for origin, u in (
+            ([x + s, y, z], [-s, 0, 0]), ([x, y + s, z], [s, 0, 0]),
+            ([x, y, z], [0, s, 0]), ([x + s, y + s, z], [0, -s, 0]),
+        ):  # fmt: skip
+            self.rectangle(origin, u, [0, 0, curb_m], "plaster", rgb=rgb)
+
     def walls(self, *bounds_m: tuple[float, float, float, float]) -> None:
         """Adds walls to the floor plan: low x, low y, high x, high y of each."""
         self.footprints += [Footprint(bounds, "wall") for bounds in bounds_m]

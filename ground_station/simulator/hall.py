@@ -100,12 +100,8 @@ def _roof(b: SceneBuilder) -> list[tuple[float, float, float]]:
     for i in range(9):
         for j in range(6):
             x, y, z = 2.0 * i, 2.0 * j, HEIGHT_M
-            if i % 2 and j in (1, 4):  # rooflights and their curbs
-                for origin, u in (
-                    ([x + 2, y, z], [-2, 0, 0]), ([x, y + 2, z], [2, 0, 0]),
-                    ([x, y, z], [0, 2, 0]), ([x + 2, y + 2, z], [0, -2, 0]),
-                ):  # fmt: skip
-                    b.rectangle(origin, u, [0, 0, 0.4], "plaster", rgb=_WHITE)
+            if i % 2 and j in (1, 4):
+                b.rooflight(x, y, z, 2, 0.4, _WHITE)
             else:
                 b.rectangle([x, y + 2, z], [2, 0, 0], [0, -2, 0], "concrete", rgb=_WHITE,
                             tie_m=0.5, detail=0.6, print=_TILE)  # fmt: skip
