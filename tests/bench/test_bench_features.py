@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ground_station.bench.features import command, homographies, timing
+from ground_station.bench.features import command, homographies
 from ground_station.bench.features.homographies import Pair, Score, score
 from ground_station.errors import InputError
 from ground_station.feature_models.homographic import Found, project
@@ -175,9 +175,9 @@ def test_the_table_has_a_column_where_there_is_a_figure_and_a_dash_where_not():
 
 def test_times_are_shares_of_rootsifts_in_the_same_run():
     made = {name: extractors.create(name, 300) for name in ("rootsift", "orb")}
-    found = timing.measure(made, timing.picture(0), 3)
+    found = command.times(made, command.picture(0), 3)
     assert found["rootsift"]["ratio"] == 1
     assert found["orb"]["ratio"] == pytest.approx(found["orb"]["ms"] / found["rootsift"]["ms"])
-    alone = timing.measure({"orb": made["orb"]}, timing.picture(0), 3)
+    alone = command.times({"orb": made["orb"]}, command.picture(0), 3)
     assert alone["orb"]["ratio"] is None and alone["orb"]["ms"] > 0
     assert json.dumps(found)

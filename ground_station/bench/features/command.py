@@ -6,12 +6,14 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ground_station.presentation.text import columns
 
 if TYPE_CHECKING:
+    from ground_station.arrays import U8
     from ground_station.features.extractor import Extractor
 
 Rows = dict[str, dict[str, Any]]
@@ -109,15 +111,42 @@ def _homographies(args: argparse.Namespace, made: dict[str, Extractor], rows: Ro
 
 
 def _times(args: argparse.Namespace, made: dict[str, Extractor], rows: Rows) -> None:
-    from ground_station.bench.features import timing
     from ground_station.recording.folder import read_grey
 
     frames = args.data / "redkitchen" / "frames"
     real = sorted(frames.iterdir())[:1] if frames.is_dir() else []
-    image = read_grey(real[0]) if real else timing.picture(0)
-    repetitions = 3 if args.quick else args.repetitions
-    for name, found in timing.measure(made, image, repetitions).items():
+    image = read_grey(real[0]) if real else picture(0)
+    for name, found in times(made, image, 3 if args.quick else args.repetitions).items():
         rows[name]["time"] = found
+
+
+def times(made: dict[str, Extractor], image: U8, repetitions: int) -> Rows:
+    """By name: the median time of `image`, ms, and its ratio to RootSIFT's where that is there.
+
+    They take turns, so that a busy moment of the machine slows all.
+    """
+    from ground_station.bench.steps import medians_ms
+
+    calls = [partial(extractor.extract, image) for extractor in made.values()]
+    by_name = dict(zip(made, medians_ms(repetitions, *calls), strict=True))
+    beside = by_name.get("rootsift")
+    return {
+        name: {"ms": ms, "ratio": ms / beside if beside else None} for name, ms in by_name.items()
+    }
+
+
+def picture(seed: int) -> U8:
+    """A picture (480, 640) with texture at all scales, for when there is no real one."""
+    import cv2
+    import numpy as np
+
+    rng = np.random.default_rng(seed)
+    whole = np.zeros((480, 640), np.float32)
+    for scale in (4, 16, 64, 160):
+        small = rng.normal(size=(480 // scale + 1, 640 // scale + 1)).astype(np.float32)
+        whole += scale**0.5 * cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC)
+    whole = 128 + 40 * whole / whole.std()
+    return np.asarray(whole.clip(0, 255), np.uint8)
 
 
 _MEASURE: dict[str, Callable[..., None]] = {"homographies": _homographies, "times": _times}
