@@ -118,12 +118,14 @@ def _make(args: argparse.Namespace, out: Path) -> int:
     from ground_station.errors import InputError
     from ground_station.replay.cases.make import Asked, make_case
     from ground_station.replay.cases.outcome import read_outcome
+    from ground_station.replay.replay import settings_for
 
     if args.map is None:
         raise InputError("--make-case needs --map MAP")
     outcome = None if args.from_outcome is None else read_outcome(args.from_outcome)
     bits = args.min_entropy_bits
-    usual_hz = 5.0 if args.preset == "thesis" else 30.0
+    said = {name: getattr(args, name) for name in ("rate_hz", "init", "start_s", "duration_s")}
+    settings = settings_for(args.preset, args.make_case, stepped=args.stepped, **said)
     asked = Asked(
         args.make_case,
         args.map,
@@ -132,14 +134,7 @@ def _make(args: argparse.Namespace, out: Path) -> int:
         args.payload_id,
         outcome,
         force=args.force,
-        flown={
-            "preset": args.preset,
-            "init": args.init or ("truth" if args.preset == "thesis" else "none"),
-            "rate_hz": usual_hz if args.rate_hz is None else args.rate_hz,
-            "start_s": args.start_s,
-            "duration_s": args.duration_s,
-            "stepped": args.stepped,
-        },
+        flown={name: getattr(settings, name) for name in ("preset", "stepped", *said)},
         settings=[] if bits is None else [f"gate.min_entropy_bits={bits!r}"],
     )
     made = make_case(asked)

@@ -254,12 +254,10 @@ def _balances(a: Outcome, b: Outcome) -> list[Line]:
     found = []
     for one, other in zip(accounting.balances(a), accounting.balances(b), strict=True):
         if not other.holds:
-            worse = float(one.holds)
-            told = other.told or f"off by {other.off}"
-            found.append(
-                Line(other.name, float(one.off), float(other.off), "frames", worse, 0.0, told)
-            )
-    broken = [int((o.frames.localized & ~o.frames.finite).sum()) for o in (a, b)]
+            told = other.told or f"off by {other.value:g}"
+            worse = float(bool(one.holds))
+            found.append(Line(other.name, one.value, other.value, "frames", worse, 0.0, told))
+    broken = [o.frames.broken for o in (a, b)]
     if any(broken):
         worse = float(broken[1] - broken[0])
         found.append(

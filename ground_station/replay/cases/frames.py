@@ -72,6 +72,11 @@ class Frames:
             unit = np.abs(np.linalg.norm(self.quaternion_xyzw, axis=1) - 1.0) <= 1e-3
         return np.asarray(self.localized & near & unit)
 
+    @property
+    def broken(self) -> int:
+        """How many have a pose that can be none."""
+        return int((self.localized & ~self.finite).sum())
+
     def called(self, state: str) -> Bools:
         """(N,), which have this state."""
         return np.array([name == state for name in self.state], dtype=bool)

@@ -79,8 +79,7 @@ def accept(
     poses = outcome.estimate
     if not len(poses):
         raise InputError(f"{where}: no frame was localized; there is nothing to accept")
-    broken = int((outcome.frames.localized & ~outcome.frames.finite).sum())
-    if broken:
+    if broken := outcome.frames.broken:
         raise InputError(f"{where}: {broken} poses are not finite; such a run cannot be accepted")
     values = {
         "accepted_by": by,

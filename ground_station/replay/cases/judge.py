@@ -149,11 +149,8 @@ def _unasked(limits: Limits, figures: dict[str, Figure], outcome: Outcome) -> li
 
 
 def _conditions(outcome: Outcome) -> list[Row]:
-    found = [
-        Row(b.name, float(b.off), "frames off", 0.0, b.holds, EXACTLY, b.told)
-        for b in accounting.balances(outcome)
-    ]
-    broken = int((outcome.frames.localized & ~outcome.frames.finite).sum())
+    found = accounting.balances(outcome)
+    broken = outcome.frames.broken
     found.append(Row("poses not finite", float(broken), "poses", 0.0, broken == 0, EXACTLY))
     run = outcome.run
     for kind, message, ranges in (

@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from ground_station.evaluation.figures import AT_LEAST, digits
 from ground_station.replay.cases.judge import BOUNDS
 from ground_station.replay.cases.measure import Figure
 
-
-@dataclass(frozen=True)
-class Margin:
-    """What is left between a measured value and its bound: a share of it, and a fixed part."""
-
-    share: float
-    fixed: float
-
-
 MARGINS = {
-    "coverage_min": Margin(0.0, 0.05),
-    "tracking_min": Margin(0.0, 0.05),
-    "lost_max": Margin(0.0, 0.02),
-    "position_rmse_m_max": Margin(0.5, 0.005),
-    "rotation_rmse_deg_max": Margin(0.5, 0.05),
-    "position_max_m": Margin(0.5, 0.02),
-    "latency_p50_ms_max": Margin(1.0, 10.0),
-    "latency_p99_ms_max": Margin(1.0, 50.0),
-    "recovery_s_max": Margin(0.5, 0.5),
-    "payload_memory_MB_max": Margin(0.25, 0.0),
-    "ground_memory_MB_max": Margin(0.25, 0.0),
-    "payload_cpu_max": Margin(0.5, 0.0),
+    "coverage_min": (0.0, 0.05),
+    "tracking_min": (0.0, 0.05),
+    "lost_max": (0.0, 0.02),
+    "position_rmse_m_max": (0.5, 0.005),
+    "rotation_rmse_deg_max": (0.5, 0.05),
+    "position_max_m": (0.5, 0.02),
+    "latency_p50_ms_max": (1.0, 10.0),
+    "latency_p99_ms_max": (1.0, 50.0),
+    "recovery_s_max": (0.5, 0.5),
+    "payload_memory_MB_max": (0.25, 0.0),
+    "ground_memory_MB_max": (0.25, 0.0),
+    "payload_cpu_max": (0.5, 0.0),
 }
-"""The cell's voltage has none: what is healthy is no matter of one run."""
+"""What is left between a measured value and its bound: a share of it, and a fixed part.
+
+The cell's voltage has none: what is healthy is no matter of one run."""
 
 
 def propose(figures: dict[str, Figure]) -> tuple[dict[str, float], dict[str, str]]:
@@ -40,16 +32,16 @@ def propose(figures: dict[str, Figure]) -> tuple[dict[str, float], dict[str, str
     bounds: dict[str, float] = {}
     remarks: dict[str, str] = {}
     for name, figure_name, unit, sense in BOUNDS:
-        margin, value = MARGINS.get(name), figures[figure_name].value
-        if margin is None or value is None or not math.isfinite(value):
+        value = figures[figure_name].value
+        if name not in MARGINS or value is None or not math.isfinite(value):
             continue
-        room = margin.share * abs(value) + margin.fixed
+        share, fixed = MARGINS[name]
+        room = share * abs(value) + fixed
         bound = value - room if sense == AT_LEAST else value + room
         bounds[name] = _outward(max(0.0, bound), down=sense == AT_LEAST)
         if unit == "share" and name != "payload_cpu_max":
             bounds[name] = min(1.0, bounds[name])
-        parts = [f"{margin.share:.0%} of it"] * (margin.share > 0)
-        parts += [f"{margin.fixed:g}"] * (margin.fixed > 0)
+        parts = [f"{share:.0%} of it"] * (share > 0) + [f"{fixed:g}"] * (fixed > 0)
         remarks[f"bounds.{name}"] = (
             f"Measured {digits(value, None)}; the margin is {' and '.join(parts)}."
         )

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import ground_station
+import pi_firmware
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.store import Map
-from ground_station.replay.cases import frames, program
+from ground_station.replay.cases import frames
 from ground_station.replay.cases.outcome import Accounts, Outage, Outcome, Run, map_sha256
 from ground_station.replay.replay import ReplayResult
 from ground_station.replay.resources import Side
 from pi_firmware.wire import messages
+
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "gtsam", "av")
+"""Those whose next version may give another pose."""
 
 
 def outcome_of(
@@ -53,7 +63,7 @@ def outcome_of(
         refused=live.payload.refused,
         payload_side=dataclasses.asdict(payload_side or Side()),
         ground_side=dataclasses.asdict(result.ground_side),
-        versions=program.versions() | _told(health),
+        versions=versions() | _told(health),
         settings={
             "replay": _plain(dataclasses.asdict(settings), without=("recording", "pictures")),
             "localizer": dataclasses.asdict(result.localizer),
@@ -95,3 +105,32 @@ def _plain(settings: dict[str, Any], without: tuple[str, ...]) -> dict[str, Any]
         for name, value in settings.items()
         if name not in without
     }
+
+
+def versions() -> dict[str, str]:
+    """Names and versions of what a pose depends on, the machine's kind included."""
+    found = {
+        "ground_station": f"{ground_station.__version__}, source {source_sha256()[:12]}",
+        "pi_firmware": pi_firmware.__version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }
+    for name in _LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+@functools.cache
+def source_sha256() -> str:
+    """Of every .py and .toml file of both packages, by name and content."""
+    digest = hashlib.sha256()
+    for package in (ground_station, pi_firmware):
+        root = Path(str(package.__file__)).parent
+        for path in sorted(p for p in root.rglob("*") if p.suffix in (".py", ".toml")):
+            content = path.read_bytes()
+            name = f"{root.name}/{path.relative_to(root).as_posix()}"
+            digest.update(f"{name}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()
