@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError, InputError
+from ground_station.errors import InputError
 from ground_station.experiments import tables
 from ground_station.experiments.report import PRINTED
 from ground_station.files import finite, write_text
@@ -100,17 +100,6 @@ def _figures(row: dict[str, Any]) -> dict[str, Any]:
 
 def _part(table: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     return {name: table[name] for name in names}
-
-
-def read(path: Path) -> dict[str, Any]:
-    """An accepted run; raises `GroundStationError` where it is none."""
-    try:
-        document = json.loads(path.read_text())
-        if not isinstance(document["experiments"], list):
-            raise ValueError("no experiments")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise GroundStationError(f"{path}: {error}") from None
-    return dict(document)
 
 
 def _levels(experiment: dict[str, Any], preset: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ground_station.map.store import Map
 from ground_station.presentation.pages import data_uri, write_page
 from ground_station.presentation.text import columns, flat
 from ground_station.replay.cases import page
-from ground_station.replay.cases.outcome import Outcome, write_outcome
+from ground_station.replay.cases.outcome import Accounts, Outcome, write_outcome
 from ground_station.replay.cases.taken import outcome_of
 from ground_station.replay.replay import ReplayResult
 from ground_station.service.bus_messages import EstimateMessage
@@ -35,16 +35,7 @@ LOCALIZED = "frames localized, of those taken"
 OUTCOME = "outcome"
 """The folder beside the page with every frame, which --accept and --compare take."""
 _TEMPLATE = Path(__file__).parent / "templates" / "report.html"
-_FRAME_MEANINGS = {
-    "captured": "taken by the camera",
-    "gated": "held back by the payload: too little to see in them",
-    "discarded": "passed the gate, but never left the payload",
-    "sent": "left the payload over the radio",
-    "received": "arrived whole at the ground station",
-    "lost": "sent, but never arrived whole",
-    "dropped": "arrived, but skipped because newer ones were waiting",
-    "localized": "solved from what is seen in them",
-}
+_MEANINGS = {item.name: item.metadata["doc"] for item in fields(Accounts)}
 _ALIGNMENT_MEANINGS = {
     "none": ("unaligned", "as flown: what an autopilot would get"),
     "se3": ("SE(3)", "moved and turned as a whole onto the truth"),
@@ -215,15 +206,16 @@ def judge(result: ReplayResult, limits: dict[str, float]) -> list[Row]:
     captured, gated = accounts["captured"], accounts["gated"]
     rmse = result.evaluation.errors["none"].rmse() if result.evaluation else {}
     taken = captured - gated - accounts["dropped"]
-    values = {
-        GATED: (100 * gated / captured if captured else None, "%", AT_MOST),
-        LOCALIZED: (100 * accounts["localized"] / taken if taken else None, "%", AT_LEAST),
-        POSITION: (rmse.get("position_m"), "m", AT_MOST),
-        ROTATION: (rmse.get("rotation_deg"), "°", AT_MOST),
-    }
+    values = (
+        (GATED, 100 * gated / captured if captured else None, "%", AT_MOST),
+        (LOCALIZED, 100 * accounts["localized"] / taken if taken else None, "%", AT_LEAST),
+        (POSITION, rmse.get("position_m"), "m", AT_MOST),
+        (ROTATION, rmse.get("rotation_deg"), "°", AT_MOST),
+    )
     return [
-        Row.bounded(name, *values[name][:2], limit, values[name][2])
-        for name, limit in limits.items()
+        Row.bounded(name, value, unit, limits[name], sense)
+        for name, value, unit, sense in values
+        if name in limits
     ]
 
 
@@ -269,7 +261,7 @@ def _frame_rows(frames: Mapping[str, int]) -> list[tuple[str, str, str, str]]:
             name,
             f"{count:,}".replace(",", " "),
             f"{count / captured:.1%}" if captured else "",
-            _FRAME_MEANINGS[name],
+            _MEANINGS[name],
         )
         for name, count in frames.items()
     ]

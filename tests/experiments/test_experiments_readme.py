@@ -43,7 +43,7 @@ def test_an_accepted_run_stands_in_readme_and_only_its_figures_there_are_kept(tm
     readme.accept(document, page, tmp_path / "accepted.json")
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("\nafter\n")
-    kept = readme.read(tmp_path / "accepted.json")
+    kept = json.loads((tmp_path / "accepted.json").read_text())
     assert readme.BLOCK.read(text) == readme.render(kept) == readme.render(document)
     assert "| Light: noon | 20.0 cm | 10.00 cm, 1.00°, 100.0 % localized | 1.00 cm" in text
     assert "100.0 % localized | 95.0 % |" in text  # of the default's poses, inside their 95 %
@@ -85,7 +85,7 @@ def test_readme_shows_the_accepted_run_of_the_shipped_experiments_or_none():
     if shown is None:
         assert not ACCEPTED.exists()
         return
-    accepted = readme.read(ACCEPTED)
+    accepted = json.loads(ACCEPTED.read_text())
     assert shown == readme.render(accepted)
     declared = declaration.load()
     assert accepted["seeds"] == list(declared.seeds)

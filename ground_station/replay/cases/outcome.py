@@ -44,13 +44,13 @@ class Accounts:
     """Frames by what became of them, as `LiveResult.accounts` names them."""
 
     captured: int = _count("taken by the camera")
-    gated: int = _count("held back by the gate")
-    discarded: int = _count("passed the gate and never left the encoder")
-    sent: int = _count("left the payload")
-    received: int = _count("decoded at the ground")
-    lost: int = _count("sent and not received")
-    dropped: int = _count("received and overtaken by newer ones")
-    localized: int = _count("with a pose")
+    gated: int = _count("held back by the payload: too little to see in them")
+    discarded: int = _count("passed the gate, but never left the payload")
+    sent: int = _count("left the payload over the radio")
+    received: int = _count("arrived whole at the ground station")
+    lost: int = _count("sent, but never arrived whole")
+    dropped: int = _count("arrived, but skipped because newer ones were waiting")
+    localized: int = _count("solved from what is seen in them")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,6 @@ class Source:
     """A recording's flight: its F frames' times (F,) int64 ns, its camera, its topics by count.
 
     `cut` says where and why the file ends early, "" for a whole one; what is before that is whole.
-    `payloads` are those that a ground station recorded, by name, with what stands before their
-    topics; empty where the recording names none.
     """
 
     path: Path
@@ -28,7 +26,6 @@ class Source:
     camera: Camera
     topics: dict[str, int]
     cut: str = ""
-    payloads: dict[str, str] = field(default_factory=dict)
 
     @property
     def span_s(self) -> float:
@@ -64,7 +61,7 @@ def examine(path: str | Path) -> Source:
         raise InputError(
             f"{path}: it carries no camera calibration; record with --camera CAMERA.toml{after}"
         )
-    return Source(path, times, camera, topics, cut, payloads_of(reader))
+    return Source(path, times, camera, topics, cut)
 
 
 def payloads_of(reader: RecordingReader) -> dict[str, str]:
