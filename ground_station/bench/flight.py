@@ -12,7 +12,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ground_station.errors import GroundStationError
@@ -105,10 +106,10 @@ class BenchFlight:
 
     process: subprocess.Popen[str]
     begin_ns: int
+    _log: Path
     ready_ns: int = 0
     said: str = ""
     errors: str = ""
-    _readers: list[threading.Thread] = field(default_factory=list)
 
     def counters(self) -> tuple[int, int, int]:
         """Frames captured, gated and sent, as the program printed them at its end."""
@@ -125,21 +126,21 @@ class BenchFlight:
             status = self.process.wait(_LIMIT_S)
         except subprocess.TimeoutExpired:
             raise FlightError(f"the firmware did not end within {_LIMIT_S:g} s") from None
-        for reader in self._readers:
-            reader.join()
+        self._reader.join()
+        self.errors = self._log.read_text(errors="replace")
         if status:
             line = (self.errors.strip().splitlines() or ["nothing"])[-1]
             raise FlightError(f"the firmware ended with status {status}: {line}")
 
-    def _read_said(self) -> None:
+    def __post_init__(self) -> None:
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self.ready_ns = self.ready_ns or time.monotonic_ns()
             self.said += line
-
-    def _read_errors(self) -> None:
-        assert self.process.stderr is not None
-        self.errors = self.process.stderr.read()
 
 
 @contextlib.contextmanager
@@ -152,30 +153,24 @@ def fly(
     """
     sets = [word for setting in (*ground.settings(), *settings) for word in ("--set", setting)]
     with tempfile.TemporaryDirectory() as folder:
-        begin_ns = time.monotonic_ns()
-        process = subprocess.Popen(
-            [sys.executable, *python, "-m", "pi_firmware", *sets],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            # Hashes are drawn at each start otherwise, and with them the cost of every dictionary.
-            env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder},
-        )
-        flight = BenchFlight(process, begin_ns)
-        for target in (flight._read_said, flight._read_errors):
-            thread = threading.Thread(target=target, daemon=True)
-            thread.start()
-            flight._readers.append(thread)
+        errors = Path(folder) / "errors.txt"
+        with errors.open("w") as log:
+            begin_ns = time.monotonic_ns()
+            process = subprocess.Popen(
+                [sys.executable, *python, "-m", "pi_firmware", *sets],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                errors="replace",
+                # Hashes are drawn at each start otherwise, and with them the cost of dictionaries.
+                env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder},
+            )
         try:
-            yield flight
+            yield BenchFlight(process, begin_ns, errors)
         finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-            for reader in flight._readers:
-                reader.join()
+            process.kill()
+            process.wait()
 
 
 def picture(seconds: float) -> str:
