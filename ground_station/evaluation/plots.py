@@ -12,7 +12,6 @@ from matplotlib.transforms import Affine2D
 
 from ground_station.arrays import F64
 from ground_station.evaluation.ate import Evaluation
-from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import LIGHT, Theme, figure_of, legend
@@ -25,13 +24,13 @@ def evaluation(result: Evaluation, align: str = "none") -> Figure:
     """Path, position error and rotation error of one alignment on one sheet."""
     errors = result.errors[align]
     figure, (path, upper, lower) = figure_of((8.0, 9.6), LIGHT, 3, height_ratios=[3, 1, 1])
-    aligned = _aligned(result.estimate, errors.alignment)
+    x, y, _ = errors.alignment.apply(result.estimate.position_m).T
     seconds = (result.estimate.time_ns - result.estimate.time_ns[0]) / 1e9
     path.plot(
         *broken_path(result.truth), color=LIGHT.truth, linewidth=2.6, alpha=0.55, label="truth"
     )
     path.plot(
-        *broken_path(aligned),
+        *broken(seconds, x, y)[1:],
         color=LIGHT.estimate,
         linewidth=1.1,
         label=f"estimate, aligned: {align}",
@@ -73,12 +72,6 @@ def show_floorplan(axes: Axes, plan: FloorPlan, theme: Theme) -> None:
     margin = 0.02 * max(width_m, height_m)
     axes.set_xlim(corners[:, 0].min() - margin, corners[:, 0].max() + margin)
     axes.set_ylim(corners[:, 1].min() - margin, corners[:, 1].max() + margin)
-
-
-def _aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
-    return Trajectory(
-        trajectory.time_ns, alignment.apply(trajectory.position_m), trajectory.quaternion_xyzw
-    )
 
 
 def broken(time_s: npt.ArrayLike, *rows: npt.ArrayLike) -> list[F64]:

@@ -83,11 +83,6 @@ class ReplayResult:
     payload_side: Side | None
     """None where the firmware ran on another machine."""
 
-    @property
-    def estimate(self) -> Trajectory:
-        """The localized frames' poses, by capture time."""
-        return results.trajectory([frame.estimate for frame in self.live.frames])
-
     def document(self) -> dict[str, Any]:
         """The result as results.json holds it."""
         latency = self.live.latency_ms()

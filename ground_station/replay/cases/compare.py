@@ -18,7 +18,7 @@ from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.presentation.text import flat
 from ground_station.replay.cases import accounting, measure, same
-from ground_station.replay.cases.judge import BOUNDS
+from ground_station.replay.cases.limits import BOUNDS
 from ground_station.replay.cases.measure import Errors, Figure
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
@@ -94,7 +94,6 @@ class Comparison:
     first: same.Difference
     errors_a: Errors | None
     errors_b: Errors | None
-    truth: Trajectory | None
     lines: list[Line]
     settings: list[tuple[str, str, str]]
     versions: list[tuple[str, str, str]]
@@ -148,7 +147,6 @@ def compare(a: Outcome, b: Outcome, allowed: Allowed | None = None) -> Compariso
         first,
         None if truth_a is None else measure.errors(a, truth_a),
         None if truth_b is None else measure.errors(b, truth_b),
-        truth_a if truth_a is not None else truth_b,
         sorted(lines, key=lambda line: (not line.fails, -line.weight)),
         differing(_conditions(a), _conditions(b)),
         differing(a.run.versions, b.run.versions),

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ground_station.evaluation import ate
-from ground_station.evaluation.figures import AT_LEAST, AT_MOST, EXACTLY, Row
+from ground_station.evaluation.figures import EXACTLY, Row
 from ground_station.replay.cases import accounting, measure, telemetry
 from ground_station.replay.cases.case import Case
 from ground_station.replay.cases.golden import Golden
-from ground_station.replay.cases.limits import Limits
+from ground_station.replay.cases.limits import BOUNDS, Limits
 from ground_station.replay.cases.measure import Figure
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.same import first_difference
@@ -105,25 +105,6 @@ def rows(
         *([_identical(outcome, again)] if limits.identical else []),
         *_unasked(limits, figures, outcome),
     ]
-
-
-# Bound, its figure, unit, sense; the figure without a suffix that its bound has.
-BOUNDS: tuple[tuple[str, str, str, str], ...] = (
-    ("coverage_min", "coverage", "share", AT_LEAST),
-    ("tracking_min", "tracking", "share", AT_LEAST),
-    ("lost_max", "lost", "share", AT_MOST),
-    ("position_rmse_m_max", "position_rmse_m", "m", AT_MOST),
-    ("rotation_rmse_deg_max", "rotation_rmse_deg", "°", AT_MOST),
-    ("position_max_m", "tracking_worst_m", "m", AT_MOST),
-    ("latency_p50_ms_max", "latency_p50_ms", "ms", AT_MOST),
-    ("latency_p99_ms_max", "latency_p99_ms", "ms", AT_MOST),
-    ("recovery_s_max", "recovery_s", "s", AT_MOST),
-    ("payload_memory_MB_max", "payload_memory_MB", "MB", AT_MOST),
-    ("ground_memory_MB_max", "ground_memory_MB", "MB", AT_MOST),
-    ("payload_cpu_max", "payload_cpu", "share", AT_MOST),
-    ("battery_V_min", "battery_V", "V", AT_LEAST),
-    ("battery_V_max", "battery_V", "V", AT_MOST),
-)
 
 
 def _bounds(limits: Limits, figures: dict[str, Figure]) -> list[Row]:

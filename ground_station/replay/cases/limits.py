@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from ground_station.evaluation.figures import AT_LEAST, AT_MOST
 from pi_firmware.wire.config import key, table
 
 
@@ -18,6 +19,10 @@ class Limits:
     """What a run must hold; what is left out is measured and not judged."""
 
     coverage_min: float | None = _bound("localized frames, of those sent", "share", 1.0)
+    tracking_min: float | None = _bound(
+        "frames called TRACKING, of those that reached the localizer", "share", 1.0
+    )
+    lost_max: float | None = _bound("frames lost, of those sent", "share", 1.0)
     position_rmse_m_max: float | None = _bound("position error, RMSE, unaligned", "m")
     rotation_rmse_deg_max: float | None = _bound("rotation error, RMSE", "°", 180.0)
     position_max_m: float | None = _bound("worst position error of a pose called TRACKING", "m")
@@ -26,10 +31,6 @@ class Limits:
     recovery_s_max: float | None = _bound(
         "from an outage's end to the first TRACKING pose of a frame taken after it", "s"
     )
-    tracking_min: float | None = _bound(
-        "frames called TRACKING, of those that reached the localizer", "share", 1.0
-    )
-    lost_max: float | None = _bound("frames lost, of those sent", "share", 1.0)
     payload_memory_MB_max: float | None = _bound("the firmware's resident memory, peak", "MB")
     ground_memory_MB_max: float | None = _bound("the ground station's resident memory, peak", "MB")
     payload_cpu_max: float | None = _bound(
@@ -42,6 +43,17 @@ class Limits:
 
 
 NAMES = tuple(item.name for item in dataclasses.fields(Limits))
+BOUNDS: list[tuple[str, str, str, str]] = [
+    (
+        item.name,
+        "tracking_worst_m" if item.name == "position_max_m" else item.name[: -len("_max")],
+        item.metadata["unit"],
+        AT_LEAST if item.name.endswith("_min") else AT_MOST,
+    )
+    for item in dataclasses.fields(Limits)
+    if item.name != "identical"
+]
+"""Of each bound its name, its figure, unit and sense; the figure without the bound's suffix."""
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
             )
         )
         panels = []
-        if c.errors_a is not None and c.errors_b is not None and c.truth is not None:
+        if c.errors_a is not None and c.errors_b is not None:
             series = [
                 Series(name, (o.frames.time_ns[e.frame] - start_ns) / 1e9, 100 * e.position_m, k)
                 for k, (name, o, e) in enumerate((("A", c.a, c.errors_a), ("B", c.b, c.errors_b)))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from ground_station.evaluation.figures import AT_LEAST, digits
-from ground_station.replay.cases.judge import BOUNDS
+from ground_station.replay.cases.limits import BOUNDS, Limits
 from ground_station.replay.cases.measure import Figure
+from pi_firmware.wire.config import range_of
 
 MARGINS = {
     "coverage_min": (0.0, 0.05),
@@ -31,16 +32,15 @@ def propose(figures: dict[str, Figure]) -> tuple[dict[str, float], dict[str, str
     """Bounds of what was measured, by name, and for each a remark that says how it came about."""
     bounds: dict[str, float] = {}
     remarks: dict[str, str] = {}
-    for name, figure_name, unit, sense in BOUNDS:
+    for name, figure_name, _, sense in BOUNDS:
         value = figures[figure_name].value
         if name not in MARGINS or value is None or not math.isfinite(value):
             continue
         share, fixed = MARGINS[name]
         room = share * abs(value) + fixed
         bound = value - room if sense == AT_LEAST else value + room
-        bounds[name] = _outward(max(0.0, bound), down=sense == AT_LEAST)
-        if unit == "share" and name != "payload_cpu_max":
-            bounds[name] = min(1.0, bounds[name])
+        outward = _outward(max(0.0, bound), down=sense == AT_LEAST)
+        bounds[name] = min(outward, range_of(Limits, name)[1])
         parts = [f"{share:.0%} of it"] * (share > 0) + [f"{fixed:g}"] * (fixed > 0)
         remarks[f"bounds.{name}"] = (
             f"Measured {digits(value, None)}; the margin is {' and '.join(parts)}."
