@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+HELP = "association, pose, whole frames and growth with the map"
+DESCRIPTION = "Measures the localizer against the preset 'thesis' and plain methods."
 EPILOG = """\
 example:
   blimp bench localize --map maps/atrium --json out/bench.json

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+HELP = "start, latency, memory and processor time a frame of the firmware"
+DESCRIPTION = "Measures the payload's own program on this machine, streaming its test picture."
 EPILOG = """\
 example:
   blimp bench payload --json out/bench-payload.json

@@ -22,7 +22,7 @@ from scipy import ndimage
 from ground_station.arrays import F32, F64, I64, U8
 from ground_station.simulator import scenes
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-from ground_station.simulator.scene import Scene, SimulatorError
+from ground_station.simulator.scene import Scene
 from ground_station.simulator.surfaces import Surface
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
@@ -63,13 +63,6 @@ LIGHTS: dict[str, Light] = {
     "evening": Light(-128, 24, 2.6, (1.30, 0.96, 0.62), 0.35, (0.90, 1.0, 1.15), 0.05),
     "sunset": Light(-142, 7, 0.9, (1.60, 0.88, 0.42), 0.09, (0.88, 0.97, 1.22), 0.16),
 }
-
-
-def light_named(name: str) -> Light:
-    """The light of that name; raises `SimulatorError` naming those there are."""
-    if name not in LIGHTS:
-        raise SimulatorError(f"light '{name}' is unknown; there are: {', '.join(LIGHTS)}")
-    return LIGHTS[name]
 
 
 def looking(direction: F64, centre_m: npt.ArrayLike, distance_m: float) -> F64:
@@ -248,13 +241,9 @@ class LitTextures:
 
 @functools.lru_cache(maxsize=1)
 def lit_scene(scene_name: str, texels_per_m: float, light_name: str) -> tuple[Scene, LitTextures]:
-    """A scene and its lit textures by name; the last is kept, since flights come in series.
-
-    Raises `SimulatorError` naming what there is.
-    """
-    light = light_named(light_name)
+    """A scene and its lit textures by name; the last is kept, since flights come in series."""
     scene = scenes.build(scene_name, texels_per_m)
-    return scene, lit_textures(scene, light)
+    return scene, lit_textures(scene, LIGHTS[light_name])
 
 
 def lit_textures(scene: Scene, light: Light) -> LitTextures:

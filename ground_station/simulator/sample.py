@@ -22,12 +22,8 @@ _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
 _FILLED = ("wall", "pillar", "furniture", "glass")
 
 
-def draw_floorplan(scene: Scene) -> tuple[U8, tuple[float, float, float]]:
-    """The plan (H, W), 254 free, 0 occupied, 205 unknown, and the origin map_server wants.
-
-    Rows go down as y falls; the origin is the world pose (x, y, yaw) of the lower left corner of
-    the lower left pixel.
-    """
+def draw_floorplan(scene: Scene) -> U8:
+    """The plan (H, W), 254 free, 0 occupied, 205 unknown; rows go down as y falls."""
     width, height = (
         round((s + 2 * _MARGIN_M) / _RESOLUTION_M) for s in (scene.size_m[0], scene.size_m[1])
     )
@@ -59,36 +55,25 @@ def draw_floorplan(scene: Scene) -> tuple[U8, tuple[float, float, float]]:
             (left, bottom), (right, _) = corner(*f.bounds_m[:2]), corner(*f.bounds_m[2:])
             for x in range(left, right, 16):
                 cv2.line(plan, (x, bottom), (min(x + 7, right), bottom), _UNKNOWN, 2)
-    return plan, (-_MARGIN_M, -_MARGIN_M, 0.0)
+    return plan
 
 
 def write_floorplan(folder: str | Path, scene: Scene) -> list[Path]:
     """Writes `floorplan.png` and `floorplan.yaml`, each beside and renamed; returns their paths."""
     folder = Path(folder)
-    plan, origin = draw_floorplan(scene)
-    fine, png = cv2.imencode(".png", plan, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not fine:
-        raise SimulatorError(f"{folder}: the floor plan cannot be encoded as PNG")
+    _, png = cv2.imencode(".png", draw_floorplan(scene), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     document = {
         "image": "floorplan.png",
         "resolution": _RESOLUTION_M,
-        "origin": list(origin),
+        # The world pose (x, y, yaw) of the lower left corner of the lower left pixel.
+        "origin": [-_MARGIN_M, -_MARGIN_M, 0.0],
         "negate": 0,
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
-    made = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in (
-            ("floorplan.png", png.tobytes()),
-            ("floorplan.yaml", yaml.safe_dump(document, sort_keys=False).encode()),
-        ):
-            write_bytes(folder / name, data)
-            made.append(folder / name)
-    except OSError as error:
-        raise SimulatorError(f"{folder}: {error.strerror or error}") from None
-    return made
+    write_bytes(folder / "floorplan.png", png.tobytes())
+    write_bytes(folder / "floorplan.yaml", yaml.safe_dump(document, sort_keys=False).encode())
+    return [folder / "floorplan.png", folder / "floorplan.yaml"]
 
 
 MAX_FILE_BYTES = 6_000_000

@@ -1,4 +1,4 @@
-"""The scenes by name."""
+"""The scenes by name, and interiors by number."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ground_station.simulator.office import build_office
 from ground_station.simulator.rooms import build_rooms
 from ground_station.simulator.scene import Scene, SimulatorError
 
-_SCENES: dict[str, Callable[[float], Scene]] = {
+SCENES: dict[str, Callable[[float], Scene]] = {
     "atrium": build_atrium,
     "office": build_office,
     "corridor": build_corridor,
@@ -25,20 +25,15 @@ _SCENES: dict[str, Callable[[float], Scene]] = {
 _INTERIOR, _DIGITS = "interior-", 3
 
 
-def names() -> tuple[str, ...]:
-    """The scenes that have a name; interiors have a number."""
-    return tuple(_SCENES)
-
-
 def build(name: str, texels_per_m: float) -> Scene:
     """The scene of that name; raises `SimulatorError` naming those there are."""
     number = name.removeprefix(_INTERIOR)
     is_interior = name != number and number.isdecimal() and len(number) <= _DIGITS
-    if name not in _SCENES and not is_interior:
-        known = ", ".join([*_SCENES, f"{_INTERIOR}N"])
+    if name not in SCENES and not is_interior:
+        known = ", ".join([*SCENES, f"{_INTERIOR}N"])
         raise SimulatorError(f"scene '{name}' is unknown; there are: {known}")
     if not 5 <= texels_per_m <= 400:
         raise SimulatorError(f"{texels_per_m} texels per metre; allowed: 5 to 400")
     if is_interior:
         return build_interior(int(number), texels_per_m)
-    return _SCENES[name](texels_per_m)
+    return SCENES[name](texels_per_m)

@@ -103,7 +103,7 @@ def test_rooms_are_by_chance_and_none_is_one_that_localizers_are_judged_in():
     first, second = rooms.build_room(1, 0), rooms.build_room(1, 1)
     assert first.size_m != second.size_m
     assert rooms.build_room(1, 0).texture_seed == first.texture_seed
-    for name in scenes.names():
+    for name in scenes.SCENES:
         judged = scenes.build(name, 20)
         for room in (first, second):
             assert room.size_m != judged.size_m and room.texture_seed != judged.texture_seed

@@ -21,6 +21,8 @@ Rows = dict[str, dict[str, Any]]
 KINDS = ("homographies", "times")
 _NONE = "-"
 
+HELP = "extractors on known homographies"
+DESCRIPTION = "Measures all extractors: how often points are found again and matched, time."
 EPILOG = """\
 examples:
   blimp bench features --json out/features.json

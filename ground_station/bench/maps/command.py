@@ -6,6 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+HELP = "builds against COLMAP's own on the same images; many images"
+DESCRIPTION = (
+    "Measures which builds are true beside COLMAP's own, or what builds of many images cost."
+)
 EPILOG = """\
 examples:
   blimp bench map --study hallway stills --features rootsift orb --real DATA --json out/study.json

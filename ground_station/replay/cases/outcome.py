@@ -195,9 +195,7 @@ def _read_run(path: Path) -> Run:
 
 
 def _write_floorplan(folder: Path, plan: FloorPlan) -> None:
-    ok, data = cv2.imencode(".png", plan.image)
-    if not ok:
-        raise InputError(f"{folder}: the floor plan cannot be encoded")
+    _, data = cv2.imencode(".png", plan.image)
     write_bytes(folder / PICTURE, data.tobytes())
     told = {"image": PICTURE, "resolution": plan.resolution_m, "origin": list(plan.origin)}
     write_text(folder / FLOORPLAN, yaml.safe_dump(told))

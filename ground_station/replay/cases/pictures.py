@@ -117,16 +117,15 @@ def _zoom(axes: Axes, paths_m: Sequence[F64]) -> None:
 
 def over_time(
     panels: Sequence[tuple[str, Sequence[Series], float | None]],
-    strips: Sequence[Strip] = (),
+    strips: Sequence[Strip],
     outages_s: Sequence[tuple[float, float]] = (),
     theme: Theme = LIGHT,
 ) -> Figure:
     """Panels over one another, each a label, its series and a bound; the states below; outages
     shaded. Times are seconds from the flight's first frame."""
-    rows = len(panels) + bool(strips)
-    heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)] * bool(strips)
+    heights = [1.7] * len(panels) + [0.3 + 0.22 * len(strips)]
     figure, grid = figure_of(
-        (WIDTH_IN, sum(heights) + 0.7), theme, rows, label_size=_SMALL, sharex=True,
+        (WIDTH_IN, sum(heights) + 0.7), theme, len(heights), label_size=_SMALL, sharex=True,
         height_ratios=heights,
     )  # fmt: skip
     for axes, (label, series, bound) in zip(grid, panels, strict=False):
@@ -144,9 +143,8 @@ def over_time(
         _shade(axes, outages_s, theme)
         if len(series) > 1 or bound is not None or outages_s:
             legend(axes, theme, **ABOVE, fontsize=_SMALL)
-    if strips:
-        _draw_strips(grid[-1], strips, theme)
-        _shade(grid[-1], outages_s, theme)
+    _draw_strips(grid[-1], strips, theme)
+    _shade(grid[-1], outages_s, theme)
     grid[-1].set_xlabel("time, s", fontsize=_SMALL)
     return figure
 
