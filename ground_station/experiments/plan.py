@@ -40,7 +40,6 @@ class MapJob:
     """Builds a map in `maps/<key>`; `recording` is the name of the flight's, None: real ones."""
 
     key: str
-    name: str
     spec: MapSpec
     settings: MappingSettings
     recording: str | None
@@ -51,7 +50,6 @@ class RunJob:
     """Localizes a flight in a map; its figures go to `runs/<key>.json`."""
 
     key: str
-    name: str
     map_key: str
     flight: FlightDeclaration
     recording: str | None
@@ -116,8 +114,7 @@ def _runs(
             "code": code_sha256("run"),
         }
         key = _key("run", depends)
-        name = f"{case.experiment}: {case.title}, {preset}, seed {seed}"
-        job = RunJob(key, name, map_job.key, flight, recording, seed, case.alter, preset, settings)
+        job = RunJob(key, map_job.key, flight, recording, seed, case.alter, preset, settings)
         _add(plan, job, (map_job.key, *needs))
         keys.append(key)
     return keys
@@ -132,13 +129,7 @@ def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> Map
         "settings": asdict(mapping),
         "code": code_sha256("map"),
     }
-    job = MapJob(
-        _key("map", depends),
-        f"map of {spec.images or 'all'} images, {spec.features}",
-        spec,
-        mapping,
-        recording,
-    )
+    job = MapJob(_key("map", depends), spec, mapping, recording)
     _add(plan, job, needs)
     return job
 

@@ -24,13 +24,13 @@ def a_plan(runs=3):
     """A flight, a map of it, runs in that."""
     jobs = {
         "f": FlightJob("f", "f.mcap", FlightDeclaration(), 1),
-        "m": MapJob("m", "map", MapSpec(), MappingSettings(), "f.mcap"),
+        "m": MapJob("m", MapSpec(), MappingSettings(), "f.mcap"),
     }
     needs = {"f": (), "m": ("f",)}
     for k in range(runs):
         key = f"r{k}"
         flight, settings = FlightDeclaration(), LocalizerSettings()
-        jobs[key] = RunJob(key, key, "m", flight, "f.mcap", k, Alteration(), "default", settings)
+        jobs[key] = RunJob(key, "m", flight, "f.mcap", k, Alteration(), "default", settings)
         needs[key] = ("m", "f")
     return Plan(jobs, needs, {})
 
