@@ -7,11 +7,11 @@ of different things. Features are made, too, so that the steps after them are me
 from __future__ import annotations
 
 import dataclasses
-import json
-import subprocess
-import sys
+import multiprocessing
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,6 @@ _KEYFRAME, _SHARED = 500, 5
 """Landmarks that a made-up keyframe sees, and keyframes that see a landmark."""
 _BYTES = np.round(255 * (np.arange(256) / 255) ** 3).astype(np.uint8)
 """Of even bytes, this makes descriptors whose distance is 1.06 by chance."""
-_SENTINEL = "localizer of a map: "
 
 
 class BenchError(GroundStationError):
@@ -231,37 +230,26 @@ def memory(seed: int, count: int) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     landmarks = building(rng, min(10_000, count), count)
     view = _view(rng, landmarks, _settings(relocalize=True))
+    spawned = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory(prefix="blimp-bench-") as name:
-        folder = Path(name)
-        store.save_tables(folder, Map(_info(), landmarks, _keyframes(landmarks)))
-        np.savez(
-            folder / "view.npz", guess=view.guess, pixel=view.features.keypoints_px,
-            descriptor=view.features.descriptors,
-        )  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, "-m", __name__, name], capture_output=True, text=True, check=False
-        )
-    lines = [line for line in done.stdout.splitlines() if line.startswith(_SENTINEL)]
-    if done.returncode or not lines:
-        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise BenchError(f"the localizer of {count} landmarks: {said[-1]}")
-    return {"landmarks": count, **json.loads(lines[0].removeprefix(_SENTINEL))}
+        store.save_tables(Path(name), Map(_info(), landmarks, _keyframes(landmarks)))
+        with ProcessPoolExecutor(1, mp_context=spawned) as alone:
+            try:
+                return {"landmarks": count, **alone.submit(_occupy, Path(name), view).result()}
+            except BrokenProcessPool:
+                raise BenchError(f"the localizer of {count} landmarks: its process ended") from None
 
 
-def _occupy(folder: Path) -> dict[str, float]:
+def _occupy(folder: Path, view: _View) -> dict[str, float]:
     """What `memory` measures, in the process that it starts."""
     idle_mb = _peak_mb()
     begin = time.perf_counter()
     localizer = Localizer(store.load(folder), THESIS_CAMERA, MadeUp(), _settings(relocalize=True))
     load_s = time.perf_counter() - begin
-    with np.load(folder / "view.npz", allow_pickle=False) as kept:
-        features = Features(
-            kept["pixel"], np.ones(len(kept["pixel"]), np.float32), kept["descriptor"]
-        )
-        tracked = _locate(localizer, _View(kept["guess"], features))
+    tracked = _locate(localizer, view)
     localizer.reset()
     begin = time.perf_counter()
-    localizer.process_features(0, features)  # nothing is known: the whole map is searched
+    localizer.process_features(0, view.features)  # nothing is known: the whole map is searched
     return {
         "load_s": load_s,
         "search_s": time.perf_counter() - begin,
@@ -279,7 +267,3 @@ def _peak_mb() -> float:
         return float("nan")
     kib = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), "nan")
     return float(kib) * 1024 / 1e6
-
-
-if __name__ == "__main__":
-    print(_SENTINEL + json.dumps(_occupy(Path(sys.argv[1]))))
