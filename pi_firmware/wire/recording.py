@@ -141,7 +141,7 @@ class RecordingWriter:
         """
         message = CompressedVideo(frame_id=frame_id, data=data, format="h264")
         message.timestamp.FromNanoseconds(time_ns)
-        self._write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
+        self.write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
     def write_calibration(
         self,
@@ -171,7 +171,7 @@ class RecordingWriter:
             P=[k[0], k[1], k[2], 0, k[3], k[4], k[5], 0, k[6], k[7], k[8], 0],
         )
         message.timestamp.FromNanoseconds(time_ns)
-        self._write_protobuf(topic, time_ns, message)
+        self.write_protobuf(topic, time_ns, message)
 
     def write_pose(
         self,
@@ -189,7 +189,7 @@ class RecordingWriter:
         position, orientation = message.pose.position, message.pose.orientation
         position.x, position.y, position.z = map(float, position_m)
         orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion_xyzw)
-        self._write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
+        self.write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
     def write_json(
         self,
@@ -244,7 +244,8 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from None
 
-    def _write_protobuf(self, topic: str, time_ns: int, message: Message) -> None:
+    def write_protobuf(self, topic: str, time_ns: int, message: Message) -> None:
+        """Adds a message as it is, at its log time."""
         if topic not in self._channels:
             name = message.DESCRIPTOR.full_name
             schema_id = self._schema(name, "protobuf", _descriptor_set(type(message)))

@@ -178,12 +178,12 @@ def test_a_recording_without_video_and_one_of_another_codec_are_refused(
 
     path = tmp_path / "h265.mcap"
     with RecordingWriter(path) as writer:
-        writer._write_protobuf("/camera/video", 1, CompressedVideo(format="h265", data=b"x"))
+        writer.write_protobuf("/camera/video", 1, CompressedVideo(format="h265", data=b"x"))
     with pytest.raises(RecordingError, match="'h265'; only h264"):
         list(open_input(path))
     with RecordingWriter(path) as writer:
         strange = CompressedVideo(format="h\x0c\n4" + "x" * 100, data=b"x")
-        writer._write_protobuf("/camera/video", 1, strange)
+        writer.write_protobuf("/camera/video", 1, strange)
     with pytest.raises(RecordingError) as refused:
         list(open_input(path))
     assert str(refused.value).isprintable() and "x" * 40 not in str(refused.value)
