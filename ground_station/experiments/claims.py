@@ -33,9 +33,9 @@ def judge(claims: Sequence[Claim], experiments: Sequence[dict[str, Any]]) -> lis
             continue
         runs = [[run for case in cases[row] for run in _runs(case, claim)] for row in named]
         values = [_value(of, claim) for of in runs]
-        value: float | None = None
-        if None not in values:
-            value = values[0] if len(values) == 1 else _ratio(*values)
+        value = values[0]
+        if value is not None and claim.against:
+            value = value / values[1] if values[1] else None
         measured = all(of and not any("failed" in run for run in of) for of in runs)
         kept = value is not None and _within(value, claim) if measured else None
         unit = " times" if claim.against else _UNITS[claim.figure.rpartition("_")[2]]
@@ -65,10 +65,6 @@ def _value(runs: Sequence[dict[str, Any]], claim: Claim) -> float | None:
     if not numbers or None in numbers:
         return None
     return float(_OVER_RUNS[claim.statistic](numbers))
-
-
-def _ratio(value: float | None, unit: float | None) -> float | None:
-    return value / unit if value is not None and unit else None
 
 
 def _within(value: float, claim: Claim) -> bool:

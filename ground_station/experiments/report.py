@@ -80,7 +80,9 @@ def good(document: dict[str, Any]) -> bool:
 
 
 def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Shown]:
-    cases = [c for c in experiment["cases"] if any(_localized(c, p) for p in c["presets"])]
+    cases = [
+        c for c in experiment["cases"] if any(pictures.first_series(c, p) for p in c["presets"])
+    ]
     if not cases:
         return []
     name = experiment["title"]
@@ -109,10 +111,6 @@ def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Show
               lambda theme: pictures.distribution(cases, theme))
     )  # fmt: skip
     return found
-
-
-def _localized(case: dict[str, Any], preset: str) -> bool:
-    return bool(pictures.first_series(case, preset))
 
 
 def _setting(case: dict[str, Any]) -> tuple[str, str]:

@@ -169,7 +169,9 @@ def run(
             result.events.append(message)
         elif isinstance(message, PayloadMessage):
             result.payload = message
-            _note_clock(result, message.clock)
+            if (clock := message.clock) is not None:
+                worst_ns = max(clock["uncertainty_ns"], (result.clock or clock)["uncertainty_ns"])
+                result.clock = clock | {"uncertainty_ns": worst_ns}
         station.step()
         if message is not None and not isinstance(message, PayloadMessage):
             continue
@@ -198,9 +200,3 @@ def run(
         if key in inbox.pictures:
             result.pictures.append((inbox.pictures[key], said))
     return result
-
-
-def _note_clock(result: LiveResult, clock: dict[str, int] | None) -> None:
-    if clock is not None:
-        worst_ns = max(clock["uncertainty_ns"], (result.clock or clock)["uncertainty_ns"])
-        result.clock = clock | {"uncertainty_ns": worst_ns}

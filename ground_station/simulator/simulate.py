@@ -206,7 +206,10 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     """
     started = time.monotonic()
     flight = prepare_flight(settings)
-    camera, sensor = flight.camera, _sensor(settings)
+    camera, sensor = flight.camera, Sensor()
+    if settings.longest_exposure_s is not None:
+        limits_s = (sensor.exposure_limits_s[0], settings.longest_exposure_s)
+        sensor = replace(sensor, exposure_limits_s=limits_s)
     _, lit = lit_scene(settings.scene, settings.texels_per_m, settings.light)
     pinhole = covering_pinhole(camera, settings.supersampling)
     buffer = (pinhole.width_px, pinhole.height_px)
@@ -237,14 +240,6 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
         max_speed_m_s=round(float(speed.max(initial=0)), 3),
         max_turn_deg_s=round(math.degrees(float(turn.max(initial=0))), 2),
     )  # fmt: skip
-
-
-def _sensor(settings: SimulationSettings) -> Sensor:
-    sensor = Sensor()
-    if settings.longest_exposure_s is None:
-        return sensor
-    shortest_s = sensor.exposure_limits_s[0]
-    return replace(sensor, exposure_limits_s=(shortest_s, settings.longest_exposure_s))
 
 
 def _record(

@@ -55,11 +55,15 @@ def run(args: argparse.Namespace) -> int:
     """
     from ground_station.bench.machine import machine
     from ground_station.errors import InputError, check_options
+    from ground_station.features import extractors
     from ground_station.files import write_json
 
     check_options(args, max_features=(50, 20000), threads=(0, 64), repetitions=(3, 10000))
     threads = args.threads or machine()["cores"]
-    made = _extractors(args.extractors, args.max_features, threads)
+    made = {
+        name: extractors.create(name, args.max_features, threads=threads)
+        for name in dict.fromkeys(args.extractors or extractors.names())
+    }
     rows: Rows = {
         name: {"name": name, "sha256": extractor.sha256, "dimension": extractor.dimension}
         for name, extractor in made.items()
@@ -89,15 +93,6 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, result)
     return 0
-
-
-def _extractors(names: list[str] | None, most: int, threads: int) -> dict[str, Extractor]:
-    from ground_station.features import extractors
-
-    return {
-        name: extractors.create(name, most, threads=threads)
-        for name in dict.fromkeys(names or extractors.names())
-    }
 
 
 def _homographies(args: argparse.Namespace, made: dict[str, Extractor], rows: Rows) -> None:

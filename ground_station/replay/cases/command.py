@@ -139,7 +139,7 @@ def _make(args: argparse.Namespace, out: Path) -> int:
     )
     made = make_case(asked)
     for note in made.notes:
-        _say(note)
+        print(f"blimp replay: {note}", file=sys.stderr)
     print("\n".join(str(path) for path in made.files))
     return 0
 
@@ -271,7 +271,3 @@ def _name(path: Path) -> str:
 
 def _option(name: str) -> str:
     return "--from" if name == "from_outcome" else "--" + name.replace("_", "-")
-
-
-def _say(line: str) -> None:
-    print(f"blimp replay: {line}", file=sys.stderr)

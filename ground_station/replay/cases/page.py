@@ -24,9 +24,9 @@ _TEMPLATES = Path(__file__).parent / "templates"
 def write_comparison(path: str | Path, comparison: Comparison, a: str, b: str) -> None:
     """Writes the page of two runs; `a` and `b` are their names."""
     c = comparison
-    _write(
+    write_page(
         path,
-        "compare.html",
+        _TEMPLATES / "compare.html",
         title=f"{b} against {a}",
         names=(a, b),
         comparison=c,
@@ -52,9 +52,9 @@ def write_suite(
     `comparisons` by a case's name show that run against an earlier one, which is A.
     """
     against = comparisons or {}
-    _write(
+    write_page(
         path,
-        "suite.html",
+        _TEMPLATES / "suite.html",
         title=title,
         began=began,
         cases=[
@@ -78,10 +78,6 @@ def cells(line: Line) -> tuple[str, str, str, str]:
         worse = f"+{worse}"
     allowed = "" if line.allowed is None else f"{line.allowed:g}"
     return a, b, worse, allowed
-
-
-def _write(path: str | Path, template: str, **values: object) -> None:
-    write_page(path, _TEMPLATES / template, **values)
 
 
 def _of_comparison(c: Comparison) -> list[Shown]:
