@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -119,8 +119,8 @@ def aggregate(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "wrong": sum(run["wrong"] for run in good),
         "landmarks": good[0]["landmarks"] if good else None,
         "keyframes": good[0]["keyframes"] if good else None,
-        "stage_s": _median_of(good, "stage_s"),
-        "consistency": _mean_of(good, "consistency"),
+        "stage_s": _over(good, "stage_s", np.median),
+        "consistency": _over(good, "consistency", np.mean) or None,
     }
     for name in FIGURES:
         result[name] = statistics([run.get(name) for run in good])
@@ -207,16 +207,12 @@ def worse(presets: dict[str, Any], common: dict[str, Any]) -> list[str]:
     return reasons
 
 
-def _median_of(runs: Sequence[dict[str, Any]], key: str) -> dict[str, float]:
-    names = dict.fromkeys(name for run in runs for name in run.get(key) or {})
+def _over(
+    runs: Sequence[dict[str, Any]], key: str, statistic: Callable[..., Any]
+) -> dict[str, float]:
+    """A statistic of each figure in a run's table `key`, over the runs that have it."""
+    tables = [run.get(key) or {} for run in runs]
     return {
-        name: float(np.median([run[key][name] for run in runs if name in run[key]]))
-        for name in names
+        name: float(statistic([table[name] for table in tables if name in table]))
+        for name in dict.fromkeys(name for table in tables for name in table)
     }
-
-
-def _mean_of(runs: Sequence[dict[str, Any]], key: str) -> dict[str, float] | None:
-    found = [run[key] for run in runs if run.get(key)]
-    if not found:
-        return None
-    return {name: float(np.mean([one[name] for one in found])) for name in found[0]}
