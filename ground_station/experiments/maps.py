@@ -15,7 +15,7 @@ from ground_station.experiments.declaration import MapSpec
 from ground_station.experiments.flights import points_of
 from ground_station.experiments.material import flown
 from ground_station.files import write_json
-from ground_station.geometry.alignment import Alignment
+from ground_station.geometry.alignment import Alignment, spread_out
 from ground_station.map import store
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.construction.cache import Cache
@@ -65,10 +65,7 @@ def clicked(known: PointObservations, count: int, seed: int) -> PointObservation
     """So many of the points, far from each other, as a person clicks and measures them."""
     rng = np.random.default_rng([seed, count])
     places = known.world_m
-    chosen = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
-    while len(chosen) < min(count, len(places)):
-        gaps = np.linalg.norm(places[:, None] - places[chosen][None], axis=2).min(axis=1)
-        chosen.append(int(gaps.argmax()))
+    chosen = spread_out(places, count)
     kept = np.isin(known.point, chosen)
     number = np.full(len(places), -1, np.int64)
     number[chosen] = np.arange(len(chosen))

@@ -97,3 +97,17 @@ def _normalized(weights: npt.ArrayLike | None, n: int) -> F64:
     if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or not np.any(w > 0):
         raise GeometryError(f"alignment: weights must be {n} finite numbers >= 0, not all zero")
     return np.asarray(w / w.sum())
+
+
+def spread_out(places: F64, count: int, least: float = 0.0) -> list[int]:
+    """Indices of up to `count` places (N, D), N >= 1, far from each other, greedily.
+
+    None is nearer than `least` to one before it.
+    """
+    picked = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
+    while len(picked) < min(count, len(places)):
+        gaps = np.linalg.norm(places[:, None] - places[picked][None], axis=2).min(axis=1)
+        if gaps.max() < least:
+            break
+        picked.append(int(gaps.argmax()))
+    return picked

@@ -12,7 +12,9 @@ import numpy.typing as npt
 from ground_station.arrays import F64, Bools
 from ground_station.files import write_text
 from ground_station.geometry import poses
+from ground_station.geometry.alignment import spread_out
 from ground_station.geometry.camera import Camera
+from ground_station.recording.video import frame_name
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import KnownPoint, SimulatorError
@@ -23,12 +25,7 @@ _RANGE_M = (1.0, 12.0)
 _FLOW_LIMIT_PX_S = 90.0  # over half a readout of 10 ms: within a pixel of a global shutter
 _MIN_FACING = 0.3  # cosine of the angle between view and normal
 _MIN_PARALLAX_DEG = 13.0
-_MOST_POINTS, _MOST_FRAMES = 18, 5
-
-
-def frame_name(index: int) -> str:
-    """How the frames of a recording are called everywhere: frame k, from 0."""
-    return f"frame-{index:06d}"
+_MOST_POINTS, _MOST_FRAMES, _APART_M = 18, 5, 0.2
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,10 @@ def choose_observations(
             seen[i].append((frame, pixels[i], wTc[:3, 3]))
     chosen: dict[int, list[tuple[int, F64, F64]]] = {}
     for i, observations in enumerate(seen):
-        picked = _far_apart(observations, _MOST_FRAMES)
+        if len(observations) < 3:
+            continue
+        centres = np.array([centre for _, _, centre in observations])
+        picked = [observations[k] for k in spread_out(centres, _MOST_FRAMES, _APART_M)]
         if len(picked) >= 3 and _parallax_deg(picked, position[i]) >= _MIN_PARALLAX_DEG:
             chosen[i] = picked
     if len(chosen) < 4:
@@ -125,42 +125,20 @@ def choose_observations(
             f"only {len(chosen)} known points are seen in three far-apart frames; 4 are needed:"
             " fly longer"
         )
+    seen_enough = list(chosen)
+    scaled = position[seen_enough] * [1, 1, 2]  # heights count double, halls being flat
     result = []
-    for index in _spread(list(chosen), position, _MOST_POINTS):
+    for index in sorted(seen_enough[k] for k in spread_out(scaled, _MOST_POINTS)):
         for frame, pixel, _ in sorted(chosen[index], key=lambda s: s[0]):
             u, v = pixel + _CLICK_NOISE_PX * rng.standard_normal(2)
             result.append(PointObservation(points[index], frame, (float(u), float(v))))
     return result
 
 
-def _far_apart(observations: list[tuple[int, F64, F64]], count: int) -> list[tuple[int, F64, F64]]:
-    """The observations whose cameras stand farthest from each other, greedily."""
-    if len(observations) <= 1:
-        return observations
-    centres = np.array([s[2] for s in observations])
-    picked = [int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmax())]
-    while len(picked) < min(count, len(observations)):
-        gaps = np.linalg.norm(centres[:, None] - centres[picked][None], axis=2).min(axis=1)
-        if gaps.max() < 0.2:
-            break
-        picked.append(int(gaps.argmax()))
-    return [observations[i] for i in picked]
-
-
 def _parallax_deg(observations: list[tuple[int, F64, F64]], point: F64) -> float:
     rays = np.array([s[2] - point for s in observations])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
-
-
-def _spread(candidates: list[int], position: F64, count: int) -> list[int]:
-    """Points that fill the space, farthest first; heights count double, halls being flat."""
-    scaled = position[candidates] * [1, 1, 2]
-    picked = [int(np.linalg.norm(scaled - scaled.mean(axis=0), axis=1).argmax())]
-    while len(picked) < min(count, len(candidates)):
-        gaps = np.linalg.norm(scaled[:, None] - scaled[picked][None], axis=2).min(axis=1)
-        picked.append(int(gaps.argmax()))
-    return sorted(candidates[i] for i in picked)
 
 
 def write_pairs(path: Path, observations: Sequence[PointObservation]) -> None:
