@@ -30,8 +30,8 @@ def verdict(map_: Map) -> Verdict:
 
     Of `built` are read: `images`, `registered`, `model_sizes`, `reprojection_px`, `observations`,
     `dropped`, and where they are there `left_out` (a reason for each image's name), `parts` (the
-    names of each model's images, the largest first), `doubts` (sentences), `noise_px`,
-    `lens_prior` and `lens` (`said`, a sentence; `refused`, whether the views leave it open).
+    names of each model's images, the largest first), `doubts` (sentences), `noise_px` and `lens`
+    (`said`, a sentence).
     """
     built, names = map_.info.built, map_.keyframes.names
     images, registered = int(built.get("images", len(names))), len(names)
@@ -50,8 +50,8 @@ def verdict(map_: Map) -> Verdict:
     alone = {name: why for name, why in reasons.items() if name not in apart}
     lines += _few(_left_out_lines(alone, every), "reasons")
     lines.append(_exact(map_))
-    if lens := _lens(built):
-        lines.append(lens)
+    if "lens" in built:
+        lines.append(f"lens: {built['lens']['said']}")
     lines.append(_scale(map_))
     return Verdict(word, lines, [name for name in every if name not in set(names)])
 
@@ -74,8 +74,6 @@ def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
             if map_.info.features == "rootsift":  # measured: `features/README.md`
                 why += "; or build with --features lark, which may join them: read its doubts"
         return f"blimp map view {where} --out {page} --open    ({why})"
-    if _open_lens(map_.info.built):
-        return "blimp calibrate VIDEO --out camera.toml    (then build again with --camera)"
     if map_.info.registered:
         return f"blimp localize VIDEO --map {where} --out est.txt"
     plan = "" if (Path(folder) / "floorplan.yaml").exists() else " --plan floorplan.png"
@@ -162,34 +160,6 @@ def _exact(map_: Map) -> str:
     if "noise_px" in built:
         text += f"; a key point's noise is {built['noise_px']:.2f} px"
     return text
-
-
-def _lens(built: Mapping[str, Any]) -> str:
-    """What was found of the lens: the sentence of its table, or the table itself."""
-    lens = built.get("lens")
-    if not isinstance(lens, Mapping) or not lens:
-        if not _open_lens(built):
-            return ""
-        prior = built["lens_prior"]
-        return (
-            f"lens: {prior['focal_px']:.0f} px by {prior['source']}, known to "
-            f"{100 * prior['sigma_focal']:.0f} %, and not refined: the map may be bent"
-        )
-    if "said" in lens:
-        return f"lens: {lens['said']}"
-    shown = [
-        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in lens.items()
-        if isinstance(value, float | int | str)
-    ]
-    return f"lens: {', '.join(shown)}" if shown else ""
-
-
-def _open_lens(built: Mapping[str, Any]) -> bool:
-    """Whether nobody measured the lens, and the build could not find it."""
-    prior, lens = built.get("lens_prior", {}), built.get("lens", {})
-    measured = prior.get("source", "file") in ("file", "recording")
-    return not measured and bool(lens.get("refused", not lens))
 
 
 def _scale(map_: Map) -> str:

@@ -92,30 +92,14 @@ def test_many_of_a_kind_are_a_few_lines() -> None:
 
 
 def test_the_lens_is_said_where_something_was_found() -> None:
-    lines = verdict(map_of(EVERY, lens={"said": "f 501 ± 2 px", "refused": False})).lines
+    lines = verdict(map_of(EVERY, lens={"said": "f 501 ± 2 px"})).lines
     assert "lens: f 501 ± 2 px" in lines
-    assert not any(line.startswith("lens") for line in verdict(map_of(EVERY, lens={})).lines)
-
-
-GUESSED = {"source": "guess", "focal_px": 473.0, "sigma_focal": 0.3}
-MEASURED = {"source": "file", "focal_px": 473.0, "sigma_focal": 0.02}
-
-
-def test_a_guessed_lens_that_nothing_refined_is_said_to_be() -> None:
-    (line,) = [s for s in verdict(map_of(EVERY, lens_prior=GUESSED)).lines if s.startswith("lens")]
-    assert line == "lens: 473 px by guess, known to 30 %, and not refined: the map may be bent"
-    lines = verdict(map_of(EVERY, lens_prior=MEASURED)).lines
-    assert not any(line.startswith("lens") for line in lines)
 
 
 @pytest.mark.parametrize(
     ("built", "command"),
     [
         ({}, "blimp map register 'maps/a b' --page "),
-        ({"lens_prior": GUESSED}, "blimp calibrate "),
-        ({"lens_prior": GUESSED, "lens": {"refused": True}}, "blimp calibrate "),
-        ({"lens_prior": GUESSED, "lens": {"said": "f"}}, "blimp map register "),
-        ({"lens_prior": MEASURED, "lens": {"refused": True}}, "blimp map register "),
         ({"doubts": ["d"]}, "blimp map view 'maps/a b' --out 'a b.html' --open "),
         ({"model_sizes": [40, 9]}, "blimp map view "),
     ],
