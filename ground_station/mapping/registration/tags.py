@@ -30,9 +30,6 @@ FAMILIES = {
     "36h11": cv2.aruco.DICT_APRILTAG_36h11,
 }
 """Olson, "AprilTag: a robust and flexible visual fiducial system", ICRA 2011."""
-_FIRST = {"16h5": 0x231B, "25h9": 0x155CBF1, "36h11": 0xD5D628584}
-"""The bits of each family's tag 0, row by row from the top left, as AprilTag's own images show it.
-OpenCV 4 has them all turned by half a turn, OpenCV 5 has not."""
 
 _MOST_TAGS = 1000
 _LARGEST_M = 1e6
@@ -144,16 +141,6 @@ def _places(tag: _Tag, size_m: float, where: str) -> F64:
     return places + half * np.array([-right + up, right + up, right - up, -right - up])
 
 
-def quarter_turns(family: str) -> int:
-    """How often OpenCV's tags of a family must turn to the left to lie as AprilTag's own do."""
-    dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[family])
-    side = dictionary.markerSize
-    drawn = cv2.aruco.generateImageMarker(dictionary, 0, side + 2)[1:-1, 1:-1] > 127
-    shift = np.arange(side * side - 1, -1, -1)
-    own = ((_FIRST[family] >> shift) & 1).reshape(side, side) == 1
-    return next(turn for turn in range(4) if (np.rot90(drawn, turn) == own).all())
-
-
 def detect(image: U8, family: str) -> list[tuple[int, F64]]:
     """Tags in a grey image (H, W): id and corners (4, 2), pixels, from the top left, clockwise.
 
@@ -167,9 +154,9 @@ def detect(image: U8, family: str) -> list[tuple[int, F64]]:
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if ids is None:
         return []
-    turns = quarter_turns(family)
+    # OpenCV 4 has them half a turn off AprilTag's own.
     return [
-        (int(number), np.roll(np.asarray(places, np.float64).reshape(4, 2), -turns, axis=0))
+        (int(number), np.roll(np.asarray(places, np.float64).reshape(4, 2), 2, axis=0))
         for number, places in zip(np.ravel(ids), corners, strict=True)
     ]
 
