@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,9 @@ from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files, landmarks, store
 from ground_station.map.folder import replacing
 from ground_station.map.model import Model
-from ground_station.mapping.construction import bending, noise
+from ground_station.mapping.construction import bending, content, noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
-from ground_station.mapping.construction.content import structure_key
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.lens import SelfCalibration, with_lens
 from ground_station.mapping.construction.lens_prior import LensPrior
@@ -36,6 +37,9 @@ from ground_station.mapping.refinement.refine import straighten
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.recording.frames import Frame
+
+_STRUCTURE = b"blimp structure 4\n"
+"""Counted on as those of `content` are."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,34 @@ def build_map(
         shutil.rmtree(folder / "work", ignore_errors=True)
     map_.folder = out
     return map_
+
+
+def structure_key(
+    images: Images,
+    pairs: Mapping[Pair, TwoView],
+    camera: Camera,
+    settings: MappingSettings,
+) -> str:
+    """The hash, as text, of all that structure from motion starts from, its seed included."""
+    digest = hashlib.sha256(_STRUCTURE)
+    document = {
+        "names": images.names,
+        "camera": camera.as_dict(),
+        "sfm": asdict(settings.sfm),
+        "match": asdict(settings.match),
+        "seed": settings.seed,
+        "pycolmap": version("pycolmap"),
+        "pairs": [[i, j, len(v.matches), v.degenerate] for (i, j), v in sorted(pairs.items())],
+        "keypoints": [len(pixels) for pixels in images.pinhole_px],
+    }
+    digest.update(content.line(document))
+    digest.update(images.time_ns.tobytes())
+    for pixels in images.pinhole_px:
+        digest.update(pixels.tobytes())
+    for _, view in sorted(pairs.items()):
+        for array in (view.matches, view.essential, view.homography):
+            digest.update(b"none" if array is None else array.tobytes())
+    return digest.hexdigest()
 
 
 def _straightened(

@@ -9,40 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from importlib.metadata import version
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any
 
 import cv2
 
-from ground_station.arrays import F64, I64, U8
+from ground_station.arrays import U8
 from ground_station.features.extractor import Extractor
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm.two_view import TwoView
 
-
-class KeyPoints(Protocol):
-    """The images of a build: their names, times and undistorted key points."""
-
-    @property
-    def names(self) -> list[str]:
-        """Of the files, or of the frames' numbers."""
-        ...
-
-    @property
-    def time_ns(self) -> I64:
-        """(n,)."""
-        ...
-
-    @property
-    def pinhole_px(self) -> Sequence[F64]:
-        """(N, 2) of each."""
-        ...
-
-
-_FEATURES, _PAIR, _STRUCTURE = b"blimp features 2\n", b"blimp pair 1\n", b"blimp structure 4\n"
+_FEATURES, _PAIR = b"blimp features 2\n", b"blimp pair 1\n"
 """Counted on when the same input gives another result: what was made before is then made again."""
 
 
@@ -63,7 +40,7 @@ def extraction(extractor: Extractor, settings: MappingSettings) -> bytes:
             "provider": settings.learned.provider,
             "onnxruntime": onnxruntime.__version__,
         }
-    return _line(document)
+    return line(document)
 
 
 def features_key(image: U8, how: bytes) -> bytes:
@@ -77,7 +54,7 @@ def comparison(camera: Camera, rules: Mapping[str, float]) -> bytes:
     lens = {name: value for name, value in camera.as_dict().items() if name != "readout_s"}
     if math.isfinite(camera.lens.reach):  # beyond it key points are left out, which numbers them
         lens["reach"] = camera.lens.reach
-    return _line({"camera": lens, "rules": dict(rules), "opencv": cv2.__version__})
+    return line({"camera": lens, "rules": dict(rules), "opencv": cv2.__version__})
 
 
 def pair_key(first: bytes, second: bytes, how: bytes) -> bytes:
@@ -85,33 +62,6 @@ def pair_key(first: bytes, second: bytes, how: bytes) -> bytes:
     return hashlib.sha256(_PAIR + how + first + second).digest()
 
 
-def structure_key(
-    images: KeyPoints,
-    pairs: Mapping[tuple[int, int], TwoView],
-    camera: Camera,
-    settings: MappingSettings,
-) -> str:
-    """The hash, as text, of all that structure from motion starts from, its seed included."""
-    digest = hashlib.sha256(_STRUCTURE)
-    document = {
-        "names": images.names,
-        "camera": camera.as_dict(),
-        "sfm": asdict(settings.sfm),
-        "match": asdict(settings.match),
-        "seed": settings.seed,
-        "pycolmap": version("pycolmap"),
-        "pairs": [[i, j, len(v.matches), v.degenerate] for (i, j), v in sorted(pairs.items())],
-        "keypoints": [len(pixels) for pixels in images.pinhole_px],
-    }
-    digest.update(_line(document))
-    digest.update(images.time_ns.tobytes())
-    for pixels in images.pinhole_px:
-        digest.update(pixels.tobytes())
-    for _, view in sorted(pairs.items()):
-        for array in (view.matches, view.essential, view.homography):
-            digest.update(b"none" if array is None else array.tobytes())
-    return digest.hexdigest()
-
-
-def _line(document: dict[str, Any]) -> bytes:
+def line(document: dict[str, Any]) -> bytes:
+    """What is hashed of plain values."""
     return json.dumps(document, sort_keys=True, allow_nan=False).encode() + b"\n"

@@ -13,8 +13,8 @@ import pytest
 from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.mapping.construction import content, matching, verification
-from ground_station.mapping.construction.build import build_map
+from ground_station.mapping.construction import matching, verification
+from ground_station.mapping.construction.build import build_map, structure_key
 from ground_station.mapping.construction.feature_file import FeatureFile
 from ground_station.mapping.construction.images import extract
 from ground_station.mapping.construction.lens import with_lens
@@ -116,11 +116,11 @@ def test_structure_from_motion_starts_from_the_same_wherever_features_lie(tmp_pa
     memory = extract(frames, camera, SETTINGS, 2, None)
     disk = extract(frames, camera, SETTINGS, 2, None, folder=tmp_path)
     assert all(_same(a, b) for a, b in zip(memory.features, disk.features, strict=True))
-    expected = content.structure_key(memory, match(memory, camera, SETTINGS, 2), camera, SETTINGS)
+    expected = structure_key(memory, match(memory, camera, SETTINGS, 2), camera, SETTINGS)
     far = _FarAway()
     for workers in (Threads(2), far):
         pairs = match(disk, camera, SETTINGS, 2, workers=workers)
-        assert content.structure_key(disk, pairs, camera, SETTINGS) == expected
+        assert structure_key(disk, pairs, camera, SETTINGS) == expected
     assert far.sent > 300 * 128 * 4  # the descriptors themselves
 
 
@@ -143,7 +143,7 @@ def test_pairs_that_look_unlike_are_not_compared_again_by_another_lens(tmp_path,
     without = len(compared)
     again = match(images, longer, SETTINGS, 2, unlike=unlike)
     assert len(compared) - without <= without - len(unlike)
-    assert content.structure_key(images, again, longer, SETTINGS) == content.structure_key(
+    assert structure_key(images, again, longer, SETTINGS) == structure_key(
         images, fresh, longer, SETTINGS
     )
 

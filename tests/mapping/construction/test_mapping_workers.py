@@ -15,7 +15,7 @@ import pytest
 
 from ground_station.errors import InputError, MapError
 from ground_station.mapping.construction import cluster as dask
-from ground_station.mapping.construction import content
+from ground_station.mapping.construction.build import structure_key
 from ground_station.mapping.construction.dask_option import open_workers, parse_cluster
 from ground_station.mapping.construction.images import extract
 from ground_station.mapping.construction.verification import match
@@ -251,7 +251,7 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames, t
     alone = extract(frames, camera, SETTINGS, 2, None)
     pairs = match(alone, camera, SETTINGS, 2)
     assert len(pairs) > 3
-    expected = content.structure_key(alone, pairs, camera, SETTINGS)
+    expected = structure_key(alone, pairs, camera, SETTINGS)
     with open_workers("2", 2, SETTINGS) as workers:
         assert workers.name == "Dask on this machine, 2 workers"
         assert workers.here
@@ -259,7 +259,7 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames, t
             images = extract(frames, camera, SETTINGS, 2, None, workers=workers, folder=folder)
             found = match(images, camera, SETTINGS, 2, workers=workers)
             # Structure from motion would start from the same, to the bit.
-            assert content.structure_key(images, found, camera, SETTINGS) == expected
+            assert structure_key(images, found, camera, SETTINGS) == expected
         masks = workers._client.run(signal.pthread_sigmask, signal.SIG_BLOCK, [])
         assert [signal.SIGINT in mask for mask in masks.values()] == [True, True]  # Ctrl-C is ours
         died = []
