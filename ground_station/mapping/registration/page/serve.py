@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import secrets
 import socket
@@ -156,64 +157,58 @@ def build(session: RegistrationSession, token: str, done: Callable[[], None]) ->
     def plan() -> Response:
         return Response(session.picture(), media_type="image/png")
 
-    @app.post(f"{root}/click")
-    def click(asked: Click) -> Any:
+    def changes(apply: Callable[..., None]) -> None:
+        """A route of the function's name: it changes the session and answers with the state."""
+
+        @functools.wraps(apply)
+        def answer(*args: Any, **asked: Any) -> Any:
+            apply(*args, **asked)
+            return session.state()
+
+        app.post(f"{root}/{apply.__name__}")(answer)
+
+    changes(session.snap)
+    changes(session.turn)
+
+    @changes
+    def click(asked: Click) -> None:
         at = np.array([asked.x, asked.y])
         session.click(at, asked.radius, asked.low, asked.high, asked.offers)
-        return session.state()
 
-    @app.post(f"{root}/snap")
-    def snap() -> Any:
-        session.snap()
-        return session.state()
-
-    @app.post(f"{root}/place")
-    def place(asked: Place) -> Any:
+    @changes
+    def place(asked: Place) -> None:
         session.place(np.array([asked.u, asked.v]))
-        return session.state()
 
-    @app.post(f"{root}/redo")
-    def redo(asked: Named) -> Any:
+    @changes
+    def redo(asked: Named) -> None:
         session.redo(asked.name)
-        return session.state()
 
-    @app.post(f"{root}/delete")
-    def delete(asked: Named) -> Any:
+    @changes
+    def delete(asked: Named) -> None:
         session.delete(asked.name)
-        return session.state()
 
-    @app.post(f"{root}/scale")
-    def scale(asked: Scale) -> Any:
+    @changes
+    def scale(asked: Scale) -> None:
         one, other = (np.array([place.u, place.v]) for place in (asked.one, asked.other))
         session.scale(one, other, asked.length_m)
-        return session.state()
 
-    @app.post(f"{root}/turn")
-    def turn() -> Any:
-        session.turn()
-        return session.state()
-
-    @app.post(f"{root}/upright")
-    def upright(asked: Upright) -> Any:
+    @changes
+    def upright(asked: Upright) -> None:
         tilt = asked.tilt_x_deg, asked.tilt_y_deg
         session.upright(asked.source, tilt, asked.level, asked.height_m)
-        return session.state()
 
-    @app.post(f"{root}/walls")
-    def walls(asked: Heights) -> Any:
+    @changes
+    def walls(asked: Heights) -> None:
         session.propose(asked.low, asked.high)
-        return session.state()
 
-    @app.post(f"{root}/decide")
-    def decide(asked: Decision) -> Any:
+    @changes
+    def decide(asked: Decision) -> None:
         session.decide(asked.accept)
-        return session.state()
 
-    @app.post(f"{root}/save")
-    def save(tasks: BackgroundTasks) -> Any:
+    @changes
+    def save(tasks: BackgroundTasks) -> None:
         session.save()
         tasks.add_task(done)  # once the answer is out
-        return session.state()
 
     return app
 
@@ -240,23 +235,19 @@ def serve(
         listener = socket.create_server(("127.0.0.1", port))
     except OSError as error:
         raise MapError(f"127.0.0.1:{port}: {error.strerror or error}") from None
-    running: list[uvicorn.Server] = []
 
     def done() -> None:
-        running[0].should_exit = True
+        server.should_exit = True
 
-    app = build(session, token, done)
-    running.append(
-        uvicorn.Server(
-            uvicorn.Config(
-                app,
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                proxy_headers=False,
-                lifespan="off",
-                timeout_graceful_shutdown=2,
-            )
+    server = uvicorn.Server(
+        uvicorn.Config(
+            build(session, token, done),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            lifespan="off",
+            timeout_graceful_shutdown=2,
         )
     )
     address = f"http://127.0.0.1:{listener.getsockname()[1]}/{token}/"
@@ -265,7 +256,7 @@ def serve(
         webbrowser.open(address)
     try:
         with listener:
-            running[0].run(sockets=[listener])
+            server.run(sockets=[listener])
     except KeyboardInterrupt:
         pass
     return session.found

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,8 +85,7 @@ class RegistrationSession:
 
         It stays where it was clicked; a corner or pillar within `radius` is offered beside it.
         """
-        with self._lock:
-            self._open()
+        with self._changing():
             if not radius > 0:
                 raise MapError(f"the radius of a pick is {radius}; allowed: above 0")
             name = self._pending.name if self._pending else self._free_name()
@@ -95,8 +96,7 @@ class RegistrationSession:
 
     def snap(self) -> None:
         """Takes the offer: the pick that is being made moves to it."""
-        with self._lock:
-            self._open()
+        with self._changing():
             pending = self._pending
             if pending is None or pending.offer is None:
                 raise MapError("there is no corner or pillar on offer")
@@ -113,8 +113,7 @@ class RegistrationSession:
 
     def place(self, pixel: F64) -> None:
         """The place on the plan, pixels (2,), of the pick that is being made; which then is."""
-        with self._lock:
-            self._open()
+        with self._changing():
             if self._pending is None or self._pending.pick is None:
                 raise MapError("click the place in the map first, then on the plan")
             height, width = self.plan.image.shape
@@ -134,8 +133,7 @@ class RegistrationSession:
 
     def propose(self, low: float, high: float) -> None:
         """Fits landmarks between two heights to the plan's walls, from the picks as they are."""
-        with self._lock:
-            self._open()
+        with self._changing():
             turned = self._turned(self.map.landmarks.position_m)
             rows = np.flatnonzero((turned[:, 2] >= low) & (turned[:, 2] <= high))
             cameras = self._turned(self.map.keyframes.wTc[:, :3, 3])[:, :2]
@@ -146,8 +144,7 @@ class RegistrationSession:
 
     def decide(self, accept: bool) -> None:
         """Accepts the fit to the walls, which then stands in place of the picks, or drops it."""
-        with self._lock:
-            self._open()
+        with self._changing():
             if self._proposal is None:
                 raise MapError("there is no fit to the walls to decide on")
             fit, rows = self._proposal
@@ -169,8 +166,7 @@ class RegistrationSession:
 
     def delete(self, name: str) -> None:
         """Takes a pick away, or ends the one that is being made."""
-        with self._lock:
-            self._open()
+        with self._changing():
             if self._pending is not None and self._pending.name == name:
                 self._pending = None
                 return
@@ -182,15 +178,13 @@ class RegistrationSession:
 
     def scale(self, one: F64, other: F64, length_m: float) -> None:
         """The plan's scale: two of its pixels (2,) are so far apart."""
-        with self._lock:
-            self._open()
+        with self._changing():
             self.plan = self.plan.with_distance(one, other, length_m)
             self._proposal = None
 
     def turn(self) -> None:
         """The top view a quarter turn further, so that it lies as the plan does."""
-        with self._lock:
-            self._open()
+        with self._changing():
             self._quarters = (self._quarters + 1) % 4
             self._view, self._proposal = self._top_view(), None
             self._revision += 1
@@ -199,8 +193,7 @@ class RegistrationSession:
         self, source: str, tilt_deg: tuple[float, float], level: float | None, height_m: float
     ) -> None:
         """The vertical by a source, tilted further by hand, and the height of a level along it."""
-        with self._lock:
-            self._open()
+        with self._changing():
             if source not in vertical.SOURCES:
                 raise MapError(f"up from '{printable(source, 20)}'; allowed: {vertical.SOURCES}")
             if not max(map(abs, tilt_deg)) <= _MOST_TILT_DEG:
@@ -223,8 +216,7 @@ class RegistrationSession:
 
     def save(self) -> None:
         """Keeps the picks in the map's folder and registers the map by them."""
-        with self._lock:
-            self._open()
+        with self._changing():
             picks = self._all()
             check_picks(picks)
             find_similarity(self.map, picks=picks, distances=self._distances, seed=self._seed)
@@ -357,9 +349,13 @@ class RegistrationSession:
         except BlimpError as error:
             self.notes = [printable(str(error), 200)]
 
-    def _open(self) -> None:
-        if self.found is not None:
-            raise MapError("the map is registered; the page is done")
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Alone, and not after the map was saved."""
+        with self._lock:
+            if self.found is not None:
+                raise MapError("the map is registered; the page is done")
+            yield
 
     def _turned(self, positions: F64) -> F64:
         return np.asarray(positions @ self._view.T)
