@@ -78,7 +78,7 @@ def localizability(
     height_m: float | None = None,
     headings: int = HEADINGS,
 ) -> LocalizabilityMap:
-    """Predicts for the mapped region of a map whose z is up (see `prediction.levelled`).
+    """Predicts for the mapped region of a map whose z is up (see `levelling.levelled`).
 
     The region is the box around 98 % of the landmarks and all keyframes, of which a floor plan
     leaves what has free space. The camera is as high as the keyframes near, or at `height_m`, and

@@ -1,4 +1,4 @@
-"""A map with z up, registered or not."""
+"""A map in other coordinates: moved by a similarity, or turned so that z is up."""
 
 from __future__ import annotations
 
@@ -6,18 +6,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from ground_station.geometry import poses
+from ground_station.geometry.alignment import Alignment
 from ground_station.map.store import Map
 
 _UP = {0: (1, -1), 90: (0, -1), 180: (1, 1), 270: (0, 1)}
 """The camera's axis and its sign that is up in pictures which displays turn clockwise so far."""
 
 
+def transformed(map_: Map, fit: Alignment) -> Map:
+    """The map with poses, positions, covariances, directions and distances in the new frame."""
+    lm, kf = map_.landmarks, map_.keyframes
+    R, s = fit.rotation, fit.scale
+    covariance = s**2 * (R @ lm.covariance_m2.astype(np.float64) @ R.T)
+    moved = replace(
+        lm,
+        position_m=fit.apply(lm.position_m),
+        covariance_m2=covariance.astype(np.float32),
+        view_direction=(lm.view_direction @ R.T).astype(np.float32),
+        distance_m=(s * lm.distance_m).astype(np.float32),
+        by_focal_m=(s * lm.by_focal_m @ R.T).astype(np.float32),
+    )
+    keyframes = replace(kf, wTc=fit.apply_poses(kf.wTc))
+    return replace(map_, info=replace(map_.info), landmarks=moved, keyframes=keyframes)
+
+
 def levelled(map_: Map) -> Map:
     """The map with z up: as it is once registered; else turned so that its cameras stand upright.
 
-    Upright is as displays show the pictures, which they may turn from how they are stored. Only
-    positions, poses, view directions and covariances are turned.
+    Upright is as displays show the pictures, which they may turn from how they are stored.
     """
     if map_.info.registered or not len(map_.keyframes):
         return map_
@@ -29,16 +45,4 @@ def levelled(map_: Map) -> Map:
     z = up / length
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    lm, kf = map_.landmarks, map_.keyframes
-    turned = replace(
-        lm,
-        position_m=lm.position_m @ R.T,
-        covariance_m2=(R @ lm.covariance_m2 @ R.T).astype(np.float32),
-        view_direction=(lm.view_direction @ R.T).astype(np.float32),
-    )
-    return replace(
-        map_,
-        landmarks=turned,
-        keyframes=replace(kf, wTc=poses.pose(R, np.zeros(3)) @ kf.wTc),
-    )
+    return transformed(map_, Alignment(np.stack([x, np.cross(z, x), z]), np.zeros(3), 1.0))

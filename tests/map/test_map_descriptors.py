@@ -13,7 +13,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.map import store
 from ground_station.map.descriptors import Descriptors, quantised
-from ground_station.mapping.registration.register import transform_map
+from ground_station.map.levelling import transformed
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_a_map_says_how_it_bends_or_nothing(built, tmp_path):
     store.save_tables(tmp_path, bent)
     assert np.array_equal(store.load(tmp_path).landmarks.by_focal_m, follows)
     turned = Alignment(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.ones(3), 2.0)
-    moved = transform_map(bent, turned).landmarks.by_focal_m
+    moved = transformed(bent, turned).landmarks.by_focal_m
     assert np.allclose(moved, 2 * np.c_[-follows[:, 1], follows[:, 0], follows[:, 2]])
     none = dataclasses.replace(landmarks, by_focal_m=np.zeros((count, 3), np.float32))
     store.save_tables(tmp_path, dataclasses.replace(plain, landmarks=none))

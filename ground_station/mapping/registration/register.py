@@ -16,6 +16,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map import colmap, store
 from ground_station.map.folder import replacing
+from ground_station.map.levelling import transformed
 from ground_station.map.store import Map
 from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration.adjustment import KnownPoints, adjust, adjust_agreeing
@@ -168,7 +169,7 @@ def register_map(
         seed=seed,
     )
     fit = found.fit
-    moved = transform_map(map_, fit)
+    moved = transformed(map_, fit)
     # In coordinates that are not the world's, no place has an error.
     region = moved.landmarks.position_m[: None if found.frame == "world" else 0]
     report = found.report | describe(found.uncertainty, region)
@@ -203,35 +204,3 @@ def find_similarity(
     else:
         raise MapError("registration: observations, a trajectory, picks or distances are needed")
     return with_distances(found, map_, distances) if distances is not None else found
-
-
-def transform_map(map_: store.Map, fit: Alignment) -> store.Map:
-    """The map with poses, positions, covariances, directions and distances in the new frame."""
-    lm, kf = map_.landmarks, map_.keyframes
-    R, s = fit.rotation, fit.scale
-    covariance = s**2 * (R @ lm.covariance_m2.astype(np.float64) @ R.T)
-    return store.Map(
-        info=store.MapInfo(**vars(map_.info)),
-        landmarks=store.Landmarks(
-            id=lm.id,
-            position_m=fit.apply(lm.position_m),
-            covariance_m2=covariance.astype(np.float32),
-            descriptor=lm.descriptor,
-            spread=lm.spread,
-            view_direction=(lm.view_direction @ R.T).astype(np.float32),
-            view_cos=lm.view_cos,
-            distance_m=(s * lm.distance_m).astype(np.float32),
-            observations=lm.observations,
-            by_focal_m=(s * lm.by_focal_m @ R.T).astype(np.float32),
-        ),
-        keyframes=store.Keyframes(
-            names=kf.names,
-            time_ns=kf.time_ns,
-            wTc=fit.apply_poses(kf.wTc),
-            offset=kf.offset,
-            landmark=kf.landmark,
-            pixel_px=kf.pixel_px,
-        ),
-        folder=map_.folder,
-        modes=map_.modes,
-    )

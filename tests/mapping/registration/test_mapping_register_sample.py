@@ -13,9 +13,10 @@ import pytest
 from surveyed_points import NOISE_M, far_apart, only, six_points
 
 from ground_station.map import store
+from ground_station.map.levelling import transformed
 from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration.observations import read_pairs
-from ground_station.mapping.registration.register import by_observations, transform_map
+from ground_station.mapping.registration.register import by_observations
 from ground_station.recording.flight import trajectory_of
 
 SAMPLE = Path(__file__).parents[3] / "maps" / "atrium"
@@ -54,7 +55,7 @@ def test_one_of_six_that_is_three_metres_off_is_named(sample):
 def test_the_uncertainty_of_the_shipped_observations_is_centimetres(sample):
     map_, _, observations = sample
     found = by_observations(map_, observations, 0)
-    moved = transform_map(map_, found.fit)
+    moved = transformed(map_, found.fit)
     report = describe(found.uncertainty, moved.landmarks.position_m)
     assert report["centre_90_percent_m"] < 0.01 and report["corner_90_percent_m"] < 0.03
     assert report["scale_sigma_percent"] < 0.1
