@@ -45,13 +45,12 @@ _FEWEST = 10
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit of matched poses left: `positions` that are used, their `scatter_m` along an axis.
+    """What a fit of matched poses left: the positions `used`, their `scatter_m` along an axis.
 
-    `given` poses were matched. `offset` is of the orientations of `model` and `truth` (N, 3, 3).
+    `offset` is of the orientations of the matched poses of `model` and `truth` (N, 4, 4).
     """
 
-    positions: Positions
-    given: int
+    used: Positions
     scatter_m: float
     offset: Offset
     model: F64
@@ -65,8 +64,8 @@ def most_agree(alike: Bools) -> bool:
 
 def disagreement(found: Fitted) -> str:
     """What shows that the poses are not of the map's flight; empty where nothing does."""
-    used, n = len(found.positions.source), found.given
-    spread_m = found.positions.spread_m()
+    used, n = len(found.used.source), len(found.model)
+    spread_m = found.used.spread_m()
     allowed_m = MOST_SCATTER * spread_m
     if found.scatter_m > allowed_m:
         return (
@@ -149,12 +148,12 @@ def mistakes(truth: F64) -> Iterator[tuple[str, F64]]:
 
 def mirrored(found: Fitted) -> str:
     """Says so where a mirrored map fits much better: an axis of the trajectory has a wrong sign."""
-    x, y = found.positions.source, found.positions.target
+    x, y = found.used.source, found.used.target
     try:
         left = _scatter_m(x * [1.0, 1.0, -1.0], y)
     except GeometryError:
         return ""
-    if left < _BETTER * found.scatter_m and left < MOST_SCATTER * found.positions.spread_m():
+    if left < _BETTER * found.scatter_m and left < MOST_SCATTER * found.used.spread_m():
         return "mirrored it fits: one of its axes has the wrong sign, or two are exchanged"
     return ""
 
@@ -200,17 +199,17 @@ def late(model: F64, time_ns: I64, trajectory: Trajectory) -> str:
     )
 
 
-def _turning_deg(rotations: F64) -> float:
-    """How far orientations (N, 3, 3) spread about their mean, root of the mean square, degrees."""
-    all_ = Rotation.from_matrix(rotations)
+def _turning_deg(wTc: F64) -> float:
+    """How far orientations (N, 4, 4) spread about their mean, root of the mean square, degrees."""
+    all_ = Rotation.from_matrix(wTc[:, :3, :3])
     return float(np.degrees(np.sqrt(np.mean((all_.mean().inv() * all_).magnitude() ** 2))))
 
 
 def _runs_backwards(found: Fitted) -> bool:
     """Whether the path would fit in reverse, too: a straight line and a circle at even speed do."""
-    x, y = found.positions.source, found.positions.target[::-1]
+    x, y = found.used.source, found.used.target[::-1]
     try:
-        return _scatter_m(x, y) <= MOST_SCATTER * found.positions.spread_m()
+        return _scatter_m(x, y) <= MOST_SCATTER * found.used.spread_m()
     except GeometryError:
         return True  # one line, of which both ends are alike
 

@@ -55,7 +55,7 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
     if odd := agreement.too_fast(time_ns, truth[:, :3, 3]):
         raise MapError(f"registration: {odd}")
     started = _start(model, truth, seed)
-    _check_agrees(started, model, truth, time_ns, trajectory, seed)
+    _check_agrees(started, time_ns, trajectory, seed)
     used, fit, offset = started.used, started.fit, started.offset
     alike, turned, turned_alike = started.alike, started.turned, started.turned_alike
     scatter_m, on_line = started.scatter_m, started.on_line
@@ -111,17 +111,14 @@ def by_trajectory(map_: Map, trajectory: Trajectory, seed: int) -> Registration:
 
 
 @dataclass(frozen=True)
-class _Start:
+class _Start(agreement.Fitted):
     """The similarity by positions, which of them agree, and what the orientations say to it."""
 
-    used: Positions
     fit: Alignment
     alike: Bools
-    scatter_m: float
     on_line: bool
     turned: F64
     turned_alike: Bools
-    offset: Offset
     bent: int
     """Positions that lie far off where the others agree, and are used all the same."""
 
@@ -146,7 +143,9 @@ def _start(model: F64, truth: F64, seed: int) -> _Start:
     used = positions.of(alike)
     scatter_m = max(position_scatter(used, fit), used.floor_m())
     offset = _offset(used, fit, scatter_m, model, truth, seed)
-    return _Start(used, fit, alike, scatter_m, on_line, turned, turned_alike, offset, bent)
+    return _Start(
+        used, scatter_m, offset, model, truth, fit, alike, on_line, turned, turned_alike, bent
+    )
 
 
 def _whole(positions: Positions) -> Alignment | None:
@@ -171,31 +170,27 @@ def _offset(
     return orientation_offset(fit, information, model[:, :3, :3], truth[:, :3, :3], seed)
 
 
-def _check_agrees(
-    found: _Start, model: F64, truth: F64, time_ns: I64, trajectory: Trajectory, seed: int
-) -> None:
+def _check_agrees(found: _Start, time_ns: I64, trajectory: Trajectory, seed: int) -> None:
     """Raises `MapError` for a trajectory that is not this flight's, with the mistake it looks like.
 
     Structure from motion can also end inside out, with all images registered and small residuals.
     """
-    fitted = _fitted(found, model, truth)
-    reason = agreement.disagreement(fitted)
-    hint = agreement.mirrored(fitted)
+    model, truth = found.model, found.truth
+    reason = agreement.disagreement(found)
+    hint = agreement.mirrored(found)
     if not hint:
         hint = agreement.late(found.used.source, time_ns[found.alike], trajectory)
     if reason and not hint:
         for words, mended in agreement.mistakes(truth):
             if np.array_equal(mended[:, :3, 3], truth[:, :3, 3]) and not found.on_line:
-                other = replace(
-                    found,
-                    offset=_offset(found.used, found.fit, found.scatter_m, model, mended, seed),
-                )
+                offset = _offset(found.used, found.fit, found.scatter_m, model, mended, seed)
+                other = replace(found, offset=offset, truth=mended)
             else:
                 try:
                     other = _start(model, mended, seed)
                 except MapError:
                     continue
-            if not agreement.disagreement(_fitted(other, model, mended)):
+            if not agreement.disagreement(other):
                 hint = words
                 break
     if reason or hint:
@@ -208,17 +203,6 @@ def _check_agrees(
             "trajectory of the video that the map was built from, or register by --pairs or --page"
         )
         raise MapError(f"registration: {reason}; {hint}")
-
-
-def _fitted(found: _Start, model: F64, truth: F64) -> agreement.Fitted:
-    return agreement.Fitted(
-        found.used,
-        len(model),
-        found.scatter_m,
-        found.offset,
-        model[:, :3, :3],
-        truth[:, :3, :3],
-    )
 
 
 def _matched(kf: Keyframes, trajectory: Trajectory) -> tuple[Bools, F64, F64]:
