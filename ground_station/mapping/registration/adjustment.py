@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
 from ground_station.arrays import F64, I64, Bools
-from ground_station.errors import MapError
-from ground_station.geometry.alignment import Alignment
+from ground_station.errors import GeometryError, MapError
+from ground_station.geometry.alignment import Alignment, align
 from ground_station.map.uncertainty import Uncertainty, jacobian
+from ground_station.mapping.registration.similarity import check_spread
 
 _ITERATIONS = 100
 _CONVERGED = 1e-10
@@ -53,6 +54,11 @@ class KnownPoints:
             self.group[chosen],
             self.axes,
         )
+
+    def off_m(self, fit: Alignment) -> F64:
+        """How far a similarity puts them off what is known of the world (N,), metres."""
+        off = (fit.apply(self.model) - self.world)[:, : self.axes]
+        return np.asarray(np.linalg.norm(off, axis=1))
 
     @property
     def groups(self) -> int:
@@ -159,6 +165,33 @@ def adjust_agreeing(
         if (now == agree).all():
             return found, agree
         start, agree = found.fit, now
+
+
+def held_out(
+    points: KnownPoints,
+    width: float,
+    start: Alignment | None = None,
+    upright: Upright | None = None,
+) -> tuple[F64, list[float]]:
+    """Each point's error (N,), metres, without the thing that it belongs to, and the scales then.
+
+    NaN where the others leave the similarity open, as on a line, narrower than `width` times long.
+    An adjustment begins at `start`, or where the others are nearest.
+    """
+    error = np.full(len(points), np.nan)
+    scales: list[float] = []
+    for group in np.unique(points.group):
+        mine = points.group == group
+        others = points.of(~mine)
+        try:
+            check_spread(others.world[:, : points.axes], "points", width)
+            begun = start or align(others.model, others.world, True)
+            fit = adjust(begun, others, upright).fit
+        except (MapError, GeometryError):
+            continue
+        error[mine] = points.of(mine).off_m(fit)
+        scales.append(fit.scale)
+    return error, scales
 
 
 def _scatter(residual: F64, own: F64, freedom: float) -> float:

@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.arrays import F64, Bools
+from ground_station.arrays import Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.map.store import Landmarks
 from ground_station.mapping.registration.adjustment import (
-    Adjusted,
     KnownPoints,
     Upright,
-    adjust,
     adjust_agreeing,
+    held_out,
 )
 from ground_station.mapping.registration.picks import MIN_WIDTH, Picks, at_present
 from ground_station.mapping.registration.registration import (
@@ -25,7 +24,6 @@ from ground_station.mapping.registration.registration import (
 )
 from ground_station.mapping.registration.similarity import (
     GATE_DEVIATION,
-    MIN_POINTS,
     check_spread,
 )
 from ground_station.mapping.registration.upright import upright_rotation
@@ -56,19 +54,19 @@ def by_picks(landmarks: Landmarks, picks: Picks, seed: int) -> Registration:
     adjusted, agree = adjust_agreeing(start, points, agree, up)
     names = [pick.name for pick in picks.picks]
     notes = []
-    off = _errors(adjusted.fit, points)
+    off = points.off_m(adjusted.fit)
     for name, good, far in zip(names, agree, off, strict=True):
         if not good:
             notes.append(f"pick '{name}' left out: {far:.2f} m off where the others agree")
     used = points.of(agree)
-    held, scales = _held_out(used, adjusted, up)
+    held, scales = held_out(used, MIN_WIDTH, adjusted.fit, up)
     report: dict[str, Any] = {
         "method": "picks",
         "points": len(used),
         "points_given": len(points),
         **listed(
             [name for name, good in zip(names, agree, strict=True) if good],
-            _errors(adjusted.fit, used),
+            used.off_m(adjusted.fit),
             held,
         ),
         "point_sigma_m": adjusted.scatter_m,
@@ -119,25 +117,3 @@ def _robust(points: KnownPoints, up: Upright, click_m: float, seed: int) -> tupl
     yaw = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     shift = np.array([other.real, other.imag, up.height_m - scale * up.level])
     return Alignment(yaw @ turn, shift, scale), inliers
-
-
-def _held_out(points: KnownPoints, all_: Adjusted, up: Upright) -> tuple[F64, list[float]]:
-    """Each pick's error (N,), metres, without it, and the scales then; NaN where two are left."""
-    error = np.full(len(points), np.nan)
-    scales: list[float] = []
-    if len(points) <= MIN_POINTS:
-        return error, scales
-    for k in range(len(points)):
-        mine = np.arange(len(points)) == k
-        try:
-            check_spread(points.world[~mine][:, :2], "picks", MIN_WIDTH)
-            fit = adjust(all_.fit, points.of(~mine), up).fit
-        except MapError:
-            continue
-        error[mine] = _errors(fit, points.of(mine))
-        scales.append(fit.scale)
-    return error, scales
-
-
-def _errors(fit: Alignment, points: KnownPoints) -> F64:
-    return np.asarray(np.linalg.norm((fit.apply(points.model) - points.world)[:, :2], axis=1))

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ground_station.arrays import F64
-from ground_station.errors import GeometryError, MapError
-from ground_station.geometry.alignment import Alignment, align
+from ground_station.errors import MapError
+from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map import colmap, store
@@ -19,7 +19,7 @@ from ground_station.map.folder import replacing
 from ground_station.map.levelling import transformed
 from ground_station.map.store import Map
 from ground_station.map.uncertainty import describe
-from ground_station.mapping.registration.adjustment import KnownPoints, adjust, adjust_agreeing
+from ground_station.mapping.registration.adjustment import KnownPoints, adjust_agreeing, held_out
 from ground_station.mapping.registration.distances import Distances, by_distances, with_distances
 from ground_station.mapping.registration.from_picks import by_picks
 from ground_station.mapping.registration.from_trajectory import by_trajectory
@@ -39,7 +39,7 @@ from ground_station.mapping.registration.registration import (
 )
 from ground_station.mapping.registration.similarity import (
     MIN_POINTS,
-    check_spread,
+    MIN_WIDTH,
     robust_similarity,
 )
 
@@ -61,19 +61,19 @@ def by_observations(map_: Map, observations: PointObservations, seed: int) -> Re
     points = _known(found, observations, sigma_px(found))
     plain, agree = robust_similarity(points.model, points.world, _noise(points), seed, "points")
     adjusted, agree = adjust_agreeing(plain, points, agree)
-    far = _errors(adjusted.fit, points)
+    far = points.off_m(adjusted.fit)
     for point, good, off_m in zip(found, agree, far, strict=True):
         if not good:
             notes.append(f"point '{point.name}' left out: {off_m:.3f} m off where the others agree")
     used, names = points.of(agree), [p for p, good in zip(found, agree, strict=True) if good]
     fit = adjusted.fit
-    held, scales = _held_out(used)
+    held, scales = held_out(used, MIN_WIDTH)
     report: dict[str, Any] = {
         "method": "observations",
         "points": len(used),
         "points_given": len(observations.points),
         "observations": sum(len(point.ray) for point in names),
-        **listed([point.name for point in names], _errors(fit, used), held),
+        **listed([point.name for point in names], used.off_m(fit), held),
         "reprojection_rms_px": _reprojection_px(fit, names, camera),
         "observation_sigma_px": sigma_px(names),
         "point_sigma_m": adjusted.scatter_m,
@@ -101,31 +101,6 @@ def _known(
 
 def _noise(points: KnownPoints) -> F64:
     return np.asarray(np.sqrt(np.trace(points.covariance, axis1=1, axis2=2)))
-
-
-def _held_out(points: KnownPoints) -> tuple[F64, list[float]]:
-    """Each point's error (N,), metres, without the thing that it belongs to, and the scales then.
-
-    NaN where the others leave the similarity open.
-    """
-    error = np.full(len(points), np.nan)
-    scales: list[float] = []
-    for group in np.unique(points.group):
-        mine = points.group == group
-        others = points.of(~mine)
-        try:
-            check_spread(others.world, "points")
-            start = align(others.model, others.world, True)
-            fit = adjust(start, others).fit
-        except (MapError, GeometryError):
-            continue
-        error[mine] = _errors(fit, points.of(mine))
-        scales.append(fit.scale)
-    return error, scales
-
-
-def _errors(fit: Alignment, points: KnownPoints) -> F64:
-    return np.asarray(np.linalg.norm(fit.apply(points.model) - points.world, axis=1))
 
 
 def _reprojection_px(fit: Alignment, points: Sequence[Triangulated], camera: Camera) -> float:
