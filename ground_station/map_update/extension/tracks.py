@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -13,12 +13,12 @@ from scipy.sparse.csgraph import connected_components
 from ground_station.arrays import I32, I64, Indices
 from ground_station.map.store import MapInfo
 from ground_station.map_update.extension.frames import Frames
-from ground_station.mapping.construction.matching import mutual_matches, verify
+from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.verification import alike, rules_of, verify_pair
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
-
-Pair = tuple[int, int]
 
 _SHARED = 30
 """Landmarks of the map that two frames far apart in time must both see to be compared."""
@@ -74,32 +74,18 @@ def match_frames(
     threads: int,
 ) -> list[tuple[Pair, I32]]:
     """Matches (N, 2) of the pairs that share a geometry, verified as in a build."""
-    match, matrix = settings.match.of(info.features), info.camera.matrix
+    rules = rules_of(replace(settings, features=info.features), far=False)
     pixels = [frames.pixel_px[a:b] for a, b in itertools.pairwise(frames.offset.tolist())]
 
-    def one(pair: Pair) -> tuple[Pair, I32 | None]:
-        i, j = pair
-        matches = mutual_matches(
-            frames.features[i].descriptors, frames.features[j].descriptors, match.ratio
-        )
-        if len(matches) < match.min_inliers:
-            return pair, None
-        view = verify(
-            pixels[i],
-            pixels[j],
-            matches,
-            matrix,
-            error_px=match.error_px,
-            planar_ratio=match.planar_ratio,
-        )
-        enough = view is not None and len(view.matches) >= match.min_inliers
-        return pair, view.matches if enough and view is not None else None
+    def one(i: int, j: int) -> TwoView | None:
+        matches = alike(frames.features[i].descriptors, frames.features[j].descriptors, rules)
+        return verify_pair(pixels[i], pixels[j], matches, rules, info.camera.matrix)
 
     verified = []
     with Progress("matching, pairs", len(pairs)) as progress:
-        for pair, matches in Threads(threads).map(one, ((pair,) for pair in pairs)):
-            if matches is not None:
-                verified.append((pair, matches))
+        for pair, view in zip(pairs, Threads(threads).map(one, pairs), strict=True):
+            if view is not None:
+                verified.append((pair, view.matches))
             progress.step()
     return verified
 

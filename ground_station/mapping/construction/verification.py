@@ -19,12 +19,11 @@ from ground_station.mapping.construction.cache import Cache, Known
 from ground_station.mapping.construction.feature_file import KeptFeatures, KeptSide, Lazily, Side
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import mutual_matches, verify
+from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.workers import Threads, Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
-
-Pair = tuple[int, int]
 
 
 @dataclass(frozen=True)
