@@ -18,13 +18,11 @@ from ground_station.mapping.construction.images import extract_features, extract
 from ground_station.mapping.construction.matching import mutual_matches
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.refinement import shutter
-from ground_station.mapping.refinement.chosen import choose_frames
+from ground_station.mapping.refinement.chosen import by_lens, choose_frames
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
 
-_SAME_RAY_PX = 0.1
-"""A feature that another camera's lens sees and the map's cannot express is left out."""
 _ENOUGH_MATCHES = 20
 """Fewer matches do not tell how far a picture moved."""
 
@@ -191,10 +189,6 @@ def _stands(before: Features, after: Features, settings: MappingSettings, moved_
 
 def _in_map(features: Features, camera: Camera, of_map: Camera) -> tuple[Features, F64]:
     """Features that the map's lens can express, and where (N, 2), undistorted pixels."""
-    focal = np.array([of_map.fx_px, of_map.fy_px])
-    with np.errstate(invalid="ignore", over="ignore"):
-        ray = camera.undistort(features.keypoints_px)
-        again = of_map.undistort(of_map.distort(ray))
-        keep = np.linalg.norm((again - ray) * focal, axis=1) < _SAME_RAY_PX
-    keep &= np.isfinite(ray).all(axis=1) & np.isfinite(features.descriptors).all(axis=1)
-    return features.where(keep), ray[keep] * focal + [of_map.cx_px, of_map.cy_px]
+    pixel_px, keep = by_lens(features.keypoints_px, camera, of_map)
+    keep &= np.isfinite(features.descriptors).all(axis=1)
+    return features.where(keep), pixel_px[keep]

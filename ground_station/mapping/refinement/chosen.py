@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ground_station.arrays import F64, I64, Bools
+from ground_station.arrays import F32, F64, I64, Bools
 from ground_station.geometry import poses
+from ground_station.geometry.camera import Camera
 from ground_station.map.observations import FlightObservations
 from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
@@ -116,15 +117,22 @@ def _against(seen: FlightObservations, map_: Map) -> _Observed:
     order = np.argsort(lm.id)
     place = np.searchsorted(lm.id[order], seen.landmark)
     landmark = order[np.minimum(place, len(order) - 1)]
-    focal, centre = np.array([camera.fx_px, camera.fy_px]), [camera.cx_px, camera.cy_px]
+    pixel_px, usable = by_lens(seen.pixel_px, seen.camera, camera)
     with np.errstate(invalid="ignore", over="ignore"):
-        ray = seen.camera.undistort(seen.pixel_px)
-        again = camera.undistort(camera.distort(ray))
         frame = np.repeat(np.arange(len(seen)), np.diff(seen.offset))
         X = shutter.in_cameras(seen.wTc[frame], lm.position_m[landmark])
-        usable = np.linalg.norm((again - ray) * focal, axis=1) < _SAME_RAY_PX
     usable &= (lm.id[landmark] == seen.landmark) & np.isfinite(X).all(axis=1) & (X[:, 2] > 0)
-    return _Observed(landmark, X, ray * focal + centre, usable)
+    return _Observed(landmark, X, pixel_px, usable)
+
+
+def by_lens(pixel_px: F32, camera: Camera, of_map: Camera) -> tuple[F64, Bools]:
+    """A camera's pixels (N, 2) as undistorted ones of the map's, and which its lens can express."""
+    focal, centre = np.array([of_map.fx_px, of_map.fy_px]), [of_map.cx_px, of_map.cy_px]
+    with np.errstate(invalid="ignore", over="ignore"):
+        ray = camera.undistort(pixel_px)
+        again = of_map.undistort(of_map.distort(ray))
+        known = np.linalg.norm((again - ray) * focal, axis=1) < _SAME_RAY_PX
+    return ray * focal + centre, np.asarray(known)
 
 
 def _view_changed(
