@@ -14,7 +14,7 @@ from ground_station.map.store import Landmarks
 
 def residuals_px(model: Model) -> F64:
     """Reprojection residuals of all observations (O, 2), pixels of the picture; inf when behind."""
-    X = _in_camera(model)
+    X = in_cameras(model)
     fx, fy, cx, cy = model.pinhole
     with np.errstate(divide="ignore", invalid="ignore"):
         projected = X[:, :2] / X[:, 2:] * [fx, fy] + [cx, cy]
@@ -22,9 +22,9 @@ def residuals_px(model: Model) -> F64:
     return np.where(X[:, 2:] > 0, (model.pixel_px - projected) / stretch, np.inf)
 
 
-def _in_camera(model: Model) -> F64:
+def in_cameras(model: Model) -> F64:
+    """The points of all observations (O, 3), each in the axes of the camera that made it."""
     T = model.wTc[model.image]
-    # cRw (X − t) for each observation
     return np.asarray(
         np.einsum("oji,oj->oi", T[:, :3, :3], model.position[model.point] - T[:, :3, 3])
     )
@@ -63,7 +63,7 @@ def covariances(model: Model, sigma: float | F64) -> F64:
     one for all or one for each (O,); the poses count as known, so this is the landmark's own part
     of the uncertainty only.
     """
-    X = _in_camera(model)
+    X = in_cameras(model)
     fx, fy = model.pinhole[:2]
     z = np.maximum(X[:, 2], 1e-9)
     J = np.zeros((len(X), 2, 3))

@@ -15,8 +15,8 @@ import pycolmap
 
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
-from ground_station.map import colmap
-from ground_station.map.colmap_cameras import HALF_PIXEL
+from ground_station.map import colmap, landmarks
+from ground_station.map.colmap_cameras import described
 
 MAX_FEATURES = 2000
 """Of an image: about what a build of ours takes, too."""
@@ -41,20 +41,9 @@ def reconstruct(
     colmap.quiet()
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
-    lens = [
-        camera.fx_px,
-        camera.fy_px,
-        camera.cx_px,
-        camera.cy_px,
-        *camera.distortion,
-        0.0,
-        0.0,
-        0.0,
-    ]
-    lens[2] += HALF_PIXEL
-    lens[3] += HALF_PIXEL
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model, reader.camera_params = "FULL_OPENCV", ",".join(map(str, lens))
+    reader.camera_model, lens = described(camera)
+    reader.camera_params = ",".join(map(str, lens))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features, extraction.num_threads = MAX_FEATURES, threads or -1
     matching = pycolmap.FeatureMatchingOptions()
@@ -74,15 +63,8 @@ def reconstruct(
     return sorted(made, key=lambda model: -len(model.names))
 
 
-def _arrays(model: pycolmap.Reconstruction) -> PlainModel:
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
-    wTc = np.tile(np.eye(4), (len(images), 1, 1))
-    depths = []
-    for pose, image in zip(wTc, images, strict=True):
-        cTw = image.cam_from_world().matrix()
-        pose[:3, :3], pose[:3, 3] = cTw[:, :3].T, -cTw[:, :3].T @ cTw[:, 3]
-        seen = [model.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
-        if seen:
-            depths.append(np.asarray(seen) @ cTw[2, :3] + cTw[2, 3])
-    depth = float(np.median(np.concatenate(depths))) if depths else float("nan")
-    return PlainModel([image.name for image in images], wTc, depth)
+def _arrays(reconstruction: colmap.Reconstruction) -> PlainModel:
+    model = colmap.to_arrays(reconstruction)
+    order = np.argsort(model.names)
+    depth = float(np.median(landmarks.in_cameras(model)[:, 2]))
+    return PlainModel([model.names[k] for k in order], model.wTc[order], depth)
