@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, I64
@@ -19,6 +17,7 @@ from ground_station.map.modes import described
 from ground_station.map.store import Map
 from ground_station.map_update.extension.frames import Frames
 from ground_station.map_update.extension.structure import Structure
+from ground_station.mapping.construction.placing.chains import components
 
 _SHARE = 0.7
 """Of a point's observations that must be where a landmark projects, for it to be that landmark."""
@@ -154,5 +153,4 @@ def _alike_groups(where: F64, mean: F32, radius: F64) -> I64:
     near = np.linalg.norm(where[a] - where[b], axis=1) <= np.minimum(radius[a], radius[b])
     alike = np.linalg.norm(mean[a] - mean[b], axis=1) <= _ALIKE
     a, b = a[near & alike], b[near & alike]
-    graph = sparse.csr_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(where), len(where)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    return components([np.stack([a, b], axis=1)], len(where)).astype(np.int64)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from ground_station.arrays import I32, I64, Indices
 from ground_station.map.store import MapInfo
 from ground_station.map_update.extension.frames import Frames
 from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.verification import alike, rules_of, verify_pair
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
@@ -95,13 +95,9 @@ def joined(offset: I64, verified: Sequence[tuple[Pair, I32]]) -> Tracks:
 
     Where a track has two features in one frame, it is not seen in that frame.
     """
-    none = np.empty(0, np.int64)
-    one = np.concatenate([none, *(offset[i] + m[:, 0] for (i, _), m in verified)])
-    other = np.concatenate([none, *(offset[j] + m[:, 1] for (_, j), m in verified)])
-    total = int(offset[-1])
-    graph = sparse.csr_matrix((np.ones(len(one), np.int8), (one, other)), shape=(total, total))
-    _, label = connected_components(graph, directed=False)
-    node = np.unique(np.concatenate([one, other]))
+    edges = [offset[[i, j]] + matches for (i, j), matches in verified]
+    label = components(edges, int(offset[-1]))
+    node = np.unique(np.concatenate([np.empty((0, 2), np.int64), *edges]))
     frame = np.searchsorted(offset, node, side="right") - 1
     _, where, times = np.unique(
         label[node].astype(np.int64) * len(offset) + frame, return_inverse=True, return_counts=True

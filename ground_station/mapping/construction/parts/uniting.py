@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ground_station.arrays import F64, I64
-from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.solving import Solved
+from ground_station.mapping.construction.placing.chains import components
+from ground_station.mapping.construction.placing.placed import IN_PLACE_PX, Placed
 from ground_station.mapping.sfm.two_view import TwoView
 
 _SAME_DEPTHS = 0.1
 """Two parts' landmarks of one key point are one where they stand so near each other, in distances
 to the camera; else one part is mistaken about it."""
-_IN_PLACE_PX = 8.0
-"""A landmark seen so near to where it should be is in its place, as in `placing.placed`."""
 _HOLDS = 0.5
 """Share of a pair's landmarks in their place, for which what it matches is one."""
 
@@ -66,9 +63,7 @@ def unite(
             own = holder[starts[i] : starts[i + 1]], holder[starts[j] : starts[j + 1]]
             px = images.pinhole_px[i], images.pinhole_px[j]
             edges.append(_in_place(own, view, position, wTc[row[[i, j]]], px, parts[0].pinhole))
-    ends = np.concatenate(edges)
-    graph = coo_array((np.ones(len(ends), bool), tuple(ends.T)), shape=(len(position),) * 2)
-    _, landmark = connected_components(graph, directed=False)
+    landmark = components(edges, len(position))
     sums = np.stack([np.bincount(landmark, position[:, k]) for k in range(3)], axis=1)
     united = sums / np.bincount(landmark)[:, None]
     # Of each key point one observation: the first. A landmark may have lost its others to another
@@ -138,12 +133,10 @@ def _in_place(
     ends = np.stack([of[view.matches[:, k]] for k, of in enumerate(holder)], axis=1)
     known = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
     ends, good = ends[known], np.ones(np.count_nonzero(known), dtype=bool)
+    there = Placed([], {}, position, pinhole)
     for one, other in ((0, 1), (1, 0)):
-        local = poses.transform(poses.inverse(wTc[other]), position[ends[:, one]])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            seen = local[:, :2] / local[:, 2:] * pinhole[:2] + pinhole[2:]
-        off = np.linalg.norm(seen - pixels[other][view.matches[known, other]], axis=1)
-        good &= (local[:, 2] > 0) & (off <= _IN_PLACE_PX)
+        seen = pixels[other][view.matches[known, other]]
+        good &= there.error_px(wTc[other], ends[:, one], seen) <= IN_PLACE_PX
     if good.sum() < _HOLDS * len(good):
         return np.empty((0, 2), np.int64)
     return np.asarray(ends[good])

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import minimum_spanning_tree
 
-from ground_station.arrays import F64, I32, I64, Bools
+from ground_station.arrays import I64, Bools
 from ground_station.geometry import poses
+from ground_station.map.uncertainty import jacobian
+from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.placing.placed import Placed
 
 _FEWEST = 30
@@ -95,7 +97,7 @@ def _cut(model: Placed) -> tuple[list[set[int]], list[Hinge]]:
     found = []
     for n, (i, j) in enumerate(edges.tolist()):
         kept[n] = False
-        part = _components(edges[kept], len(index))
+        part = components([edges[kept]], len(index))
         sides = part == part[i], part == part[j]
         smaller = min(sides, key=np.count_nonzero)
         if np.count_nonzero(smaller) < _PART:
@@ -106,7 +108,7 @@ def _cut(model: Placed) -> tuple[list[set[int]], list[Hinge]]:
         )
         kept[n] = hinge.deviation <= _LOOSE
         found.append(hinge)
-    part = _components(edges[kept], len(index))
+    part = components([edges[kept]], len(index))
     sets = [{*index[part == number].tolist()} for number in np.unique(part).tolist()]
     return sorted(sets, key=lambda each: -len(each)), found
 
@@ -149,7 +151,7 @@ def _deviation(model: Placed, one: I64, other: I64) -> float:
         by_point = by_point @ cTw[:3, :3] / _NOISE_PX
         of_point[seen] += np.swapaxes(by_point, 1, 2) @ by_point
         if k in other:  # whoever moves sees a landmark as if it had moved the other way
-            by_set = -by_point @ _moved(model.position[seen] - middle)
+            by_set = -by_point @ jacobian(model.position[seen] - middle)
             of_both[seen] += np.swapaxes(by_set, 1, 2) @ by_point
             of_set[seen] += np.swapaxes(by_set, 1, 2) @ by_set
     left = of_set - of_both @ np.linalg.pinv(of_point, hermitian=True) @ np.swapaxes(of_both, 1, 2)
@@ -157,25 +159,11 @@ def _deviation(model: Placed, one: I64, other: I64) -> float:
         covariance = np.linalg.inv(left.sum(axis=0))
     except np.linalg.LinAlgError:
         return float("inf")
-    by_set = _moved(centres - middle)
+    by_set = jacobian(centres - middle)
     variance = np.einsum("kij,jl,kil->k", by_set, covariance, by_set)
     return float(np.sqrt(variance.max())) / model.depth
-
-
-def _moved(offset: F64) -> F64:
-    """Derivatives (N, 3, 7) of points by a turn, a shift and a growth about their origin."""
-    result = np.zeros((len(offset), 3, 7))
-    result[:, :, :3] = np.cross(offset[:, None], np.eye(3))
-    result[:, :, 3:6] = np.eye(3)
-    result[:, :, 6] = offset
-    return result
 
 
 def _stand_among(images: csr_array, triangulated: Bools) -> int:
     """How many images see as many of the landmarks as place one."""
     return int(np.count_nonzero(images @ triangulated.astype(float) >= _FEWEST))
-
-
-def _components(edges: I32, nodes: int) -> I32:
-    graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(nodes, nodes))
-    return np.asarray(connected_components(graph, directed=False)[1])
