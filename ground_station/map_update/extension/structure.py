@@ -24,7 +24,7 @@ from ground_station.map_update.extension.tracks import Tracks
 from ground_station.map_update.extension.triangulation import triangulate
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
-from ground_station.mapping.sfm.growing import adjust_among_fixed
+from ground_station.mapping.sfm.adjustment import adjust_among_fixed
 from ground_station.mapping.sfm.models import without_points
 
 

@@ -37,9 +37,6 @@ from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
 
-_ITERATIONS = 100
-"""At most, of an adjustment of the points alone."""
-
 
 def triangulate(
     database: Path, wTc: F64, *, seed: int, min_tri_angle_deg: float, max_error_px: float
@@ -73,17 +70,6 @@ def triangulate(
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
     return model
-
-
-def adjust_points(model: colmap.Reconstruction, *, loss_px: float, threads: int = 0) -> None:
-    """Adjusts all points, with a Cauchy loss of scale `loss_px`, and neither poses nor camera."""
-    options = adjustment.adjustment_options(loss_px, threads, _ITERATIONS)
-    options.refine_rig_from_world = False
-    options.refine_sensor_from_rig = False
-    chosen = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        chosen.add_image(image_id)
-    pycolmap.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
 _ROWS = 256
@@ -230,7 +216,7 @@ def _settle(reconstruction: colmap.Reconstruction, sfm: SfmSettings, threads: in
     Images that see none of what is left go.
     """
     for _ in range(2):
-        adjust_points(reconstruction, loss_px=sfm.loss_px, threads=threads)
+        adjustment.adjust_points(reconstruction, loss_px=sfm.loss_px, threads=threads)
         model = drop_misfits(reconstruction, sfm)
     if not len(model.point_id):
         raise MapError(

@@ -12,7 +12,7 @@ from ground_station.map.model import Model
 from ground_station.map_update.extension.extend import never_seen
 from ground_station.map_update.extension.tracks import joined
 from ground_station.map_update.extension.triangulation import triangulate
-from ground_station.mapping.sfm.growing import adjust_among_fixed
+from ground_station.mapping.sfm.adjustment import adjust_among_fixed
 
 
 def test_matches_become_tracks_and_a_track_is_once_in_a_frame():
