@@ -24,9 +24,9 @@ from ground_station.map.model import Model
 from ground_station.mapping.construction import bending, content, noise
 from ground_station.mapping.construction.assembly import assemble
 from ground_station.mapping.construction.cache import Cache
+from ground_station.mapping.construction.first_lens import LensPrior
 from ground_station.mapping.construction.images import Images, extract
 from ground_station.mapping.construction.lens import SelfCalibration, with_lens
-from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.parts.reconstruction import reconstruct
 from ground_station.mapping.construction.structure import Structure, adjust_and_filter

@@ -6,11 +6,11 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 from ground_station.errors import CameraError
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.resizing import for_pictures
-from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.recording.frames import FrameSource
 from ground_station.recording.look import Look, check_one_lens, look
 
@@ -47,6 +47,24 @@ SIGMA_FILE = 0.02
 """Of a camera that somebody measured, as a share. A calibration itself is ten times better, but the
 file may be of another camera of the same make, of another focus, or roughly right: two and a half
 deviations are the 5 % that an adjustment is to find back from."""
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """A nominal camera and how far it may be off.
+
+    `source` says where the camera came from. `sigma_focal` is the standard deviation of the focal
+    length as a share of it. Where the camera is not `calibrated`, its distortion is unknown, too.
+    """
+
+    camera: Camera
+    source: Literal["file", "recording", "metadata", "guess"]
+    sigma_focal: float
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether somebody measured this lens; its file may still be another camera's."""
+        return self.source in ("file", "recording")
 
 
 @dataclass(frozen=True)

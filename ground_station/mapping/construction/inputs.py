@@ -18,9 +18,8 @@ from typing import Any
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import keyframes
-from ground_station.mapping.construction.first_lens import known_lens
+from ground_station.mapping.construction.first_lens import LensPrior, known_lens
 from ground_station.mapping.construction.keyframes import Choice
-from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.motion import Figures
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress

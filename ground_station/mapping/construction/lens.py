@@ -19,6 +19,7 @@ from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
+from ground_station.mapping.construction.first_lens import LensPrior
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.lens_adjustment import (
     PARAMETERS,
@@ -27,7 +28,6 @@ from ground_station.mapping.construction.lens_adjustment import (
     adjust,
     vector,
 )
-from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.construction.noise import matched_neighbours
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings

@@ -18,9 +18,9 @@ from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
 from ground_station.map.model import Model
 from ground_station.mapping.construction import lens
+from ground_station.mapping.construction.first_lens import LensPrior
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.lens_adjustment import PARAMETERS, adjust, vector
-from ground_station.mapping.construction.lens_prior import LensPrior
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import adjustment
