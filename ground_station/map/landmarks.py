@@ -46,12 +46,15 @@ def largest_angles_deg(model: Model) -> F64:
     return angles
 
 
-def sigma_px(model: Model) -> float:
+def sigma_px(model: Model, assumed: F64 | None = None) -> float:
     """The standard deviation of a pixel coordinate, from the residuals.
 
-    Residual sum of squares over the degrees of freedom that poses and points leave.
+    Residual sum of squares over the degrees of freedom that poses and points leave. Where
+    deviations (O,) are `assumed` of the observations, what it is of these.
     """
     r = residuals_px(model)
+    if assumed is not None:
+        r = r / assumed[:, None]
     freedom = 2 * len(r) - 3 * len(model.position) - 6 * len(model.names) + 7
     return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
 

@@ -193,7 +193,8 @@ def _keyframe_observations(
 def _assemble(map_: store.Map, graph: Graph) -> store.Map:
     """The map in memory: old descriptors, everything else from the graph."""
     model, old = graph.model, map_.landmarks
-    sigma_px = graph.sigma_px[graph.group_of_observations()] * _unit_weight(graph)
+    sigma_px = graph.sigma_px[graph.group_of_observations()]
+    sigma_px = sigma_px * landmarks.sigma_px(model, sigma_px)
     made = landmarks.make_landmarks(model, np.zeros((len(model.point), 0), np.float32))
     kept = np.isin(old.id, model.point_id)
     covariance = landmarks.covariances(model, sigma_px)
@@ -218,17 +219,6 @@ def _assemble(map_: store.Map, graph: Graph) -> store.Map:
     )
     modes = map_.modes.among(kept) if map_.modes is not None else None
     return store.Map(store.MapInfo(**vars(map_.info)), lm, keyframes, modes=modes)
-
-
-def _unit_weight(graph: Graph) -> float:
-    """The standard deviation of unit weight: what residuals say of the deviations assumed.
-
-    Residual sum of squares over the degrees of freedom, as in `landmarks.sigma_px`.
-    """
-    model = graph.model
-    r = landmarks.residuals_px(model) / graph.sigma_px[graph.group_of_observations()][:, None]
-    freedom = 2 * len(r) - 3 * len(model.position) - 6 * len(model.names) + 7
-    return float(np.sqrt(np.sum(r * r) / max(freedom, 1)))
 
 
 def _keyframe_report(map_: store.Map, past: Refined, graph: Graph) -> dict[str, Any]:
