@@ -12,18 +12,12 @@ import numpy.typing as npt
 from ground_station.arrays import F32
 from ground_station.errors import MapError
 
-NAMES: dict[str, np.dtype[Any]] = {
-    "descriptor": np.dtype("<f4"),
-    "descriptor_u8": np.dtype("u1"),
-    "descriptor_i8": np.dtype("i1"),
+NAMES: dict[str, tuple[np.dtype[Any], str]] = {
+    "descriptor": (np.dtype("<f4"), "F32"),
+    "descriptor_u8": (np.dtype("u1"), "U8"),
+    "descriptor_i8": (np.dtype("i1"), "I8"),
 }
-"""Arrays of `landmarks.safetensors` that may hold the descriptors, and their types."""
-
-_SAFETENSORS_TYPES: dict[str, np.dtype[Any]] = {
-    "F32": np.dtype("<f4"),
-    "U8": np.dtype("u1"),
-    "I8": np.dtype("i1"),
-}
+"""Arrays of `landmarks.safetensors` that may hold the descriptors, their types, and their names."""
 
 _BLOCK = 1 << 22
 """Numbers that are looked at together: 16 MB as float32."""
@@ -70,7 +64,7 @@ class Descriptors:
         """What keeps them as they are in a map's file, by name; none of float32."""
         return {
             name: np.asarray(self._kept)
-            for name, dtype in NAMES.items()
+            for name, (dtype, _) in NAMES.items()
             if dtype.itemsize == 1 and self._kept.dtype == dtype
         }
 
@@ -128,11 +122,19 @@ def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -
             if found is None:
                 raise MapError(f"{path}: it holds no {prefix}descriptors")
             name = prefix + found
-            shape = tuple(header[name]["shape"])
+            entry, (dtype, kind) = header[name], NAMES[found]
+            shape, (begin, end) = tuple(entry["shape"]), entry["data_offsets"]
             if shape != (count, dimension):
                 raise MapError(f"{path}: descriptors are {shape}, not ({count}, {dimension})")
-            kind = next(k for k, dtype in _SAFETENSORS_TYPES.items() if dtype == NAMES[found])
-            values = _mapped(file, path, header, length, name, kind)
+            if entry["dtype"] != kind:
+                raise MapError(f"{path}: '{name}' must be {dtype}, not {entry['dtype']}")
+            if end - begin != count * dimension * dtype.itemsize:
+                raise MapError(f"{path}: '{name}' has {end - begin} bytes")
+            values = (
+                np.memmap(file, dtype, "r", 8 + length + begin, shape)
+                if begin < end
+                else np.empty(shape, dtype)  # nothing cannot be mapped
+            )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{path}: {reason}") from None
@@ -143,21 +145,3 @@ def open_descriptors(path: Path, count: int, dimension: int, prefix: str = "") -
             if not np.isfinite(values[start : start + rows]).all():
                 raise MapError(f"{path}: '{name}' holds a value that is not finite")
     return Descriptors(values)
-
-
-def _mapped(
-    file: Any, path: Path, header: dict[str, Any], length: int, name: str, kind: str
-) -> npt.NDArray[Any]:
-    """An array of a file whose header has `length` bytes, mapped into memory."""
-    if name not in header:
-        raise MapError(f"{path}: the array '{name}' is missing")
-    entry, dtype = header[name], _SAFETENSORS_TYPES[kind]
-    shape = tuple(entry["shape"])
-    if entry["dtype"] != kind:
-        raise MapError(f"{path}: '{name}' must be {dtype}, not {entry['dtype']}")
-    begin, end = entry["data_offsets"]
-    if end - begin != int(np.prod(shape, dtype=object)) * dtype.itemsize:
-        raise MapError(f"{path}: '{name}' has {end - begin} bytes")
-    if begin == end:  # nothing cannot be mapped
-        return np.empty(shape, dtype)
-    return np.memmap(file, dtype, "r", 8 + length + begin, shape)
