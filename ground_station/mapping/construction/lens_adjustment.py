@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.arrays import F64, I64
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.lens_models import BrownConrady
 from ground_station.map.model import Model
 from ground_station.mapping.sfm.models import among, without_points
 
@@ -377,13 +378,7 @@ def _robust_sigma(residuals: F64) -> float:
 
 def _project(lens: F64, xy: F64) -> F64:
     """Coordinates on the plane z = 1 (N, 2) to distorted pixels, as `Camera.distort`."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
-    x, y = xy[:, 0], xy[:, 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.stack([fx * xd + cx, fy * yd + cy], axis=1)
+    return np.asarray(BrownConrady(*lens[4:]).bend(xy) * lens[:2] + lens[2:4])
 
 
 def _derivatives(lens: F64, xy: F64) -> tuple[F64, F64]:
