@@ -21,7 +21,7 @@ from ground_station.arrays import F32, F64, I64
 from ground_station.errors import CameraError, MapError
 from ground_station.files import write_bytes
 from ground_station.geometry.camera import Camera
-from ground_station.map.store import Landmarks
+from ground_station.map.store import Landmarks, Layout, check_arrays
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
@@ -64,7 +64,7 @@ class FlightObservations:
         return len(self.time_ns)
 
 
-_LAYOUT: dict[str, tuple[str, tuple[int, ...]]] = {
+_LAYOUT: Layout = {
     "time_ns": ("int64", ()),
     "wTc": ("float64", (4, 4)),
     "offset": ("int64", ()),
@@ -150,15 +150,7 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
             f"{path}: is no whole file of observations (a trajectory has poses only); "
             "make one with 'blimp localize … --observations F'"
         )
-    for name, (dtype, shape) in _LAYOUT.items():
-        array = arrays.get(name)
-        if array is None:
-            raise MapError(f"{path}: the array '{name}' is missing")
-        if str(array.dtype) != dtype or array.ndim == 0 or array.shape[1:] != shape:
-            rows = ", ".join(["N", *map(str, shape)])
-            raise MapError(
-                f"{path}: '{name}' must be {dtype} ({rows}), not {array.dtype} {array.shape}"
-            )
+    check_arrays(path, arrays, _LAYOUT)
     return arrays, metadata
 
 
@@ -168,8 +160,6 @@ def _fault(seen: FlightObservations) -> str | None:
     camera, R = seen.camera, seen.wTc[:, :3, :3]
     if not seen.name.isprintable() or not 0 < len(seen.name) <= _LONGEST_NAME:
         return f"the flight's name in it is not 1 to {_LONGEST_NAME} printable characters"
-    if not np.isfinite(seen.wTc).all() or not np.isfinite(seen.pixel_px).all():
-        return "it holds a value that is not finite"
     if len(seen.wTc) != frames or len(offset) != frames + 1 or len(seen.pixel_px) != observations:
         return "its arrays do not fit each other"
     if offset[0] != 0 or offset[-1] != observations or (offset[1:] < offset[:-1]).any():

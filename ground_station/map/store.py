@@ -143,9 +143,9 @@ class Map:
 
 
 _Arrays = dict[str, npt.NDArray[Any]]
-_Layout = dict[str, tuple[str, tuple[int, ...]]]
+Layout = dict[str, tuple[str, tuple[int, ...]]]
 """Of each array its type, and its shape after the first axis."""
-_LANDMARKS: _Layout = {
+_LANDMARKS: Layout = {
     "id": ("int64", ()),
     "position_m": ("float64", (3,)),
     "covariance_m2": ("float32", (3, 3)),
@@ -155,12 +155,12 @@ _LANDMARKS: _Layout = {
     "distance_m": ("float32", (2,)),
     "observations": ("int32", ()),
 }
-_BENDING: _Layout = {"by_focal_m": ("float32", (3,))}
+_BENDING: Layout = {"by_focal_m": ("float32", (3,))}
 """Maps of before have none."""
-_MODES: _Layout = {"mode_landmark": ("int32", ())}
+_MODES: Layout = {"mode_landmark": ("int32", ())}
 _OF_MODES = "mode_"
 """Stands before the names of the modes' descriptors, which are called as the landmarks' own."""
-_KEYFRAMES: _Layout = {
+_KEYFRAMES: Layout = {
     "time_ns": ("int64", ()),
     "wTc": ("float64", (4, 4)),
     "offset": ("int64", ()),
@@ -326,7 +326,7 @@ def _landmarks(path: Path) -> _Arrays:
 
 
 def _read(
-    path: Path, wanted: _Layout, optional: _Layout | None = None
+    path: Path, wanted: Layout, optional: Layout | None = None
 ) -> tuple[_Arrays, dict[str, str]]:
     every = wanted | (optional or {})
     try:
@@ -337,7 +337,15 @@ def _read(
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MapError(f"{path}: {reason}; copy the map again, or build it again") from None
-    for name, (dtype, shape) in every.items():
+    check_arrays(path, arrays, wanted, optional)
+    return arrays, metadata
+
+
+def check_arrays(
+    path: Path, arrays: _Arrays, wanted: Layout, optional: Layout | None = None
+) -> None:
+    """Raises `MapError` unless a file's arrays are there, of their types, and of finite numbers."""
+    for name, (dtype, shape) in (wanted | (optional or {})).items():
         if name not in arrays:
             if name not in wanted:
                 continue
@@ -350,7 +358,6 @@ def _read(
             )
         if not np.isfinite(array).all():
             raise MapError(f"{path}: '{name}' holds a value that is not finite")
-    return arrays, metadata
 
 
 def check_features(info: MapInfo, name: str, sha256: str) -> None:
