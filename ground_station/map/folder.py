@@ -24,9 +24,31 @@ PICTURE = "map.png"
 """What a build draws of its map; it is not kept where another map takes the place."""
 
 
+PARTS = {
+    "landmarks": ("landmarks.safetensors",),
+    "keyframes": ("keyframes.safetensors",),
+    "sparse": ("sparse",),
+    "other": ("map.toml", *FLOORPLAN),
+}
+"""What a map's folder holds of it, by part. Recordings that lie beside it are not of it."""
+
+
 def files_flown_in(folder: Path) -> list[Path]:
     """The files of a map that localizers and pages read."""
     return [folder / name for name in FLOWN_IN if (folder / name).is_file()]
+
+
+def sizes(folder: str | Path) -> dict[str, int]:
+    """The bytes of each part and in all (`total`) of a map on disk."""
+    whole = Path(folder)
+    found = {part: sum(_bytes(whole / name) for name in names) for part, names in PARTS.items()}
+    return found | {"total": sum(found.values())}
+
+
+def _bytes(path: Path) -> int:
+    if path.is_dir():
+        return sum(entry.stat().st_size for entry in path.rglob("*") if entry.is_file())
+    return path.stat().st_size if path.is_file() else 0
 
 
 def content_id(folder: Path) -> str:

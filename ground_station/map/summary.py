@@ -8,10 +8,10 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.map import landmarks
+from ground_station.map.folder import sizes
 from ground_station.map.levelling import levelled
 from ground_station.map.model import model_of
 from ground_station.map.refined import Refined
-from ground_station.map.sizes import sizes
 from ground_station.map.store import Map
 
 _JUDGED = ("doubts", "parts", "left_out", "noise_px", "lens_prior", "lens")

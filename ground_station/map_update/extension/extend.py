@@ -26,11 +26,11 @@ from ground_station.map.folder import (
     content_id,
     kept_name,
     replacing,
+    sizes,
 )
 from ground_station.map.model import model_of
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.refined import FRAME_TIME, Refined
-from ground_station.map.sizes import sizes
 from ground_station.map.store import Map
 from ground_station.map_update.extension.anchoring import Anchoring
 from ground_station.map_update.extension.frames import Frames, Picked, describe, pick, thinned
