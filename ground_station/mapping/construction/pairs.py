@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse import csr_array
 
-from ground_station.arrays import F32, I64
+from ground_station.arrays import F32, F64, I64
 from ground_station.mapping.settings import MatchSettings
 
 Pair = tuple[int, int]
@@ -87,8 +87,8 @@ def covisible_pairs(
     ends = np.array(list(linked), dtype=np.int64).reshape(-1, 2)
     matches = np.fromiter(linked.values(), np.int64, len(linked))
     strong = matches >= settings.min_inliers_far
-    weight = _symmetric(ends[strong], matches[strong], images)
-    known = _symmetric(np.array(tried, dtype=np.int64).reshape(-1, 2), None, images)
+    weight = symmetric(ends[strong], matches[strong], images)
+    known = symmetric(np.array(tried, dtype=np.int64).reshape(-1, 2), None, images)
     found = []
     for i in range(images):
         between, first = _row(weight, i)
@@ -210,7 +210,7 @@ def _ahead(way: I64, step: int) -> I64:
     return np.stack([first, first + step], axis=1)
 
 
-def _symmetric(pairs: I64, values: I64 | None, images: int) -> csr_array:
+def symmetric(pairs: I64, values: I64 | F64 | None, images: int) -> csr_array:
     """A sparse matrix (images, images) with the values of pairs (P, 2) both ways, ones by default.
 
     Columns are sorted in each row.

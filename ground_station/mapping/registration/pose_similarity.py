@@ -100,7 +100,7 @@ class JointFit:
 
 
 def rotation_vectors(rotation: F64) -> F64:
-    """Rotation vectors (N, 3), radians, of rotations (N, 3, 3)."""
+    """Rotation vectors (..., 3), radians, of rotations (..., 3, 3)."""
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
@@ -243,12 +243,12 @@ def orientation_offset(
         mean = there.sum(axis=0) / sigma**2
         one = n / sigma**2 * np.eye(3)
         normal = np.block([[one + prior, mean], [mean.T, one]])
-        pull = np.einsum("nij,nj->i", there, left) / sigma**2 - prior @ _log(E)
+        pull = np.einsum("nij,nj->i", there, left) / sigma**2 - prior @ rotation_vectors(E)
         step = np.linalg.solve(normal, np.concatenate([pull, left.sum(axis=0) / sigma**2]))
         E, B = _exp(step[:3]) @ E, B @ _exp(step[3:])
         if np.abs(step).max() < 1e-9:
             break
-    offset = _log(B)
+    offset = rotation_vectors(B)
     angle_deg = float(np.degrees(np.linalg.norm(offset)))
     first, cross, last = normal[:3, :3], normal[:3, 3:], normal[3:, 3:]
     known = last - cross.T @ np.linalg.solve(first, cross)
@@ -299,7 +299,3 @@ def _angles(rotations: F64, about: F64) -> F64:
 
 def _exp(vector: F64) -> F64:
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
-
-
-def _log(rotation: F64) -> F64:
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

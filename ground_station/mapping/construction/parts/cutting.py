@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 
 from ground_station.arrays import I64, Bools
-from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.pairs import Pair, symmetric
 
 OVERLAP = 0.1
 """Of the largest part's images, how many a part takes from each part beside it."""
@@ -79,9 +79,7 @@ def inside(parts: Sequence[Part], pairs: Iterable[Pair], images: int) -> list[li
 def _weights(pairs: Mapping[Pair, int], images: int) -> csr_array:
     """Matches between images, symmetric (images, images)."""
     ends = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
-    matches = np.fromiter(pairs.values(), np.float64, len(pairs))
-    rows, columns = np.concatenate([ends, ends[:, ::-1]]).T
-    return csr_array((np.tile(matches, 2), (rows, columns)), shape=(images, images))
+    return symmetric(ends, np.fromiter(pairs.values(), np.float64, len(pairs)), images)
 
 
 def _pieces(weight: csr_array, most: int) -> list[I64]:
