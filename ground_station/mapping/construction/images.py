@@ -80,7 +80,7 @@ def extract(
 
     def missing() -> Iterator[tuple[MappingSettings, U8]]:
         for frame in frames:
-            _check_size(frame, camera)
+            check_size(frame, camera)
             names.append(frame.name)
             times.append(frame.time_ns)
             features = None
@@ -128,7 +128,8 @@ def extractor_of(settings: MappingSettings) -> Extractor:
     return extractors.create(settings.features, settings.max_features, learned=settings.learned)
 
 
-def _check_size(frame: Frame, camera: Camera) -> None:
+def check_size(frame: Frame, camera: Camera) -> None:
+    """Raises `MapError` for a picture that has not the camera's size."""
     if frame.image.shape != (camera.height_px, camera.width_px):
         height, width = frame.image.shape[:2]
         raise MapError(f"{frame.name}: is {misfit(camera, width, height)}")

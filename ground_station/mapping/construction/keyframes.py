@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.arrays import F64, I64, Bools
-from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.resizing import misfit
+from ground_station.mapping.construction.images import check_size
 from ground_station.mapping.construction.motion import Figures, Motion
 from ground_station.mapping.settings import KeyframeSettings
 from ground_station.recording.frames import Frame
@@ -54,9 +53,7 @@ def measure(frames: Iterable[Frame], camera: Camera, settings: KeyframeSettings)
     """Figures of an input's frames, read once; `MapError` for a size that is not the camera's."""
     motion = Motion(camera, settings)
     for frame in frames:
-        height, width = frame.image.shape
-        if (width, height) != (camera.width_px, camera.height_px):
-            raise MapError(f"{frame.name}: is {misfit(camera, width, height)}")
+        check_size(frame, camera)
         motion.add(frame.index, frame.time_ns, frame.image)
     return motion.figures()
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ground_station.arrays import F64
@@ -28,6 +27,7 @@ from ground_station.mapping.construction.lens_adjustment import (
     adjust,
     vector,
 )
+from ground_station.mapping.construction.matching import essential
 from ground_station.mapping.construction.noise import matched_neighbours
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
@@ -362,13 +362,8 @@ def rough_lens(images: Images, known: LensPrior, ratio: float) -> Camera:
 def _agreeing(camera: Camera, first: F64, second: F64) -> int:
     p, q = camera.undistort_to_pinhole(first), camera.undistort_to_pinhole(second)
     limit = _SEARCH_PX * camera.width_px / 640
-    try:
-        _, mask = cv2.findEssentialMat(
-            p, q, camera.matrix, cv2.USAC_MAGSAC, 0.999, limit, _SEARCH_ITERATIONS
-        )
-    except cv2.error:  # the solver found no model in a degenerate sample
-        return 0
-    return 0 if mask is None else int(np.count_nonzero(mask))
+    found = essential(p, q, camera.matrix, limit, 0.999, _SEARCH_ITERATIONS)
+    return 0 if found is None else int(np.count_nonzero(found[1]))
 
 
 def _divided(camera: Camera, share: float, bend: float) -> Camera | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ground_station.arrays import F32, F64, I32
+from ground_station.arrays import F32, F64, I32, Bools
 from ground_station.mapping.sfm.two_view import TwoView
 
 _MIN_SAMPLE = 8
@@ -47,6 +47,24 @@ def mutual_matches(first: F32, second: F32, ratio: float) -> I32:
     return np.stack([i[keep], j[keep]], axis=1).astype(np.int32)
 
 
+def essential(
+    p: F64, q: F64, camera_matrix: F64, error_px: float, confidence: float, iterations: int
+) -> tuple[F64, Bools] | None:
+    """The essential matrix (3, 3) that most matched pixels (K, 2) agree with, and which do (K,).
+
+    None where there is none, as where a sample is degenerate.
+    """
+    try:
+        E, mask = cv2.findEssentialMat(
+            p, q, camera_matrix, cv2.USAC_MAGSAC, confidence, error_px, iterations
+        )
+    except cv2.error:
+        return None
+    if E is None or E.shape != (3, 3) or mask is None:
+        return None
+    return np.asarray(E, np.float64), mask.ravel() != 0
+
+
 def verify(
     first_px: F64,
     second_px: F64,
@@ -67,18 +85,16 @@ def verify(
     if len(matches) < _MIN_SAMPLE:
         return None
     p, q = first_px[matches[:, 0]], second_px[matches[:, 1]]
+    found = essential(p, q, camera_matrix, error_px, _CONFIDENCE, _MAX_ITERATIONS)
+    if found is None:
+        return None
+    E, inliers = found
     try:
-        E, mask = cv2.findEssentialMat(
-            p, q, camera_matrix, cv2.USAC_MAGSAC, _CONFIDENCE, error_px, _MAX_ITERATIONS
-        )
-        if E is None or E.shape != (3, 3) or mask is None:
-            return None
         H, planar = cv2.findHomography(
             p, q, cv2.USAC_MAGSAC, 2 * error_px, None, _MAX_ITERATIONS, _CONFIDENCE
         )
     except cv2.error:  # the solver found no model in a degenerate sample
         return None
-    inliers = mask.ravel() != 0
     degenerate = False
     if H is not None and planar is not None:
         on_plane = planar.ravel() != 0
@@ -89,7 +105,7 @@ def verify(
         return None
     return TwoView(
         matches[inliers],
-        np.asarray(E, np.float64),
+        E,
         None if H is None else np.asarray(H, np.float64),
         degenerate,
     )

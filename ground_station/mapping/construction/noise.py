@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.special import gammaln
 
@@ -19,7 +18,7 @@ from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.epipolar import sampson_px
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.matching import mutual_matches
+from ground_station.mapping.construction.matching import essential, mutual_matches
 
 _PAIRS, _GAPS = 48, (1, 2, 4)
 """Compared pairs of images at most, and how far apart they stand."""
@@ -67,9 +66,10 @@ def measured(images: Images, camera: Camera, ratio: float) -> Noise | None:
     inside: list[F64] = []
     for first, second in matched_neighbours(images, ratio, _PAIRS):
         p, q = camera.undistort_to_pinhole(first), camera.undistort_to_pinhole(second)
-        distance = _distances(p, q, camera.matrix, float(limits[-1]) * 2 / 3)
-        if distance is None:
+        found = essential(p, q, camera.matrix, float(limits[-1]) * 2 / 3, 0.9999, 1000)
+        if found is None:
             continue
+        distance = sampson_px(p, q, found[0], camera.matrix)
         distance /= np.sqrt(0.5 * (camera.stretch(p) ** 2 + camera.stretch(q) ** 2))
         n, k = len(distance), (distance[:, None] < limits).sum(axis=0)
         binomial = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
@@ -79,14 +79,3 @@ def measured(images: Images, camera: Camera, ratio: float) -> Noise | None:
         return None
     limit = _APART * float(limits[np.argmin(false_alarms)])
     return Noise(_MAD * float(np.median(np.concatenate(inside))), limit)
-
-
-def _distances(p: F64, q: F64, camera_matrix: F64, limit_px: float) -> F64 | None:
-    """Sampson distances (K,) from the geometry that most agree with, None where there is none."""
-    try:
-        E, _ = cv2.findEssentialMat(p, q, camera_matrix, cv2.USAC_MAGSAC, 0.9999, limit_px, 1000)
-    except cv2.error:  # the solver found no model in a degenerate sample
-        return None
-    if E is None or E.shape != (3, 3):
-        return None
-    return sampson_px(p, q, np.asarray(E, np.float64), camera_matrix)
