@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap as pycolmap  # others have it from here, after zlib
 
-from ground_station.arrays import F64, I64
+from ground_station.arrays import F64
 from ground_station.errors import CameraError, MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map.colmap_cameras import HALF_PIXEL, camera_of, described
@@ -183,39 +183,6 @@ def drop_points(model: Reconstruction, point_ids: npt.ArrayLike) -> None:
     for point_id in np.asarray(point_ids).tolist():
         if model.exists_point3D(point_id):
             model.delete_point3D(point_id)
-
-
-def compact(model: Reconstruction) -> Reconstruction:
-    """A copy that holds the observations of points only, without the key points that none came of.
-
-    Two thirds of a model's size on disk are key points without a point.
-    """
-    result = pycolmap.Reconstruction()
-    result.add_camera_with_trivial_rig(model.cameras[CAMERA_ID])
-    place: dict[int, I64] = {}
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        kept = [int(i) for i in image.get_observation_point2D_idxs()]
-        place[image_id] = np.full(len(image.points2D), -1, np.int64)
-        place[image_id][kept] = np.arange(len(kept))
-        pixels = np.array([image.points2D[i].xy for i in kept]).reshape(-1, 2)
-        result.add_image_with_trivial_frame(
-            pycolmap.Image(
-                name=image.name, keypoints=pixels, camera_id=CAMERA_ID, image_id=image_id
-            ),
-            image.cam_from_world(),
-        )
-    for point_id in sorted(model.point3D_ids()):
-        point = model.points3D[point_id]
-        track = pycolmap.Track(
-            [
-                pycolmap.TrackElement(e.image_id, place[e.image_id][e.point2D_idx])
-                for e in point.track.elements
-            ]
-        )
-        moved = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=track)
-        result.add_point3D_with_id(point_id, moved)
-    return result
 
 
 def transform(model: Reconstruction, scale: float, rotation: F64, translation: F64) -> None:

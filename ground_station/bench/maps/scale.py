@@ -74,7 +74,7 @@ def build(images: int, dask: int, settings: MappingSettings) -> Row:
         stage_s["refine"] = time.monotonic() - start_s
         start_s = time.monotonic()
         map_ = assemble(model, given, CAMERA, settings, "campus")
-        colmap.write(colmap.compact(structure.reconstruction), work / "sparse")
+        colmap.write(colmap.from_arrays(model, CAMERA), work / "sparse")
         store.save_tables(work, map_, quantise=settings.quantise)
         stage_s["write"] = time.monotonic() - start_s
     centres, truth = model.wTc[:, :3, 3], made.wTc[model.image_id - 1, :3, 3]

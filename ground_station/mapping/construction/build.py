@@ -165,7 +165,8 @@ def build_map(
             "stage_s": {name: round(value, 3) for name, value in stage_s.items()},
             "settings": asdict(settings),
         }
-        map_, sparse = _straightened(map_, structure.reconstruction, limits)
+        map_, straight = _straightened(map_, model, limits)
+        sparse = colmap.from_arrays(straight, camera)
         if len(model.names) <= limits.sfm.part_images:  # of more its cost is not measured
             map_.landmarks.by_focal_m = bending.by_focal(
                 sparse, map_.landmarks.id, loss_px=limits.sfm.loss_px, threads=threads
@@ -207,20 +208,17 @@ def structure_key(
 
 
 def _straightened(
-    map_: store.Map, reconstruction: colmap.Reconstruction, settings: MappingSettings
-) -> tuple[store.Map, colmap.Reconstruction]:
-    """The map without its camera's rolling shutter, and the COLMAP model that goes with it.
+    map_: store.Map, model: Model, settings: MappingSettings
+) -> tuple[store.Map, Model]:
+    """The map without its camera's rolling shutter, and the model that goes with it.
 
     One that cannot be adjusted stays as it is, and a note says so.
     """
     try:
-        found = straighten(map_, settings)
+        return straighten(map_, settings) or (map_, model)
     except MapError as error:
         map_.info.built["notes"].append(f"the rolling shutter stays in the map: {error}")
-        found = None
-    if found is None:
-        return map_, colmap.compact(reconstruction)
-    return found[0], colmap.from_arrays(found[1], map_.info.camera)
+        return map_, model
 
 
 @contextmanager

@@ -203,7 +203,7 @@ def import_model(
             "stage_s": {"import": round(time.monotonic() - started_s, 3)},
             "settings": asdict(settings),
         }
-        colmap.write(colmap.compact(reconstruction), folder / "sparse")
+        colmap.write(colmap.from_arrays(found, camera), folder / "sparse")
         store.save_tables(folder, map_, quantise=settings.quantise)
         shutil.rmtree(work)
     map_.folder = out
