@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ground_station.arrays import F32
+from ground_station.arrays import F32, Bools, Indices
 from ground_station.errors import MapError
 
 NAMES: dict[str, tuple[np.dtype[Any], str]] = {
@@ -78,6 +78,13 @@ def joined(first: F32 | Descriptors, second: F32 | Descriptors) -> F32 | Descrip
         if values.dtype == more.dtype:
             return Descriptors(np.concatenate([values, more]))
     return np.concatenate([first[:], second[:]])
+
+
+def rows_of(descriptors: F32 | Descriptors, index: Indices | Bools) -> F32 | Descriptors:
+    """Those of an index or a mask on the first axis: codes stay codes."""
+    if isinstance(descriptors, Descriptors):
+        return descriptors.rows(index)
+    return descriptors[index]
 
 
 def quantised(descriptors: F32 | Descriptors) -> dict[str, npt.NDArray[Any]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_station.arrays import F32, I32, I64, Bools, Indices
-from ground_station.map.descriptors import Descriptors, joined
+from ground_station.map.descriptors import Descriptors, joined, rows_of
 
 MOST = 8
 """Modes that one landmark may have: a file that claims more is refused."""
@@ -43,7 +43,9 @@ class Modes:
         """Those of the landmarks that are kept of all M, (M,), which are counted again."""
         rows = np.flatnonzero(kept[self.landmark])
         landmark = (np.cumsum(kept) - 1)[self.landmark[rows]]
-        return Modes(landmark.astype(np.int32), _some(self.descriptor, rows)) if len(rows) else None
+        return (
+            Modes(landmark.astype(np.int32), rows_of(self.descriptor, rows)) if len(rows) else None
+        )
 
 
 def with_modes(modes: Modes | None, landmark: I64, descriptor: F32) -> Modes:
@@ -53,7 +55,7 @@ def with_modes(modes: Modes | None, landmark: I64, descriptor: F32) -> Modes:
         landmark = np.concatenate([modes.landmark, landmark])
         rows = joined(modes.descriptor, descriptor)
     order = np.argsort(landmark, kind="stable")
-    return Modes(landmark[order].astype(np.int32), _some(rows, order))
+    return Modes(landmark[order].astype(np.int32), rows_of(rows, order))
 
 
 def described(
@@ -70,9 +72,3 @@ def described(
     if not len(place):
         return rows, None
     return np.concatenate([rows, modes.descriptor[row]]), place
-
-
-def _some(descriptors: F32 | Descriptors, rows: Indices) -> F32 | Descriptors:
-    if isinstance(descriptors, Descriptors):
-        return descriptors.rows(rows)
-    return descriptors[rows]

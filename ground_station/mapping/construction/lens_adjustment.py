@@ -98,11 +98,6 @@ def vector(camera: Camera) -> F64:
     return np.array([getattr(camera, name) for name in PARAMETERS])
 
 
-def with_vector(camera: Camera, lens: F64) -> Camera:
-    """The camera with another lens (9,)."""
-    return replace(camera, **dict(zip(PARAMETERS, lens.tolist(), strict=True)))
-
-
 def adjust(model: Model, camera: Camera, prior: Prior) -> Adjusted | None:
     """The lens by which a model fits best; poses and points move with it.
 
@@ -120,7 +115,8 @@ def adjust(model: Model, camera: Camera, prior: Prior) -> Adjusted | None:
         scale = _CAUCHY * _robust_sigma(problem.residuals(state))
         state = problem.minimise(state, scale, settled)
     covariance, curvature = problem.covariance(state, scale)
-    found, sigma_px = with_vector(camera, state.lens), _robust_sigma(problem.residuals(state))
+    found = replace(camera, **dict(zip(PARAMETERS, state.lens.tolist(), strict=True)))
+    sigma_px = _robust_sigma(problem.residuals(state))
     return Adjusted(found, covariance, sigma_px, curvature, camera)
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.arrays import F32, F64, Bools
+from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.map import colmap, landmarks, store
-from ground_station.map.descriptors import Descriptors
+from ground_station.map.descriptors import rows_of
 from ground_station.map.folder import carry_floorplan, kept_name, replacing
 from ground_station.map.model import Model
 from ground_station.map.observations import FlightObservations, landmarks_sha256
@@ -201,7 +201,7 @@ def _assemble(map_: store.Map, graph: Graph) -> store.Map:
     lm = dataclasses.replace(
         made,
         covariance_m2=covariance.astype(np.float32),
-        descriptor=_those(old.descriptor, kept),
+        descriptor=rows_of(old.descriptor, kept),
         spread=old.spread[kept],
         by_focal_m=old.by_focal_m[kept],
     )
@@ -258,13 +258,6 @@ def _flight_report(flight: Chosen, start: Graph, graph: Graph, group: int) -> di
         "median_px": _median(graph.error_px()[mine]),
         "frames_left_out": {reason: count for reason, count in flight.left.items() if count},
     }
-
-
-def _those(descriptor: F32 | Descriptors, kept: Bools) -> F32 | Descriptors:
-    """The descriptors of the landmarks that stay, as they lie: codes stay codes."""
-    if isinstance(descriptor, Descriptors):
-        return descriptor if kept.all() else descriptor.rows(np.flatnonzero(kept))
-    return descriptor[kept]
 
 
 def _median(values: F64) -> float:

@@ -128,9 +128,9 @@ def triangulate_observations(
                 "too near the rim of a fisheye's picture to be used: click it nearer to the middle"
             )
         mine = within
-        known = [
-            (s, lookup[key]) for s in mine if (key := known_image(observations.image[s], lookup))
-        ]
+        images = [observations.image[s] for s in mine]
+        rows = [lookup.get(image, lookup.get(Path(image).stem)) for image in images]
+        known = [(s, k) for s, k in zip(mine, rows, strict=True) if k is not None]
         if len({k for _, k in known}) < 2:
             notes.append(
                 f"point '{name}' left out: {len(known)} of its {len(mine)} images are in the map"
@@ -218,8 +218,3 @@ def lookup_images(names: list[str]) -> dict[str, int]:
         stems.setdefault(Path(name).stem, []).append(k)
     result = {stem: k[0] for stem, k in stems.items() if len(k) == 1}
     return result | {name: k for k, name in enumerate(names)}
-
-
-def known_image(image: str, lookup: dict[str, int]) -> str | None:
-    """The key of `lookup` under which an image is known, None where it is not."""
-    return next((key for key in (image, Path(image).stem) if key in lookup), None)

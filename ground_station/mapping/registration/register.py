@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
 from ground_station.geometry.camera import Camera
@@ -59,7 +58,8 @@ def by_observations(map_: Map, observations: PointObservations, seed: int) -> Re
             + (f" ({notes[0]})" if notes else "")
         )
     points = _known(found, observations, sigma_px(found))
-    plain, agree = robust_similarity(points.model, points.world, _noise(points), seed, "points")
+    noise = np.sqrt(np.trace(points.covariance, axis1=1, axis2=2))
+    plain, agree = robust_similarity(points.model, points.world, noise, seed, "points")
     adjusted, agree = adjust_agreeing(plain, points, agree)
     far = points.off_m(adjusted.fit)
     for point, good, off_m in zip(found, agree, far, strict=True):
@@ -97,10 +97,6 @@ def _known(
         world=np.array([point.world_m for point in found]),
         group=np.array([group[point.name] for point in found], np.int64),
     )
-
-
-def _noise(points: KnownPoints) -> F64:
-    return np.asarray(np.sqrt(np.trace(points.covariance, axis1=1, axis2=2)))
 
 
 def _reprojection_px(fit: Alignment, points: Sequence[Triangulated], camera: Camera) -> float:
