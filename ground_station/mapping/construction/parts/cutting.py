@@ -65,14 +65,20 @@ def overlapping(pairs: Mapping[Pair, int], images: int, most: int) -> list[Part]
 
 def inside(parts: Sequence[Part], pairs: Iterable[Pair], images: int) -> list[list[Pair]]:
     """The pairs of images that each part has both of, in their order."""
-    holders: list[set[int]] = [set() for _ in range(images)]
-    for number, part in enumerate(parts):
-        for k in part.images.tolist():
-            holders[k].add(number)
+    within = holders((part.images for part in parts), images)
     found: list[list[Pair]] = [[] for _ in parts]
     for i, j in pairs:
-        for number in holders[i] & holders[j]:
+        for number in within[i] & within[j]:
             found[number].append((i, j))
+    return found
+
+
+def holders(parts: Iterable[I64], images: int) -> list[set[int]]:
+    """Which of the parts, each some images by index, every image is in."""
+    found: list[set[int]] = [set() for _ in range(images)]
+    for number, part in enumerate(parts):
+        for k in part.tolist():
+            found[k].add(number)
     return found
 
 

@@ -177,10 +177,13 @@ def _spanned(parts: Sequence[Solved], edges: Sequence[Edge]) -> list[Alignment |
     return found
 
 
-def _similarity3(of: Alignment, unit: float) -> gtsam.Similarity3:
-    """In GTSAM's form, s (R x + t), of coordinates of the part in units of what it sees."""
+def _similarity3(of: Alignment, unit: float, target: float = 1.0) -> gtsam.Similarity3:
+    """In GTSAM's form, s (R x + t), of a part's coordinates in units of what it sees.
+
+    What it gives is in such units of a `target`, another part.
+    """
     return gtsam.Similarity3(
-        gtsam.Rot3(of.rotation), of.translation / of.scale / unit, of.scale * unit
+        gtsam.Rot3(of.rotation), of.translation / of.scale / unit, of.scale * unit / target
     )
 
 
@@ -207,13 +210,7 @@ def _adjusted(
     fixed = gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)
     graph.add(gtsam.PriorFactorSimilarity3(placed[0], values.atSimilarity3(placed[0]), fixed))
     for edge in edges:
-        of = edge.similarity
-        # From the source's unit to the target's.
-        measured = gtsam.Similarity3(
-            gtsam.Rot3(of.rotation),
-            of.translation / of.scale / depth[edge.source],
-            of.scale * depth[edge.source] / depth[edge.target],
-        )
+        measured = _similarity3(edge.similarity, depth[edge.source], depth[edge.target])
         graph.add(gtsam.BetweenFactorSimilarity3(edge.target, edge.source, measured, noise))
     best = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     result: list[Alignment | None] = [None] * len(start)

@@ -12,6 +12,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.map.model import Model
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.pairs import Pair
+from ground_station.mapping.construction.parts.cutting import holders
 from ground_station.mapping.construction.parts.solving import Solved
 from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.placing.placed import IN_PLACE_PX, Placed
@@ -57,7 +58,7 @@ def unite(
     edges = [np.stack([one[same], other[same]], axis=1)]
     holder = np.full(starts[-1], -1, dtype=np.int64)
     holder[seen] = point[first]
-    inside = _inside(parts, len(images.names))
+    inside = holders((part.index for part in parts), len(images.names))
     for (i, j), view in pairs.items():
         if row[i] >= 0 and row[j] >= 0 and not inside[i] & inside[j]:
             own = holder[starts[i] : starts[i + 1]], holder[starts[j] : starts[j + 1]]
@@ -107,15 +108,6 @@ def _poses(
                 best[k], wTc[k] = rank, moved[n]
     index = np.array(sorted(wTc), dtype=np.int64)
     return index, np.array([wTc[k] for k in index.tolist()])
-
-
-def _inside(parts: Sequence[Solved], images: int) -> list[set[int]]:
-    """Which parts each image is in."""
-    inside: list[set[int]] = [set() for _ in range(images)]
-    for number, part in enumerate(parts):
-        for k in part.index.tolist():
-            inside[k].add(number)
-    return inside
 
 
 def _in_place(

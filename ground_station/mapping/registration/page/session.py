@@ -22,7 +22,7 @@ from ground_station.mapping.registration import upright as vertical
 from ground_station.mapping.registration.distances import Distances
 from ground_station.mapping.registration.page.clusters import Offer, anchors_at, offer_at
 from ground_station.mapping.registration.page.proposal import shown, wall_picks
-from ground_station.mapping.registration.picks import Pick, Picks, check_picks
+from ground_station.mapping.registration.picks import Pick, Picks
 from ground_station.mapping.registration.plan import Plan, keep_plan
 from ground_station.mapping.registration.register import find_similarity, register_map
 from ground_station.mapping.registration.registration import Registration
@@ -218,7 +218,6 @@ class RegistrationSession:
         """Keeps the picks in the map's folder and registers the map by them."""
         with self._changing():
             picks = self._all()
-            check_picks(picks)
             find_similarity(self.map, picks=picks, distances=self._distances, seed=self._seed)
             files.write_picks(self.folder / files.FILE, picks)
             (self.folder / files.DRAFT).unlink(missing_ok=True)
