@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import MapError
-from ground_station.inspection.prediction import Prediction, Predictor
+from ground_station.inspection.prediction import NEEDED, Prediction, Predictor
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.store import Map
 
@@ -62,7 +62,7 @@ class LocalizabilityMap:
             "places": len(self.place),
             "cell_m": self.cell_m,
             "headings": len(self.heading_deg),
-            "needed_landmarks": p.needs.count,
+            "needed_landmarks": NEEDED,
             "share_lost": round(float(lost.mean()), 3) if lost.size else 1.0,
             "places_lost_in_every_heading": round(float(lost.all(axis=1).mean()), 3),
             "places_lost_in_some_heading": round(float(lost.any(axis=1).mean()), 3),

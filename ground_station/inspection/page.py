@@ -20,6 +20,7 @@ from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.inspection import tables
 from ground_station.inspection.localizability import LocalizabilityMap
+from ground_station.inspection.prediction import NEEDED
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.store import Map
 from ground_station.map.summary import describe, figures, sigma
@@ -173,7 +174,7 @@ def _figures(
             "origin": grid.tolist(),
             "cell": scale * found.cell_m,
             "heading_deg": found.heading_deg.tolist(),
-            "needed": found.prediction.needs.count,
+            "needed": NEEDED,
         },
         # Cividis was made to look the same with every kind of colour vision (Nuñez et al. 2018).
         "ramp": _ramp("cividis", 0.0, 1.0),

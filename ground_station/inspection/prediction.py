@@ -15,19 +15,9 @@ _LEAST_CHANCE = 0.02
 """Landmarks less likely than this are not projected."""
 _WEAK = 1e-6
 """Information that keeps a pose without landmarks invertible: 1,000 of its units."""
-
-
-@dataclass(frozen=True)
-class Needs:
-    """What the localizer's preset `default` asks for; a test holds the two together.
-
-    `sigma_px` of an observation; `count`, landmarks below which there is no keyframe to follow;
-    `most`, observations that are solved at once.
-    """
-
-    sigma_px: float = 2.0
-    count: int = 20
-    most: int = 400
+SIGMA_PX, NEEDED, MOST = 2.0, 20, 400
+"""As the localizer's preset `default` has them, to which a test holds them: an observation's
+deviation, landmarks below which there is no keyframe to follow, observations solved at once."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +31,17 @@ class Prediction:
     count: F64
     sigma_m: F64
     sigma_deg: F64
-    needs: Needs
 
     @property
     def lost(self) -> Bools:
         """Where fewer landmarks are expected than are followed; to be found again it takes more."""
-        return self.count < self.needs.count
+        return self.count < NEEDED
 
 
 class Predictor:
     """A map, asked from many places."""
 
-    def __init__(self, map_: Map, needs: Needs | None = None) -> None:
-        self.needs = needs or Needs()
+    def __init__(self, map_: Map) -> None:
         self._observations = Visibility(map_)
         self._view = View.of(map_)
         covariance = map_.landmarks.covariance_m2[self._observations.rows].astype(np.float64)
@@ -66,7 +54,7 @@ class Predictor:
         places, R = np.asarray(position_m, np.float64).reshape(-1, 3), np.asarray(wRc, np.float64)
         rows = [self._at(place, R) for place in places]
         table = np.array(rows).reshape(len(places), len(R), 3)
-        return Prediction(table[..., 0], table[..., 1], table[..., 2], self.needs)
+        return Prediction(table[..., 0], table[..., 1], table[..., 2])
 
     def _at(self, position_m: F64, wRc: F64) -> F64:
         """Count, position's and rotation's deviation of each rotation (H, 3, 3); (H, 3)."""
@@ -83,7 +71,7 @@ class Predictor:
         for h in range(len(wRc)):
             mine = rows[ends[h] : ends[h + 1]].reshape(-1, 6)
             information[h] = mine.T @ mine
-        solved = np.minimum(1.0, self.needs.most / np.maximum(count, 1e-9))
+        solved = np.minimum(1.0, MOST / np.maximum(count, 1e-9))
         information = information * solved[:, None, None] + _WEAK * np.eye(6)
         variance = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
         sigma = np.sqrt(np.maximum(variance, 0.0).reshape(-1, 2, 3).sum(axis=2))
@@ -105,7 +93,7 @@ class Predictor:
         # By the landmark in world axes, and then in its own deviations.
         a, b = (np.einsum("ni,nij->nj", np.einsum("ni,nji->nj", d, wRc), root) for d in (du, dv))
         flat = np.stack([X[:, 0] / z, X[:, 1] / z], axis=1)
-        square = (self.needs.sigma_px * camera.lens.stretch(flat)) ** 2
+        square = (SIGMA_PX * camera.lens.stretch(flat)) ** 2
         l11 = np.sqrt(np.einsum("ni,ni->n", a, a) + square)
         l21 = np.einsum("ni,ni->n", a, b) / l11
         l22 = np.sqrt(np.maximum(np.einsum("ni,ni->n", b, b) + square - l21**2, square))

@@ -14,7 +14,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.lens import Lens
 from ground_station.inspection.localizability import localizability
-from ground_station.inspection.prediction import Needs, Predictor
+from ground_station.inspection.prediction import MOST, NEEDED, SIGMA_PX, Predictor
 from ground_station.inspection.visibility import View, Visibility
 from ground_station.localization.settings import load_preset
 from ground_station.map.floorplan import FloorPlan
@@ -27,10 +27,10 @@ def rooms():
 
 
 def test_what_the_localizer_needs_is_what_its_preset_says():
-    preset, needs = load_preset("default"), Needs()
-    assert needs.sigma_px == preset.pose.sigma_px
-    assert needs.count == preset.tracking.keyframe_min_points
-    assert needs.most == preset.pose.max_observations
+    preset = load_preset("default")
+    assert preset.pose.sigma_px == SIGMA_PX
+    assert preset.tracking.keyframe_min_points == NEEDED
+    assert preset.pose.max_observations == MOST
 
 
 def test_the_image_ends_where_the_localizer_says():
@@ -83,7 +83,7 @@ def test_deviations_are_what_noise_does_to_a_pose():
         moved = position + sigma_m * rng.normal(size=position.shape)
         local = poses.transform(cTw, position)
         pixel = local[:, :2] / local[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
-        pixel += Needs().sigma_px * rng.normal(size=pixel.shape)
+        pixel += SIGMA_PX * rng.normal(size=pixel.shape)
         r, t = cv2.solvePnPRefineLM(moved, pixel, K, None, turn.copy(), shift.copy())
         T = poses.inverse(poses.pose(cv2.Rodrigues(r)[0], t[:, 0]))
         found.append((T[:3, 3] - truth[:3, 3], poses.log(poses.inverse(truth) @ T)[:3]))
