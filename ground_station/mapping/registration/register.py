@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -110,15 +110,17 @@ def _reprojection_px(fit: Alignment, points: Sequence[Triangulated], camera: Cam
     return rms(flat[np.isfinite(flat)]) if np.isfinite(flat).any() else float("inf")
 
 
+class Given(TypedDict, total=False):
+    """What a map may be registered by; of the first three one is used."""
+
+    observations: PointObservations | None
+    trajectory: Trajectory | None
+    picks: Picks | None
+    distances: Distances | None
+
+
 def register_map(
-    folder: str | Path,
-    *,
-    observations: PointObservations | None = None,
-    trajectory: Trajectory | None = None,
-    picks: Picks | None = None,
-    distances: Distances | None = None,
-    source: str = "",
-    seed: int = 0,
+    folder: str | Path, *, source: str = "", seed: int = 0, **given: Unpack[Given]
 ) -> tuple[store.Map, Registration]:
     """Takes a map on disk to world coordinates by observations of known points, a trajectory or
     picks.
@@ -131,14 +133,7 @@ def register_map(
     folder = Path(folder)
     map_ = store.load(folder)
     reconstruction = colmap.read(folder / "sparse")
-    found = find_similarity(
-        map_,
-        observations=observations,
-        trajectory=trajectory,
-        picks=picks,
-        distances=distances,
-        seed=seed,
-    )
+    found = find_similarity(map_, seed=seed, **given)
     fit = found.fit
     moved = transformed(map_, fit)
     # In coordinates that are not the world's, no place has an error.
@@ -154,21 +149,14 @@ def register_map(
     return moved, replace(found, report=report)
 
 
-def find_similarity(
-    map_: store.Map,
-    *,
-    observations: PointObservations | None = None,
-    trajectory: Trajectory | None = None,
-    picks: Picks | None = None,
-    distances: Distances | None = None,
-    seed: int = 0,
-) -> Registration:
+def find_similarity(map_: store.Map, *, seed: int = 0, **given: Unpack[Given]) -> Registration:
     """The similarity of what is given; changes nothing."""
-    if observations is not None:
+    distances = given.get("distances")
+    if (observations := given.get("observations")) is not None:
         found = by_observations(map_, observations, seed)
-    elif trajectory is not None:
+    elif (trajectory := given.get("trajectory")) is not None:
         found = by_trajectory(map_, trajectory, seed)
-    elif picks is not None:
+    elif (picks := given.get("picks")) is not None:
         found = by_picks(map_.landmarks, picks, seed)
     elif distances is not None:
         return by_distances(map_, distances)
