@@ -44,17 +44,6 @@ class Chosen:
         return len(self.landmark) / max(len(seen), 1)
 
 
-@dataclass(frozen=True)
-class _Observed:
-    """A flight's observations against a map: landmarks' indices, where they are in the frame's axes
-    (O, 3), undistorted pixels (O, 2), and which of them can be used (O,)."""
-
-    landmark: I64
-    points_c: F64
-    pixel_px: F64
-    usable: Bools
-
-
 def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings) -> Chosen:
     """The frames that are worth adding, in order of time.
 
@@ -64,7 +53,7 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
     observations do not fit the map from the pose they came with."""
     camera = map_.info.camera
     focal, centre = np.array([camera.fx_px, camera.fy_px]), [camera.cx_px, camera.cy_px]
-    observations = _against(seen, map_)
+    landmarks, points_c, pixel_px, usable = _against(seen, map_)
     twist = shutter.twists(seen.time_ns, seen.wTc, settings.twist_reach_s, settings.twist_gap_s)
     if seen.camera.readout_s == 0:
         twist[:] = 0.0
@@ -75,8 +64,8 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
     taken: list[tuple[int, I64, F64]] = []
     for k in range(len(seen)):
         rows = np.arange(seen.offset[k], seen.offset[k + 1])
-        rows = rows[observations.usable[rows]]
-        X = observations.points_c[rows]
+        rows = rows[usable[rows]]
+        X = points_c[rows]
         if len(rows) < settings.min_observations:
             left["few observations"] += 1
             continue
@@ -91,14 +80,14 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
         if not np.percentile(moved, 90) <= settings.max_shift_px:  # nor where it is NaN
             left["too fast"] += 1
             continue
-        pixel = observations.pixel_px[rows] - shift
+        pixel = pixel_px[rows] - shift
         off = np.linalg.norm(pixel - (X[:, :2] / X[:, 2:] * focal + centre), axis=1)
         if np.median(off) > settings.max_misfit_px:
             left["misfit"] += 1
             continue
         # A landmark that is there twice counts where it fits best.
         order = np.argsort(off, kind="stable")
-        landmark, first = np.unique(observations.landmark[rows[order]], return_index=True)
+        landmark, first = np.unique(landmarks[rows[order]], return_index=True)
         taken.append((k, landmark, pixel[order[first]]))
     frames = np.array([k for k, _, _ in taken], np.int64)
     return Chosen(
@@ -112,7 +101,10 @@ def choose_frames(seen: FlightObservations, map_: Map, settings: RefineSettings)
     )
 
 
-def _against(seen: FlightObservations, map_: Map) -> _Observed:
+def _against(seen: FlightObservations, map_: Map) -> tuple[I64, F64, F64, Bools]:
+    """A flight's observations against a map: landmarks' indices (O,), where they are in the frame's
+    axes (O, 3), undistorted pixels (O, 2), and which of them can be used (O,).
+    """
     camera, lm = map_.info.camera, map_.landmarks
     order = np.argsort(lm.id)
     place = np.searchsorted(lm.id[order], seen.landmark)
@@ -122,7 +114,7 @@ def _against(seen: FlightObservations, map_: Map) -> _Observed:
         frame = np.repeat(np.arange(len(seen)), np.diff(seen.offset))
         X = shutter.in_cameras(seen.wTc[frame], lm.position_m[landmark])
     usable &= (lm.id[landmark] == seen.landmark) & np.isfinite(X).all(axis=1) & (X[:, 2] > 0)
-    return _Observed(landmark, X, pixel_px, usable)
+    return landmark, X, pixel_px, usable
 
 
 def by_lens(pixel_px: F32, camera: Camera, of_map: Camera) -> tuple[F64, Bools]:
