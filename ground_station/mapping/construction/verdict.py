@@ -29,15 +29,15 @@ def verdict(map_: Map) -> Verdict:
     """Judges a map by what its build has written into `info.built`; what it lacks is not said.
 
     Of `built` are read: `images`, `registered`, `model_sizes`, `reprojection_px`, `observations`,
-    `dropped`, and where they are there `left_out` (a reason for each image's name), `parts` (the
-    names of each model's images, the largest first), `doubts` (sentences), `noise_px` and `lens`
-    (`said`, a sentence).
+    and where they are there `left_out` (a reason for each image's name), `parts` (the names of
+    each model's images, the largest first), `doubts` (sentences), `noise_px` and `lens` (`said`, a
+    sentence).
     """
     built, names = map_.info.built, map_.keyframes.names
     images, registered = int(built.get("images", len(names))), len(names)
     parts = [list(part) for part in built.get("parts", [])][1:]
     doubts = [str(doubt) for doubt in built.get("doubts", [])]
-    reasons = _left_out(built)
+    reasons: dict[str, str] = built.get("left_out", {})
     apart = {name for part in parts for name in part} - set(names)
     word, first = _first(images, registered, _other_sizes(built), doubts)
     every = sorted({*names, *reasons, *apart})
@@ -109,12 +109,6 @@ def _other_sizes(built: Mapping[str, Any]) -> list[int]:
     """How many images each of the other parts has."""
     sizes = [len(part) for part in built.get("parts", [])][1:]
     return sizes or [int(n) for n in built.get("model_sizes", [])][1:]
-
-
-def _left_out(built: Mapping[str, Any]) -> dict[str, str]:
-    """A reason for each image's name that was left out."""
-    dropped = dict.fromkeys(map(str, built.get("dropped", [])), "far off their neighbours")
-    return dropped | {str(name): str(why) for name, why in built.get("left_out", {}).items()}
 
 
 def _left_out_lines(reasons: Mapping[str, str], every: Sequence[str]) -> list[str]:
