@@ -218,7 +218,7 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
     """
     check_picks(picks)
     row = {int(number): k for k, number in enumerate(landmarks.id.tolist())}
-    now: list[Pick] = []
+    middle: list[F64] = []
     scatter: list[F64] = []
     for pick in picks.picks:
         rows = [row[i] for i in pick.landmarks.tolist() if i in row]
@@ -228,12 +228,12 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
                 "made in another one"
             )
         found = landmarks.position_m[rows]
-        now.append(replace(pick, place=found.mean(axis=0), offset=np.zeros(3)))
+        middle.append(found.mean(axis=0))
         scatter.append(
             np.cov(found.T, bias=True) / len(rows) if len(rows) > 1 else np.zeros((3, 3))
         )
     before = np.array([pick.place - pick.offset for pick in picks.picks])
-    after = np.array([pick.place for pick in now])
+    after = np.array(middle)
     try:
         went = align(before, after, True)
     except GeometryError:
@@ -241,15 +241,15 @@ def at_present(picks: Picks, landmarks: Landmarks) -> Picks:
     off = np.linalg.norm(went.apply(before) - after, axis=1)
     extent = float(np.linalg.norm(np.ptp(after, axis=0)))
     if not off.max() <= _SAME_MAP * extent:
-        worst = now[int(np.argmax(off))].name
+        worst = picks.picks[int(np.argmax(off))].name
         raise MapError(
             f"registration: pick '{worst}' is {100 * off.max() / extent:.1f} % of the picks' extent"
             f" off where it was made; allowed: {100 * _SAME_MAP:g} %: it was another map"
         )
     moved = [went.scale * went.rotation @ pick.offset for pick in picks.picks]
     now = [
-        replace(pick, place=pick.place + offset, offset=offset)
-        for pick, offset in zip(now, moved, strict=True)
+        replace(pick, place=place + offset, offset=offset)
+        for pick, place, offset in zip(picks.picks, middle, moved, strict=True)
     ]
     up = picks.upright
     direction = went.rotation @ up.direction

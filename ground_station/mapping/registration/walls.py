@@ -116,9 +116,9 @@ def fit_walls(flat: F64, cameras: F64, picked: F64, picked_px: F64, plan: Plan) 
         raise MapError(f"{len(picked)} picks; two or more, far apart, are where the fit begins")
     if len(flat) < _FEWEST:
         raise MapError(f"{len(flat)} landmarks at these heights; at least {_FEWEST} are needed")
-    z = _thinned(flat)
+    some = flat[:: max(1, len(flat) // _LANDMARKS)]
     # The plan's v grows downwards, so the top view is conjugated: a similarity keeps its hand.
-    z, zp, wp = z.conj(), _complex(picked).conj(), _complex(picked_px)
+    z, zp, wp = _complex(some).conj(), _complex(picked).conj(), _complex(picked_px)
     a, b = _similarity(zp, wp)
     field = _Field(plan.image, a * _complex(cameras).conj() + b)
     i, j = np.unravel_index(np.argmax(np.abs(zp[:, None] - zp[None])), (len(zp), len(zp)))
@@ -259,10 +259,6 @@ def _similarity(z: C128, w: C128) -> tuple[complex, complex]:
         raise MapError("the picks are in one place: two, far apart, are where the fit begins")
     a = complex(np.vdot(dz, dw) / squares)
     return a, complex(w.mean() - a * z.mean())
-
-
-def _thinned(flat: F64) -> C128:
-    return _complex(flat[:: max(1, len(flat) // _LANDMARKS)])
 
 
 def _complex(places: F64) -> C128:

@@ -386,15 +386,12 @@ class RegistrationSession:
     def _shown_pending(self) -> dict[str, Any] | None:
         if self._pending is None:
             return None
-        pick = self._pending.pick
-        said: dict[str, Any] = {"name": printable(self._pending.name, 40), "map": None}
-        said["offer"] = None
-        if self._pending.offer is not None:
-            offer = self._pending.offer
-            said["offer"] = {"what": offer.what, "map": offer.place.tolist()}
-        if pick is not None:
-            said["map"] = self._turned(pick.place[None])[0].tolist()
-        return said
+        pick, offer = self._pending.pick, self._pending.offer
+        return {
+            "name": printable(self._pending.name, 40),
+            "map": self._turned(pick.place[None])[0].tolist() if pick else None,
+            "offer": {"what": offer.what, "map": offer.place.tolist()} if offer else None,
+        }
 
 
 def _order(pick: Pick) -> tuple[int, str]:
