@@ -78,18 +78,15 @@ def _only_camera(
 ) -> Camera:
     """Also that of a model that repeats it for every image."""
     used = sorted({image.camera_id for image in images})
-    cameras = [_told(model.cameras[number]) for number in used]
-    for number, camera in zip(used, cameras, strict=True):
-        if camera != cameras[0]:
+    cameras = [model.cameras[number] for number in used]
+    told = [(each.model, each.width, each.height, *each.params) for each in cameras]
+    for number, one in zip(used, told, strict=True):
+        if one != told[0]:
             raise MapError(
                 f"{folder}: the model's images are of {len(used)} cameras ({used[0]} and {number} "
                 "differ); a map is of one: let COLMAP take one camera for all images"
             )
     try:
-        return camera_of(model.cameras[used[0]])
+        return camera_of(cameras[0])
     except (CameraError, ConfigError) as error:
         raise MapError(f"{folder}: camera {used[0]}: {error}") from None
-
-
-def _told(camera: pycolmap.Camera) -> tuple[object, ...]:
-    return camera.model, camera.width, camera.height, *camera.params

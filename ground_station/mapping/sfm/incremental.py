@@ -114,7 +114,8 @@ class Incremental:
         if (self._work / _DONE).exists() and models:
             return models
         while len(models) < self._options.max_num_models:
-            if models and self._total(models) >= self._cache.num_images() - 1:
+            placed = {image_id for model in models for image_id in model.reg_image_ids()}
+            if models and len(placed) >= self._cache.num_images() - 1:
                 break
             start = starts[len(models)] if len(models) < len(starts) else None
             found = self._next_model(models, level, start)
@@ -166,10 +167,6 @@ class Incremental:
     def _count(self, model: colmap.Reconstruction) -> None:
         for _ in range(model.num_reg_images()):
             self._on_image()
-
-    @staticmethod
-    def _total(models: Sequence[colmap.Reconstruction]) -> int:
-        return len({image_id for model in models for image_id in model.reg_image_ids()})
 
     def _mapper(self, models: Sequence[colmap.Reconstruction]) -> pycolmap.IncrementalMapper:
         """A mapper that knows which images are in finished models."""
