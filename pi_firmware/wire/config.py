@@ -207,29 +207,3 @@ def _check(value: Any, kind: Any, meta: Mapping[str, Any], what: str) -> Any:
 def _kind_name(kind: Any) -> str:
     names = {float: "a number", int: "a whole number", str: "a string", bool: "true or false"}
     return names.get(kind, str(kind))
-
-
-def differences(path: str | Path, cls: type) -> list[str]:
-    """What a shipped TOML file says otherwise than the dataclass `cls`, one line each.
-
-    A shipped file is documentation and default in one: it must load, hold every key (but those
-    whose default is None, which TOML cannot say), and give each its default.
-    """
-    return _differences(read(path), load(path, cls), cls, "")
-
-
-def _differences(document: Mapping[str, Any], loaded: Any, cls: type, prefix: str) -> list[str]:
-    lines: list[str] = []
-    for field in dataclasses.fields(typing.cast(Any, cls)):
-        full, value = prefix + field.name, getattr(loaded, field.name)
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        if field.name not in document:
-            if default is not None:
-                lines.append(f"'{full}' is not in the file (default: {shown(default)})")
-        elif dataclasses.is_dataclass(value):
-            lines += _differences(document[field.name], value, type(value), full + ".")
-        elif default is not dataclasses.MISSING and value != default:
-            lines.append(f"'{full}' is {shown(value)} in the file; default: {shown(default)}")
-    return lines

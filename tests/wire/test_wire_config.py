@@ -38,19 +38,6 @@ class Strict:
             raise ValueError("count must be 0 when name is 'none'")
 
 
-FILE = """\
-rate_hz = 30.0            # Hz, 1 to 120
-encoder = "x264"          # x264 or v4l2
-gate = true
-offsets_m = [0.0, 1.5]    # m
-words = []
-
-[radio]
-port = 5600
-host = "127.0.0.1"
-"""
-
-
 def load(tmp_path: Path, text: str, cls: type = Settings) -> object:
     path = tmp_path / "c.toml"
     path.write_text(text)
@@ -157,35 +144,6 @@ def test_text_with_many_dots_is_no_deep_key(tmp_path: Path) -> None:
 def test_defaults_that_are_lists_are_not_shared() -> None:
     Settings().offsets_m.append(9.0)
     assert Settings().offsets_m == [0.0, 1.5]
-
-
-def test_a_shipped_file_that_says_all_defaults_has_no_differences(tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(FILE)
-    assert config.differences(tmp_path / "c.toml", Settings) == []
-
-
-def test_a_shipped_file_is_held_against_its_defaults(tmp_path: Path) -> None:
-    text = FILE.replace("rate_hz = 30.0", "rate_hz = 25.0").replace("port = 5600\n", "")
-    text = text.replace("words = []", "").replace("1.5]", "2.5]")
-    (tmp_path / "c.toml").write_text(text)
-    assert config.differences(tmp_path / "c.toml", Settings) == [
-        "'rate_hz' is 25.0 in the file; default: 30.0",
-        "'offsets_m' is [0.0, 2.5] in the file; default: [0.0, 1.5]",
-        "'words' is not in the file (default: [])",
-        "'radio.port' is not in the file (default: 5600)",
-    ]
-
-
-def test_a_shipped_file_without_a_table_lacks_it(tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(FILE[: FILE.index("[radio]")])
-    (line,) = config.differences(tmp_path / "c.toml", Settings)
-    assert line.startswith("'radio' is not in the file")
-
-
-def test_a_shipped_file_with_an_unknown_key_does_not_load(tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(FILE + "colour = 1\n")
-    with pytest.raises(ConfigError, match=r"radio\.colour"):
-        config.differences(tmp_path / "c.toml", Settings)
 
 
 def test_an_override_of_somebody_elses_document_takes_values_and_text() -> None:

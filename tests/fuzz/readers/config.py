@@ -5,7 +5,7 @@ from __future__ import annotations
 from pieces import Picker, refusing, scratch, stretch
 
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.mapping.settings import MappingSettings, load_settings
+from ground_station.mapping.settings import load_settings
 from ground_station.service import settings as station
 from pi_firmware import settings as payload
 from pi_firmware.wire import config
@@ -17,7 +17,6 @@ _LOADS = (
     lambda: station.load(_FILE),
     lambda: load_settings(_FILE),
     lambda: config.load(_FILE, LocalizerSettings),
-    lambda: config.differences(_FILE, MappingSettings),
     lambda: payload.load(_FILE, ["encoder.bitrate_kbps=800"]),
 )
 _KEYS = (
