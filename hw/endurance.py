@@ -18,6 +18,7 @@ from hw.quantities import checked
 from pi_firmware.battery.cell import Cell
 
 MODES = ("idle", "stream", "peak")
+_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def fly(build: Build, mode: str = "stream", wear: Wear | None = None) -> Enduran
 
 def drain(
     part: Part, boost: Part, behind_W: float, beside_W: float, series_ohm: float, wear: Wear,
-    mode: str = "stream", steps: int = 400,
+    mode: str = "stream",
 ) -> Endurance:  # fmt: skip
     """One cell under a constant power behind a boost converter.
 
@@ -99,7 +100,7 @@ def drain(
     capacity_ah = part.capacity_mAh / 1000 * wear.health_percent / 100
     cell = Cell(capacity_ah, temperature_c=wear.temperature_C)
     reserve = wear.reserve_percent / 100
-    charge = np.linspace(1.0, reserve, steps + 1)
+    charge = np.linspace(1.0, reserve, _STEPS + 1)
     rest = np.asarray(cell.rest_v(charge), float)
     ohms = np.asarray(cell.total_ohm(charge), float) + series_ohm
     volts = rest.copy()
@@ -118,7 +119,7 @@ def drain(
                          float(volts[0]), rating, float(amperes[0]) / part.capacity_mAh * 1000,
                          "none")  # fmt: skip
     mean = (amperes[: count - 1] + amperes[1:count]) / 2
-    step_ah = capacity_ah * (1 - reserve) / steps
+    step_ah = capacity_ah * (1 - reserve) / _STEPS
     minutes = 60 * float(np.sum(step_ah / mean)) if count > 1 else 0.0
     end = float(amperes[count - 1])
     verdict = "refuse" if end > rating else "warn" if end > 0.8 * rating else "ok"

@@ -54,13 +54,11 @@ class Capture:
         decided: Decided,
         leave: Leave,
         announce: Callable[[str, str], None],
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = Counters()
         self.restarts = Restarts()
         self._settings = settings
         self._decided, self._leave, self._announce = decided, leave, announce
-        self._clock = clock
         self._gst = gstreamer.load()
         self._ceiling_kbps: int | None = None
         self._bitrate_kbps: int | None = None
@@ -107,7 +105,7 @@ class Capture:
     def start(self) -> None:
         """Begins to deliver; raises `BlimpError` with one line."""
         assert self._media is not None and self._source is not None
-        self._started_s = self._clock()
+        self._started_s = time.monotonic()
         self._media.play()
         self._source.start()
 
@@ -122,7 +120,7 @@ class Capture:
             time.sleep(_POLL_NS / 1e9)
             if self._ending:
                 return False
-            if self._clock() >= self._due_s:
+            if time.monotonic() >= self._due_s:
                 self._reopen()
             return True
         media, source = self._media, self._source
@@ -239,7 +237,7 @@ class Capture:
 
     def _go_back(self, settings: Settings) -> None:
         self._settings, self._trusted = settings, None
-        self._due_s = self._clock()
+        self._due_s = time.monotonic()
 
     def _open(self) -> None:
         source = open_source(self._settings.camera)
@@ -277,7 +275,7 @@ class Capture:
 
     def _watch(self, media: Media) -> None:
         """Restarts what has not delivered for too long."""
-        now_s = self._clock()
+        now_s = time.monotonic()
         limit_s = self._settings.supervision.frame_timeout_s
         frame_s = 1.5 / self._settings.camera.rate_hz
         if media.encoded and media.alive and self._in_a_row:
@@ -306,7 +304,7 @@ class Capture:
         self._in_a_row += 1
         setattr(self.restarts, what, getattr(self.restarts, what) + 1)
         pause_s = 0.0 if self._in_a_row == 1 else min(0.25 * 2**self._in_a_row, _LONGEST_PAUSE_S)
-        self._due_s = self._clock() + pause_s
+        self._due_s = time.monotonic() + pause_s
         self._announce(_STARTED_ANEW[what], str(error))
 
 

@@ -13,7 +13,7 @@ from pi_firmware.capture import Capture
 from pi_firmware.ground import IDR_GAP_S, Ground
 from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi, memory
 from pi_firmware.recording import Recorder
-from pi_firmware.release import Release, of_environment
+from pi_firmware.release import of_environment
 from pi_firmware.settings import Settings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire.clock_offset import OffsetFilter
@@ -60,13 +60,11 @@ class Supervision:
         self,
         settings: Settings,
         announce: Callable[[str, str], None],
-        notifier: Notifier | None = None,
-        release: Release | None = None,
     ) -> None:
         self.table = Table(tasks(settings))
-        self.notifier = notifier or Notifier()
+        self.notifier = Notifier()
         self.wifi = Wifi(settings.wifi, announce)
-        self.release = release or of_environment()
+        self.release = of_environment()
         self._settings = settings
         self._restarts = Restarts(settings.supervision.state, settings.supervision.process_restarts)
         folder = settings.recording.folder

@@ -8,7 +8,6 @@ import os
 import pwd
 import stat
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +32,7 @@ class WifiOptions:
     none: bool = False
 
 
-def read_wifi(options: WifiOptions, ask: Callable[[str], str] | None = None) -> Wifi | None:
+def read_wifi(options: WifiOptions) -> Wifi | None:
     """The network asked for; None without one. Raises `DeployError` with one line.
 
     The password is asked for on the terminal where no file holds it: on a command line every user
@@ -62,7 +61,7 @@ def read_wifi(options: WifiOptions, ask: Callable[[str], str] | None = None) -> 
     elif security == OPEN:
         password = ""
     else:
-        password = (ask or _ask)(options.ssid)
+        password = _ask(options.ssid)
     return dataclasses.replace(network, password=password)
 
 
@@ -99,17 +98,17 @@ def merge(
     )
 
 
-def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+def read_file(path: Path) -> bytes:
     """A small regular file's bytes; raises `DeployError` with one line."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise DeployError(f"{path}: not a file")
-            data = file.read(limit + 1)
+            data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise DeployError(f"{path}: {error.strerror or error}") from None
-    if len(data) > limit:
-        raise DeployError(f"{path}: more than {limit} bytes")
+    if len(data) > MAX_FILE_BYTES:
+        raise DeployError(f"{path}: more than {MAX_FILE_BYTES} bytes")
     return data
 
 

@@ -35,6 +35,8 @@ VIDEO_TOPIC = "/camera/video"
 CALIBRATION_TOPIC = "/camera/calibration"
 TRUTH_TOPIC = "/truth/pose"
 ESTIMATE_TOPIC = "/estimate/pose"
+_CAMERA_FRAME = "camera"
+_ANY_OBJECT = b'{"type": "object"}'
 FRAME_INFO_TOPIC = "/camera/frame"
 """JSON, one a frame: `sequence`, `exposure_s`, `gain`."""
 
@@ -83,7 +85,6 @@ class RecordingWriter:
         path: str | Path,
         *,
         chunk_bytes: int = 256 * 1024,
-        profile: str = "",
         open_file: Callable[[Path], IO[bytes]] | None = None,
     ) -> None:
         self.path = Path(path)
@@ -99,7 +100,7 @@ class RecordingWriter:
             use_summary_offsets=False,  # it tells of groups that it has not
         )
         with self._disk():
-            self._writer.start(profile=profile, library="blimp")
+            self._writer.start(library="blimp")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -132,14 +133,13 @@ class RecordingWriter:
         data: bytes,
         *,
         topic: str = VIDEO_TOPIC,
-        frame_id: str = "camera",
         log_ns: int | None = None,
     ) -> None:
         """Adds one H.264 access unit in Annex B form.
 
         `log_ns` is the log time where that is another clock's, as in a file of several cameras.
         """
-        message = CompressedVideo(frame_id=frame_id, data=data, format="h264")
+        message = CompressedVideo(frame_id=_CAMERA_FRAME, data=data, format="h264")
         message.timestamp.FromNanoseconds(time_ns)
         self.write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
@@ -153,7 +153,6 @@ class RecordingWriter:
         distortion: Sequence[float],
         distortion_model: str = "plumb_bob",
         topic: str = CALIBRATION_TOPIC,
-        frame_id: str = "camera",
     ) -> None:
         """Adds the camera: `matrix` is K row by row (9), `distortion` k1, k2, p1, p2, k3.
 
@@ -161,7 +160,7 @@ class RecordingWriter:
         """
         k = [float(value) for value in matrix]
         message = CameraCalibration(
-            frame_id=frame_id,
+            frame_id=_CAMERA_FRAME,
             width=width_px,
             height=height_px,
             distortion_model=distortion_model,
@@ -192,42 +191,21 @@ class RecordingWriter:
         self.write_protobuf(topic, time_ns if log_ns is None else log_ns, message)
 
     def write_json(
-        self,
-        topic: str,
-        time_ns: int,
-        message: Mapping[str, Any],
-        *,
-        schema_name: str,
-        schema: Mapping[str, Any] | None = None,
+        self, topic: str, time_ns: int, message: Mapping[str, Any], *, schema_name: str
     ) -> None:
-        """Adds a JSON object; `schema` is its JSON schema (any object when not given).
-
-        Raises `RecordingError` for what JSON cannot say, such as NaN.
-        """
+        """Adds a JSON object; raises `RecordingError` for what JSON cannot say, such as NaN."""
         try:
             payload = json.dumps(message, separators=(",", ":"), allow_nan=False).encode()
         except (TypeError, ValueError) as error:
             raise RecordingError(
                 f"{self.path}: a message on {topic} is not JSON: {error}"
             ) from None
-        self.write_json_text(topic, time_ns, payload, schema_name=schema_name, schema=schema)
+        self.write_json_text(topic, time_ns, payload, schema_name=schema_name)
 
-    def write_json_text(
-        self,
-        topic: str,
-        time_ns: int,
-        text: bytes,
-        *,
-        schema_name: str,
-        schema: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Adds a JSON object that is text already, as telemetry's messages are; it is not parsed.
-
-        `schema` is its JSON schema (any object when not given).
-        """
+    def write_json_text(self, topic: str, time_ns: int, text: bytes, *, schema_name: str) -> None:
+        """Adds a JSON object that is text already, as telemetry's are; it is not parsed."""
         if topic not in self._channels:
-            description = json.dumps(schema or {"type": "object"}).encode()
-            schema_id = self._schema(schema_name, "jsonschema", description)
+            schema_id = self._schema(schema_name, "jsonschema", _ANY_OBJECT)
             self._channels[topic] = self._writer.register_channel(topic, "json", schema_id)
         self._add(topic, time_ns, text)
 
