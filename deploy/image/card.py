@@ -24,7 +24,6 @@ from deploy.image.sparse import sha256
 from deploy.image.tree import Tree
 from deploy.run import run
 
-NAMES = ("boot", "root", "data")
 ROOT_LABEL, DATA_LABEL = "blimp-root", "blimp-data"
 DESCRIPTIONS = (".bmap", ".manifest.json", ".sha256")
 Say = Callable[[str], None]
@@ -133,29 +132,19 @@ def _build(
     size = align(ext4.bytes_needed(tree))
     ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
     say("boot and data partition, image, block map and checksums")
-    digest = finish(image, board, front, place, new, epoch)
-    manifest.write(
-        image,
-        beside(image, ".manifest.json"),
-        digest=digest,
-        board=board,
-        checkout=checkout,
-        epoch=epoch,
-        packages=manifest.packages_of(tree),
-        site=given.site,
-        names=NAMES,
-        units=units,
-    )
+    told = manifest.Told(board, checkout, epoch, manifest.packages_of(tree), given.site, units)
+    finish(image, front, place, new, told)
 
 
 def finish(
-    image: Path, board: str, front: Tree, root_place: Path, new: Identifiers, epoch: int
-) -> str:
+    image: Path, front: Tree, root_place: Path, new: Identifiers, told: manifest.Told
+) -> None:
     """Puts an image together from a boot partition's files and a root partition's file system.
 
-    Adds the data partition, empty: the card makes its folders and grows it. Writes block map and
-    checksum, too. Returns the image's SHA-256.
+    Adds the data partition, empty: the card makes its folders and grows it. Writes block map,
+    checksum and manifest, too.
     """
+    board, epoch = told.board, told.epoch
     boot_place, data_place = image.with_name("boot"), image.with_name("data")
     size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
     fat.make(boot_place, size, front, boot.LABEL, new.number("boot"), epoch)
@@ -172,7 +161,7 @@ def finish(
     run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
     digest = sha256(image)
     beside(image, ".sha256").write_text(f"{digest}  {image.name}\n")
-    return digest
+    manifest.write(image, beside(image, ".manifest.json"), digest, told)
 
 
 def check_epoch(epoch: int) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from deploy.image.tree import Tree
 from deploy.run import run
 
 SCHEMA = "blimp.image/1"
+_PARTITIONS = ("boot", "root", "data")
 _NUMBER = re.compile(r"\d\.\d")
 
 # The tools whose work is in the bytes, and how each says its version.
@@ -30,57 +32,53 @@ _TOOLS = {
 }
 
 
-def write(
-    image: Path,
-    to: Path,
-    *,
-    digest: str,
-    board: str,
-    checkout: Path,
-    epoch: int,
-    packages: Sequence[tuple[str, str, str]],
-    site: Path | None,
-    names: Sequence[str],
-    units: Sequence[str],
-    base: Path | None = None,
-) -> None:
-    """Writes an image's manifest.
+@dataclass(frozen=True)
+class Told:
+    """What an image does not tell by itself.
 
-    Args:
-        image: finished.
-        to: the manifest's file.
-        digest: the image's SHA-256 in hex.
+    Attributes:
         board, checkout, epoch: what it was made for, of and at.
         packages: name, version, architecture of what is installed.
         site: the unpacked wheels.
-        names: of the partitions, in order.
         units: that are enabled.
         base: the image that it was made from, if any.
     """
+
+    board: str
+    checkout: Path
+    epoch: int
+    packages: Sequence[tuple[str, str, str]]
+    site: Path | None
+    units: Sequence[str]
+    base: Path | None = None
+
+
+def write(image: Path, to: Path, digest: str, told: Told) -> None:
+    """Writes the manifest of a finished image, whose SHA-256 in hex is `digest`."""
     partitions = []
-    for name, part in zip(names, table(image), strict=True):
+    for name, part in zip(_PARTITIONS, table(image), strict=True):
         span = Range(part["start"], part["start"] + part["size"])
         partitions.append({"name": name, **part, "sha256": sha256(image, span)})
     document: dict[str, Any] = {
         "schema": SCHEMA,
-        "board": board,
-        "version": git.version(checkout),
-        "revision": git.revision(checkout),
-        "epoch": epoch,
-        "made": utc(epoch),
+        "board": told.board,
+        "version": git.version(told.checkout),
+        "revision": git.revision(told.checkout),
+        "epoch": told.epoch,
+        "made": utc(told.epoch),
         "image": {"size": image.stat().st_size, "sha256": digest},
         "partitions": partitions,
-        "units": list(units),
+        "units": list(told.units),
         "packages": [
             {"name": name, "version": version, "architecture": architecture}
-            for name, version, architecture in packages
+            for name, version, architecture in told.packages
         ],
-        "wheels": wheels(site),
-        "wheels_sha256": _all_files(site),
+        "wheels": wheels(told.site),
+        "wheels_sha256": _all_files(told.site),
         "tools": {name: _version(words) for name, words in _TOOLS.items()},
     }
-    if base is not None:
-        document["base"] = {"name": base.name, "sha256": sha256(base)}
+    if told.base is not None:
+        document["base"] = {"name": told.base.name, "sha256": sha256(told.base)}
     to.write_text(json.dumps(document, indent=2) + "\n")
 
 

@@ -27,7 +27,7 @@ from deploy.image import (
     release,
     root,
 )
-from deploy.image.card import Identifiers, beside, building
+from deploy.image.card import Identifiers, building
 from deploy.image.packages import add_packages, layer
 from deploy.image.packages.board import Board
 from deploy.image.partitions import FAT32_LBA, LINUX
@@ -108,21 +108,8 @@ def build(
         files = _boot_files(base, boot_place, work / "base-files")
         front = boot.contents(board.name, _KERNEL, board.machine, files, first, where)
         say("boot and data partition, image, block map and checksums")
-        whole = work / image.name
-        digest = card.finish(whole, board.name, front, root_place, new, epoch)
-        manifest.write(
-            work / image.name,
-            beside(work / image.name, ".manifest.json"),
-            digest=digest,
-            board=board.name,
-            checkout=checkout,
-            epoch=epoch,
-            packages=packages,
-            site=site,
-            names=card.NAMES,
-            units=units,
-            base=base,
-        )
+        told = manifest.Told(board.name, checkout, epoch, packages, site, units, base)
+        card.finish(work / image.name, front, root_place, new, told)
 
 
 def _take_apart(base: Path, work: Path, boot_place: Path, root_place: Path) -> None:
