@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import lzma
+from collections.abc import Callable
 from pathlib import Path
 
 from deploy.errors import DeployError
@@ -53,55 +54,72 @@ def build(tree: Tree, release: str) -> bytes:
     return gzip.compress(cpio.pack(root), 9, mtime=0)
 
 
+class Modules:
+    """A kernel's modules by depmod's tables; `-` and `_` are the same in a name.
+
+    `paths` are by name, `needs` by path, the nearest first; `before` and `after` what a module's
+    softdep asks for, in names that may be aliases. `lines` gives those of a table, by its name.
+    """
+
+    def __init__(self, lines: Callable[[str], list[str]]) -> None:
+        self.paths: dict[str, str] = {}
+        self.needs: dict[str, list[str]] = {}
+        for line in lines("modules.dep"):
+            path, _, others = line.partition(":")
+            self.paths[name_of(path)] = path
+            self.needs[path] = others.split()
+        self.builtin = {name_of(line) for line in lines("modules.builtin")}
+        self._aliases: dict[str, list[str]] = {}
+        for line in lines("modules.alias"):
+            if len(words := line.split()) == 3 and words[0] == "alias":
+                self._aliases.setdefault(name_of(words[1]), []).append(name_of(words[2]))
+        self.before: dict[str, list[str]] = {}
+        self.after: dict[str, list[str]] = {}
+        for line in lines("modules.softdep"):
+            asked, words = self.before, line.split()
+            for word in words[2:] if words[:1] == ["softdep"] else ():
+                if word in ("pre:", "post:"):
+                    asked = self.before if word == "pre:" else self.after
+                else:
+                    asked.setdefault(name_of(words[1]), []).append(name_of(word))
+
+    def behind(self, asked: str) -> list[str]:
+        """Paths of what stands behind a name: its own, then those that it is an alias of."""
+        names = [asked, *reversed(self._aliases.get(asked, []))]
+        return [self.paths[name] for name in names if name in self.paths]
+
+
 def load_order(tree: Tree, release: str) -> list[str]:
     """The modules' paths in the tree, each after those that it depends on."""
     base = f"usr/lib/modules/{release}"
-    needs: dict[str, list[str]] = {}
-    for line in tree.read(f"{base}/modules.dep").decode().splitlines():
-        path, _, others = line.partition(":")
-        needs[path] = others.split()
-    paths = {_name(path): path for path in needs}
-    builtin = {_name(line) for line in _lines(tree, f"{base}/modules.builtin")}
-    soft: dict[str, list[str]] = {}
-    for line in _lines(tree, f"{base}/modules.softdep"):
-        words = line.split()
-        if words[:1] == ["softdep"] and "pre:" in words:
-            after = words[words.index("pre:") + 1 :]
-            stop = after.index("post:") if "post:" in after else len(after)
-            soft[_name(words[1])] = after[:stop]
-    aliases = {
-        words[1]: words[2]
-        for words in (line.split() for line in _lines(tree, f"{base}/modules.alias"))
-        if len(words) == 3
-    }
+    modules = Modules(lambda table: _lines(tree, f"{base}/{table}"))
     order: list[str] = []
 
     def take(path: str) -> None:
         if path in order:
             return
-        for name in soft.get(_name(path), []):
-            other = paths.get(_name(name)) or paths.get(_name(aliases.get(name, "")))
+        for name in modules.before.get(name_of(path), []):
             # ext4 asks for its checksum by what that does and not by the module's name.
-            stem = _name(name).removeprefix("crypto_")
-            if other is not None:
-                take(other)
-            elif not any(stem in known for known in builtin):
-                raise DeployError(f"/{base}: no {name}, which {_name(path)} asks for")
-        # depmod lists the nearest first.
-        for other in reversed(needs[path]):
+            stem = name.removeprefix("crypto_")
+            if behind := modules.behind(name):
+                take(behind[0])
+            elif not any(stem in known for known in modules.builtin):
+                raise DeployError(f"/{base}: no {name}, which {name_of(path)} asks for")
+        for other in reversed(modules.needs[path]):
             take(other)
         if path not in order:
             order.append(path)
 
     for name in (*_WELCOME, *_NEEDED):
-        if _name(name) in paths:
-            take(paths[_name(name)])
-        elif name in _NEEDED and _name(name) not in builtin:
+        if name_of(name) in modules.paths:
+            take(modules.paths[name_of(name)])
+        elif name in _NEEDED and name_of(name) not in modules.builtin:
             raise DeployError(f"/{base}: no {name}, neither as a module nor built in")
     return [f"{base}/{path}" for path in order]
 
 
-def _name(path: str) -> str:
+def name_of(path: str) -> str:
+    """A module's name, from its path or another writing of it."""
     return path.rpartition("/")[2].partition(".ko")[0].replace("-", "_")
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
+from deploy.image.initrd import Modules, name_of
 from deploy.image.packages import apt, cache
 from deploy.image.packages.board import Board, KernelChoice
 from deploy.run import run
@@ -138,53 +139,28 @@ def _modules(choice: KernelChoice, version: str, unpacked: Path, root: Path) -> 
 def with_dependencies(modules: Path, names: Iterable[str]) -> list[str]:
     """Paths in a modules folder of the named modules and all that they depend on, sorted.
 
-    Read from depmod's tables: `modules.dep`, and `modules.softdep` for what a module asks for by
-    an alias (ext4 its checksums). `-` and `_` are the same in a name. What is built into the kernel
-    gives no path. Raises `DeployError` for modules that the kernel doesn't have.
+    Those that a softdep asks for by an alias are among them. What is built into the kernel gives no
+    path. Raises `DeployError` for modules that the kernel doesn't have.
     """
-    paths: dict[str, str] = {}
-    needs: dict[str, list[str]] = {}
-    for line in _lines(modules / "modules.dep"):
-        path, _, others = line.partition(":")
-        paths[_module(path)] = path
-        needs[path] = others.split()
-    builtin = {_module(line) for line in _lines(modules / "modules.builtin")}
-    unknown = [name for name in names if _module(name) not in {*paths, *builtin}]
+    tables = Modules(lambda table: _lines(modules / table))
+    unknown = [name for name in names if name_of(name) not in {*tables.paths, *tables.builtin}]
     if unknown:
         raise DeployError(f"kernel {modules.name}: has no module {', '.join(unknown)}")
-    soft = _soft_dependencies(modules)
-    waiting, found = [_module(name) for name in names], set()
+    waiting = [tables.paths[n] for n in map(name_of, names) if n in tables.paths]
+    found: set[str] = set()
     while waiting:
-        name = waiting.pop()
-        if name in paths and paths[name] not in found:
-            found.add(paths[name])
-            waiting += [_module(path) for path in needs[paths[name]]]
-            waiting += soft.get(name, [])
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += tables.needs[path]
+            for asked in (tables.before, tables.after):
+                for name in asked.get(name_of(path), []):
+                    waiting += tables.behind(name)
     return sorted(found)
-
-
-def _soft_dependencies(modules: Path) -> dict[str, list[str]]:
-    """By module, the modules that stand behind what its `softdep` asks for, before or after it."""
-    aliases: dict[str, list[str]] = {}
-    for line in _lines(modules / "modules.alias"):
-        if len(words := line.split()) == 3 and words[0] == "alias":
-            aliases.setdefault(_module(words[1]), []).append(_module(words[2]))
-    soft: dict[str, list[str]] = {}
-    for line in _lines(modules / "modules.softdep"):
-        words = line.split()
-        if len(words) > 2 and words[0] == "softdep":
-            asked = [_module(word) for word in words[2:] if not word.endswith(":")]
-            named = soft.setdefault(_module(words[1]), [])
-            named += [name for word in asked for name in (word, *aliases.get(word, []))]
-    return soft
 
 
 def _lines(file: Path) -> list[str]:
     return file.read_text().splitlines() if file.is_file() else []
-
-
-def _module(path: str) -> str:
-    return Path(path).name.split(".ko")[0].replace("-", "_")
 
 
 def _matching(folder: Path, patterns: tuple[str, ...]) -> list[Path]:
