@@ -12,7 +12,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
@@ -33,16 +32,6 @@ SETTINGS = (
     'Acquire::AllowInsecureRepositories "false";\n'
     'Acquire::AllowDowngradeToInsecureRepositories "false";\n'
 )
-_INSTALLS = re.compile(r"^Inst (\S+) \((\S+) (.+?) \[([a-z0-9-]+)\]\)", re.MULTILINE)
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A package that apt would install: which version, and of which archive's origin."""
-
-    name: str
-    version: str
-    origin: str
 
 
 def sources(archives: Sequence[Archive]) -> str:
@@ -143,11 +132,9 @@ class Apt:
                     f"{archive.origin!r} was expected"
                 )
 
-    def plan(self, names: Sequence[str]) -> list[Candidate]:
-        """What installing `names` into an empty system would install, sorted by name."""
-        text = self._run("apt-get", "install", "--simulate", "-q", *names)
-        found = [Candidate(name, version, o) for name, version, o, _ in _INSTALLS.findall(text)]
-        return sorted(found, key=lambda candidate: candidate.name)
+    def plan(self, names: Sequence[str]) -> str:
+        """What installing `names` into an empty system would do, in apt's words."""
+        return self._run("apt-get", "install", "--simulate", "-q", *names)
 
     def dependency(self, name: str, pattern: str) -> str:
         """The package itself, or the one dependency of it whose name matches `pattern` whole."""

@@ -5,7 +5,6 @@ Installing would build an initrd under emulation, a quarter of an hour; the card
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,13 +18,13 @@ from deploy.run import run
 
 # Raised when this module makes something else of the same inputs.
 _RECIPE = 1
-_FACTS = "kernel.json"
 _VERSIONED = r"linux-image-\d[a-z0-9.+~-]*"
 
 # Where Raspberry Pi's and Debian's package keep what the Pi's own boot loader reads.
 _FIRMWARE = Path("usr/lib/raspi-firmware")
 _FIRMWARE_FILES = ("bootcode.bin", "start*.elf", "fixup*.dat")
 _LICENCE = "LICENCE.firmware.txt"
+_MODULES = Path("usr/lib/modules")
 
 # What of a kernel's modules folder is neither a module nor made by depmod.
 _MODULE_LISTS = ("modules.builtin", "modules.builtin.modinfo", "modules.order")
@@ -37,14 +36,12 @@ class Kernel:
 
     Attributes:
         version: as `uname -r` says.
-        packages: what it was taken from, as (name, version).
         boot: a folder of files and folders for the boot partition: the kernel under the board's
             name for it, device trees, `overlays/`, the first stage's programs.
         root: a tree to lay over the root file system: modules with their index, licences.
     """
 
     version: str
-    packages: tuple[tuple[str, str], ...]
     boot: Path
     root: Path
 
@@ -68,9 +65,8 @@ def unpack_kernel(board: Board, cache_folder: Path) -> Kernel:
     with cache.made(target) as work:
         if work is not None:
             _make(board, choice, work, work / target.name)
-    facts = json.loads((target / _FACTS).read_text())
-    packages = tuple((str(name), str(version)) for name, version in facts["packages"])
-    return Kernel(str(facts["version"]), packages, target / "boot", target / "root")
+    (modules,) = (target / "root" / _MODULES).iterdir()
+    return Kernel(modules.name, target / "boot", target / "root")
 
 
 def _make(board: Board, choice: KernelChoice, work: Path, folder: Path) -> None:
@@ -78,22 +74,17 @@ def _make(board: Board, choice: KernelChoice, work: Path, folder: Path) -> None:
         package = archives.dependency(choice.package, _VERSIONED)
         files = archives.download([package, *choice.firmware], work / "packages")
     unpacked = work / "unpacked"
-    packages = []
     for file in files:
         run(["dpkg-deb", "--extract", file, unpacked])
-        found = run(["dpkg-deb", "--show", "--showformat=${Package} ${Version}", file])
-        packages.append(found.decode().split())
     version = package.removeprefix("linux-image-")
     _boot(choice, version, unpacked, folder / "boot")
     _modules(choice, version, unpacked, folder / "root")
-    for name, _ in packages:
+    for name in (package, *choice.firmware):
         licence = Path("usr/share/doc") / name / "copyright"
         if (unpacked / licence).is_file():
             _copy(unpacked / licence, folder / "root" / licence)
             if name in choice.firmware:
                 _copy(unpacked / licence, folder / "boot" / _LICENCE)
-    facts = {"version": version, "packages": sorted(packages)}
-    (folder / _FACTS).write_text(json.dumps(facts, indent=2) + "\n")
 
 
 def _boot(choice: KernelChoice, version: str, unpacked: Path, boot: Path) -> None:
@@ -115,7 +106,7 @@ def _boot(choice: KernelChoice, version: str, unpacked: Path, boot: Path) -> Non
 def _modules(choice: KernelChoice, version: str, unpacked: Path, root: Path) -> None:
     """Copies the modules that the board names, with what they depend on, and indexes them."""
     # A merged /usr, as Debian has it, whichever of the two the package was made for.
-    split, merged = Path("lib/modules") / version, Path("usr/lib/modules") / version
+    split, merged = Path("lib/modules") / version, _MODULES / version
     if not (unpacked / merged).is_dir():
         if not (unpacked / split).is_dir():
             raise DeployError(f"package linux-image-{version}: has no modules")

@@ -391,7 +391,7 @@ def test_the_command_makes_of_packages_kernel_and_wheels_the_same_image(
 ):
     given = make_ingredients(tmp_path / "in")
     compiled = []
-    kernel = Kernel(RELEASE, (), given.boot, given.modules)
+    kernel = Kernel(RELEASE, given.boot, given.modules)
     monkeypatch.setattr(command, "_CHECKOUT", checkout)
     monkeypatch.setattr(command, "fetch_wheels", lambda board, cache: given.site)
     monkeypatch.setattr(command, "unpack_kernel", lambda board, cache: kernel)

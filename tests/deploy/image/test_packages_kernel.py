@@ -94,10 +94,6 @@ def test_the_zero_2_w_s_kernel_and_firmware_come_from_the_signed_archive(
 ) -> None:
     kernel = unpack_kernel(board, tmp_path)
     assert kernel.version == _VERSION
-    assert kernel.packages == (
-        (f"linux-image-{_VERSION}", "1:6"),
-        ("raspi-firmware", "1:20260101"),
-    )
     boot = {p.relative_to(kernel.boot).as_posix(): p for p in kernel.boot.rglob("*") if p.is_file()}
     assert sorted(boot) == [
         "LICENCE.firmware.txt",
