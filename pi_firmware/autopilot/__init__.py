@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from pi_firmware import uri
 from pi_firmware.settings import AutopilotSettings
@@ -14,40 +13,22 @@ WHAT = "autopilot.uri"
 _SERIAL = ("baud", "system", "component")
 
 
-class Autopilot(Protocol):
-    """Anything that takes poses; no method waits for a device.
+class Autopilot:
+    """What takes poses; no method waits for a device. This one is `off:`, they go nowhere.
 
     `armed`: it said so last, though it may be silent since.
     """
 
-    armed: bool
-
-    def start(self) -> None:
-        """Begins to talk to it."""
-        ...
-
-    def stop(self) -> None:
-        """Ends the talk."""
-        ...
-
-    def on_pose(self, message: Pose) -> None:
-        """A pose from the ground station; from any thread."""
-        ...
-
-
-class NoAutopilot:
-    """`off:`: poses go nowhere."""
-
     armed = False
 
     def start(self) -> None:
-        """Nothing to begin."""
+        """Begins to talk to it."""
 
     def stop(self) -> None:
-        """Nothing to end."""
+        """Ends the talk."""
 
     def on_pose(self, message: Pose) -> None:
-        """Takes a pose and forgets it."""
+        """A pose from the ground station; from any thread."""
 
 
 def open_autopilot(
@@ -62,7 +43,7 @@ def open_autopilot(
         parsed.only()
         if parsed.path:
             raise parsed.fail(f"takes no path, not {parsed.path!r}")
-        return NoAutopilot()
+        return Autopilot()
     if parsed.scheme != "serial":
         raise parsed.fail("unknown scheme (available: serial:, off:)")
     parsed.only(*_SERIAL)

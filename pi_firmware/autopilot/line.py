@@ -14,6 +14,7 @@ from typing import Any
 import serial
 from pymavlink.dialects.v20 import common as mavlink
 
+from pi_firmware.autopilot import Autopilot
 from pi_firmware.autopilot.poses import PoseGate
 from pi_firmware.settings import AutopilotSettings
 from pi_firmware.wire.messages import Autopilot as State
@@ -34,7 +35,7 @@ def _quality(share: float | None) -> int:
     return 0 if share is None else round(min(max(100 * share, 1), 100))
 
 
-class SerialAutopilot:
+class SerialAutopilot(Autopilot):
     """Sends `ODOMETRY`, and keeps what heartbeat, attitude and battery say.
 
     A pose without a velocity goes as `VISION_POSITION_ESTIMATE`: not every autopilot takes an
@@ -53,7 +54,6 @@ class SerialAutopilot:
         component: int,
         publish: Callable[[State], None],
     ) -> None:
-        self.armed = False
         self.poses = PoseGate(settings)
         self._settings = settings
         self._path, self._baud = path, baud
