@@ -37,19 +37,19 @@ class Source(Protocol):
     rate_hz: float
     """Frames captured a second."""
 
-    cut_reason: str
+    cut_reason: str = ""
     """Why a recording ended early, in words; empty when it did not."""
 
-    error: BlimpError | None
+    error: BlimpError | None = None
     """What ended the source for good, when it was not its end: opening it again would not help.
 
     None where the pipeline's error is one of the moment, as of a camera that was unplugged.
     """
 
-    dmabuf: bool
+    dmabuf: bool = False
     """Whether the pictures are dmabufs, which a hardware encoder reads without a copy."""
 
-    window: Window | None
+    window: Window | None = None
     """Told of each frame that passes the gate, where the source waits for the ground's answers."""
 
     def elements(self) -> str:
@@ -70,7 +70,7 @@ class Source(Protocol):
 
     def explain(self, message: str) -> str:
         """GStreamer's error message, in words of this source where it has better ones."""
-        ...
+        return message
 
     def stop(self) -> None:
         """Ends the stream: what was delivered still flows through."""

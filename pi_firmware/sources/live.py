@@ -8,11 +8,9 @@ from typing import Any
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.base import Stamp
+from pi_firmware.sources.base import Source, Stamp
 from pi_firmware.sources.shutter import Mark, to_middle_ns
-from pi_firmware.sources.window import Window
 from pi_firmware.uri import Uri
-from pi_firmware.wire.errors import BlimpError
 
 _GOOD_NS = 100_000  # a tenth of the millisecond that capture times are good for
 _ATTEMPTS = 5
@@ -72,7 +70,7 @@ def post_error(element: Any, text: str) -> None:
     element.post_message(gst.Message.new_error(element, error, text))
 
 
-class LiveSource:
+class LiveSource(Source):
     """A GStreamer source named `source` that stamps each frame; `mark` tells which instant of it.
 
     A source that knows more than this one of a frame's exposure says so in `told`.
@@ -87,10 +85,6 @@ class LiveSource:
         readout_s: float = 0.0,
     ) -> None:
         self.rate_hz = camera.rate_hz
-        self.dmabuf = False
-        self.window: Window | None = None
-        self.cut_reason = ""
-        self.error: BlimpError | None = None
         self._camera = camera
         self._elements = elements
         self._mark = mark
@@ -117,9 +111,6 @@ class LiveSource:
     def told(self) -> tuple[float | None, float | None]:
         """Exposure, s, and gain of the frame at hand; None where the device does not tell."""
         return None, None
-
-    def explain(self, message: str) -> str:
-        return message
 
     def stop(self) -> None:
         if self._pipeline is not None:

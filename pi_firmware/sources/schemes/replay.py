@@ -11,7 +11,7 @@ from typing import Any
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.base import Stamp
+from pi_firmware.sources.base import Source, Stamp
 from pi_firmware.sources.decoding import Picture, RecordingDecoder
 from pi_firmware.sources.pacing import MAX_STEPS_HZ, PACES, Pace, RealTime, Stepped
 from pi_firmware.sources.window import Window
@@ -49,7 +49,7 @@ class RateGrid:
         return True
 
 
-class ReplaySource:
+class ReplaySource(Source):
     """Decodes ahead, waits for each frame's turn, then hands it to the pipeline.
 
     `time_ns` of a frame is the recording's own, so that it meets the recorded ground truth exactly;
@@ -63,10 +63,6 @@ class ReplaySource:
         if not uri.path:
             raise uri.fail("expected replay:FLIGHT.mcap")
         self.rate_hz = uri.number("rate_hz", camera.rate_hz, 1, 120)
-        self.dmabuf = False
-        self.window: Window | None = None
-        self.cut_reason = ""
-        self.error: BlimpError | None = None
         self._path = Path(uri.path)
         self._start_ns = int(1e9 * uri.number("start_s", 0.0, 0.0, 1e6))
         self._duration_ns = int(1e9 * uri.number("duration_s", 1e6, 0.01, 1e6))
@@ -103,9 +99,6 @@ class ReplaySource:
 
     def stamp(self, running_ns: int) -> Stamp:
         return self._stamps.pop(running_ns)
-
-    def explain(self, message: str) -> str:
-        return message
 
     def stop(self) -> None:
         self._stopping.set()
