@@ -25,7 +25,6 @@ class Reporter:
 
     def gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
         """The gate's decision on a frame."""
-        counters = self.counters
         self._telemetry.publish(
             messages.Gate(
                 time_ns=time.time_ns(),
@@ -35,29 +34,21 @@ class Reporter:
                 heartbeat=info.heartbeat,
                 entropy_bits=info.entropy_bits,
                 sharpness=info.sharpness,
-                captured=counters.captured,
-                gated=counters.gated,
-                heartbeats=counters.heartbeats,
-                sent=counters.sent,
-                discarded=counters.discarded,
                 ssrc=self._ssrc,
                 reason=verdict.reason,
                 difference=verdict.difference,
+                **vars(self.counters),
             ),
         )
 
     def announce(self, name: str, text: str) -> None:
         """An event, with the counters and the stream's properties."""
-        camera, counters = self._settings.camera, self.counters
+        camera = self._settings.camera
         values = {
             "ssrc": self._ssrc,
             "width_px": camera.width_px,
             "height_px": camera.height_px,
-            "captured": counters.captured,
-            "gated": counters.gated,
-            "heartbeats": counters.heartbeats,
-            "sent": counters.sent,
-            "discarded": counters.discarded,
+            **vars(self.counters),
         }
         self._telemetry.publish(
             messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values),
