@@ -64,6 +64,12 @@ def first_of(elements: tuple[str, ...], what: str) -> str:
     raise AssertionError("an element was installed meanwhile")
 
 
+def failure(pipeline: Any) -> str | None:
+    """What ended a pipeline, in GStreamer's words; None while it lives."""
+    message = pipeline.get_bus().pop_filtered(load().MessageType.ERROR)
+    return None if message is None else str(message.parse_error()[0].message)
+
+
 def launch(description: str) -> Any:
     """A pipeline from its text; raises `StreamError` with one line."""
     gst = load()

@@ -152,9 +152,7 @@ class Link:
     def start(self) -> None:
         """Sets the pipeline to playing; raises `StreamError` with one line."""
         if self._pipeline.set_state(self._gst.State.PLAYING) == self._gst.StateChangeReturn.FAILURE:
-            message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
-            reason = message.parse_error()[0].message if message else "it does not start"
-            raise StreamError(f"video link: {reason}")
+            raise StreamError(f"video link: {self.failure() or 'it does not start'}")
         if self._retransmission is not None:
             self._retransmission.start()
 
@@ -212,8 +210,7 @@ class Link:
 
     def failure(self) -> str | None:
         """What ended the pipeline, in GStreamer's words; None while it lives."""
-        message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
-        return str(message.parse_error()[0].message) if message else None
+        return gstreamer.failure(self._pipeline)
 
     def flush(self) -> bool:
         """Waits until all that is queued has left; whether it did within 5 s."""

@@ -124,8 +124,7 @@ class Media:
         """Sets the pipeline to playing; raises `StreamError` with one line."""
         gst = self._gst
         if self._pipeline.set_state(gst.State.PLAYING) == gst.StateChangeReturn.FAILURE:
-            message = self.bus.pop_filtered(gst.MessageType.ERROR)
-            text = message.parse_error()[0].message if message else "it does not start"
+            text = gstreamer.failure(self._pipeline) or "it does not start"
             raise StreamError(f"video pipeline: {self._source.explain(text)}")
         self._pipeline.get_state(_START_LIMIT_NS)
 

@@ -66,7 +66,7 @@ class RecordingDecoder:
         while not self._closed.is_set():
             sample = self._sink.emit("try-pull-sample", _POLL_NS)
             if sample is None:
-                self._raise_errors(gst)
+                self._raise_errors()
                 if self._sink.get_property("eos"):
                     break
                 continue
@@ -78,7 +78,7 @@ class RecordingDecoder:
                 yield Picture(found[0], buffer, found[1], found[2])
         self._feeder.join()
         if not self._closed.is_set():
-            self._raise_errors(gst)
+            self._raise_errors()
             if count == 0:
                 raise RecordingError(f"{self._path}: no frame of its video decodes")
 
@@ -116,12 +116,11 @@ class RecordingDecoder:
         finally:
             self._units.emit("end-of-stream")
 
-    def _raise_errors(self, gst: Any) -> None:
+    def _raise_errors(self) -> None:
         if self._error is not None:
             raise self._error
-        message = self._pipeline.get_bus().pop_filtered(gst.MessageType.ERROR)
-        if message is not None:
-            raise RecordingError(f"{self._path}: {message.parse_error()[0].message}")
+        if failure := gstreamer.failure(self._pipeline):
+            raise RecordingError(f"{self._path}: {failure}")
 
 
 Details = Callable[[int], tuple[float | None, float | None]]
