@@ -14,3 +14,7 @@ class DeployError(Exception):
 
     def __init__(self, text: str = "") -> None:
         super().__init__(printable(text))
+
+
+class Interrupted(DeployError):
+    """Ctrl-C, a kill or a closed terminal while a card was being written, and what it is now."""

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.board import settings
-from deploy.errors import DeployError
+from deploy.errors import DeployError, Interrupted
 from deploy.flash.boot import FOLDER, BootPartition
-from deploy.flash.interrupted import Interrupted
 from deploy.flash.keys import Keys
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse, render

@@ -16,11 +16,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 
-from deploy.errors import DeployError
+from deploy.errors import DeployError, Interrupted
 from deploy.flash.bmap import CHUNK_BYTES, Stretch, chunks
 from deploy.flash.boot import SECTOR_BYTES
 from deploy.flash.image import Image
-from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
 from deploy.progress import Progress
 
@@ -32,7 +31,7 @@ UNKNOWN = "what the card holds now is not known; flash it again"
 NOT_BOOTABLE = "the card has no partition table now and does not boot; flash it again"
 
 
-def write(image: Image, target: Target, customise: Callable[[], None]) -> None:
+def write(image: Image, target: Target, customise: Callable[[], object]) -> None:
     """Writes the image, calls `customise`, and makes the card bootable at the very end.
 
     Raises `DeployError` with one line that says where it failed and what the card is now.

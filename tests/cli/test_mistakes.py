@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deploy.flash.command import main as flash
-from deploy.image.command import main as image
+from deploy.flash.__main__ import main as flash
+from deploy.image.__main__ import main as image
 from deploy.update.__main__ import main as update
 from ground_station.cli import main as blimp
 from hw.__main__ import main as hw

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.flash.command import _parser as flash
+from deploy.flash.__main__ import _parser as flash
 from ground_station.cli import parser as blimp
 from hw.command import parser as hw
 from pi_firmware.__main__ import _parser as firmware

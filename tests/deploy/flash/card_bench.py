@@ -13,7 +13,7 @@ import sys
 import unittest.mock
 from pathlib import Path
 
-from deploy.flash import command
+from deploy.flash import __main__ as command
 
 REPOSITORY = Path(__file__).parents[3]
 MEBI = 1 << 20

@@ -17,11 +17,10 @@ from pathlib import Path
 import pytest
 from card_bench import BOOT_OFFSET, REPOSITORY, Bench, refused, run, tool
 
-from deploy.errors import DeployError
+from deploy.errors import DeployError, Interrupted
 from deploy.flash import customise, image, keys, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
-from deploy.flash.interrupted import Interrupted
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse
 
