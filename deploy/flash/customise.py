@@ -7,7 +7,6 @@ provisioned with half of it.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from deploy.flash.boot import FOLDER, BootPartition
 from deploy.flash.keys import Keys
 from deploy.flash.target import Target
 from deploy.provisioning import Provisioning, parse, render
+from deploy.run import run
 
 TOML, PAYLOAD_TOML, CERTIFICATES = (
     f"{FOLDER}/{name}" for name in ("blimp.toml", "payload.toml", "certificates")
@@ -127,15 +127,9 @@ def check_payload_toml(
         copy.write_text(settings.dump(document), encoding="utf-8")
         words = [sys.executable, "-m", "pi_firmware", "--config", str(copy), "--check"]
         words += ["--set", f"payload_id={provisioning.payload_id}"]
-        root = Path(__file__).parents[2]
         try:
-            done = subprocess.run(
-                words, cwd=root, capture_output=True, text=True, errors="replace",
-                stdin=subprocess.DEVNULL, timeout=_CHECK_S, check=False,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            raise DeployError(f"{file}: the firmware's check took over {_CHECK_S:g} s") from None
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no word"]
-        said = lines[-1].removeprefix("pi_firmware: ").replace(str(copy), str(file))
-        raise DeployError(said if str(file) in said else f"{file}: {said}")
+            run(words, cwd=Path(__file__).parents[2], timeout_s=_CHECK_S)
+        except DeployError as error:
+            said = str(error).removeprefix(f"{Path(words[0]).name}: ")
+            said = said.removeprefix("pi_firmware: ").replace(str(copy), str(file))
+            raise DeployError(said if str(file) in said else f"{file}: {said}") from None

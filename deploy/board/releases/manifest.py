@@ -12,13 +12,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from deploy.board.releases import places
 from deploy.errors import DeployError
+from deploy.run import run
 
 SCHEMA, RELEASE_SCHEMA = "blimp.bundle/1", "blimp.release/1"
 NAMESPACE = IDENTITY = "blimp-release"
@@ -180,29 +180,13 @@ def verify(data: bytes, signature: bytes, signers: Path) -> None:
     with tempfile.NamedTemporaryFile(suffix=".sig") as file:
         file.write(signature)
         file.flush()
-        command = [
-            "ssh-keygen",
-            "-Y",
-            "verify",
-            "-f",
-            str(signers),
-            "-I",
-            IDENTITY,
-            "-n",
-            NAMESPACE,
-        ]
+        words = ["ssh-keygen", "-Y", "verify", "-f", str(signers), "-I", IDENTITY, "-n", NAMESPACE]
         try:
-            done = subprocess.run(
-                [*command, "-s", file.name],
-                input=data,
-                capture_output=True,
-                timeout=60,
-                check=False,
-            )
-        except (OSError, subprocess.SubprocessError) as error:
-            raise DeployError(f"ssh-keygen: {error}") from None
-    if done.returncode != 0:
-        raise DeployError("the bundle's signature is of no release key that this card trusts")
+            run([*words, "-s", file.name], input=data, timeout_s=60)
+        except DeployError as error:
+            raise DeployError(
+                f"the bundle's signature is of no release key that this card trusts ({error})"
+            ) from None
 
 
 def check_against(manifest: Manifest, factory: Release, running: Release) -> None:

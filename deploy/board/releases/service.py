@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from typing import NamedTuple
+
+from deploy.errors import DeployError
+from deploy.run import run
 
 UNIT = "blimp-payload.service"
 WATCH = "blimp-release-watch.service"
@@ -48,18 +50,10 @@ class Service:
     @staticmethod
     def _do(*words: str) -> str:
         try:
-            done = subprocess.run(
-                ["systemctl", *words],
-                capture_output=True,
-                stdin=subprocess.DEVNULL,
-                text=True,
-                errors="replace",
-                timeout=_COMMAND_S,
-                check=False,
-            )
-        except (OSError, subprocess.SubprocessError):
+            said = run(["systemctl", *words], timeout_s=_COMMAND_S, ok=range(256))
+        except DeployError:
             return ""
-        return done.stdout
+        return said.decode(errors="replace")
 
 
 def judge(shown: str, now_s: float) -> Seen:
