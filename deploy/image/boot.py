@@ -53,20 +53,18 @@ The folder of this payload.
 
 
 def contents(
-    board: str, kernel: str, machine: str, files: Tree, initrd: bytes | None, root: str
+    board: str, kernel: str, machine: str, tree: Tree, initrd: bytes | None, root: str
 ) -> Tree:
-    """The partition's files.
+    """Adds what is ours to the partition's files, in place.
 
     Args:
         board: its name.
-        kernel: the name of the kernel's file among `files`.
+        kernel: the name of the kernel's file in the tree.
         machine: as `uname -m` says there.
-        files: kernel, device trees, overlays, the board's firmware.
+        tree: kernel, device trees, overlays, the board's firmware.
         initrd: the first root.
         root: as the kernel's line names it.
     """
-    tree = Tree()
-    tree.merge(files)
     more = "arm_64bit=1\n" if machine == "aarch64" else ""
     if board == "qemu":
         more += "device_tree=bcm2837-rpi-3-b.dtb\n"

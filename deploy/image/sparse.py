@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,27 +56,17 @@ def merged(ranges: Iterable[Range], block: int, size: int) -> list[Range]:
 
 def copy_into(source: Path, ranges: Iterable[Range], target: Path, offset: int) -> None:
     """Writes the source's ranges into another file, `offset` bytes on; zeros are written, too."""
-    with open(source, "rb") as reader, open(target, "r+b") as writer:
+    with open(target, "r+b") as writer:
         for item in ranges:
-            reader.seek(item.start)
             writer.seek(offset + item.start)
-            left = item.stop - item.start
-            while left:
-                chunk = reader.read(min(left, _CHUNK_BYTES))
+            for chunk in _chunks(source, item):
                 writer.write(chunk)
-                left -= len(chunk)
 
 
 def cut_out(source: Path, item: Range, target: Path) -> None:
     """Writes a stretch of a file to a file of its own; blocks of zeros become holes."""
-    with open(source, "rb") as reader, open(target, "wb") as writer:
-        reader.seek(item.start)
-        left = item.stop - item.start
-        while left:
-            chunk = reader.read(min(left, _CHUNK_BYTES))
-            if not chunk:
-                break
-            left -= len(chunk)
+    with open(target, "wb") as writer:
+        for chunk in _chunks(source, item):
             if chunk.count(0) == len(chunk):
                 writer.seek(len(chunk), os.SEEK_CUR)
             else:
@@ -87,10 +77,16 @@ def cut_out(source: Path, item: Range, target: Path) -> None:
 def sha256(path: Path, item: Range | None = None) -> str:
     """The hash of a file, or of a stretch of it, in hex."""
     whole = hashlib.sha256()
-    with open(path, "rb") as file:
-        start, stop = (item.start, item.stop) if item else (0, os.fstat(file.fileno()).st_size)
-        file.seek(start)
-        while start < stop and (chunk := file.read(min(stop - start, _CHUNK_BYTES))):
-            whole.update(chunk)
-            start += len(chunk)
+    for chunk in _chunks(path, item or Range(0, path.stat().st_size)):
+        whole.update(chunk)
     return whole.hexdigest()
+
+
+def _chunks(path: Path, item: Range) -> Iterator[bytes]:
+    """A stretch of a file piece by piece; it ends early where the file does."""
+    with open(path, "rb") as file:
+        file.seek(item.start)
+        left = item.stop - item.start
+        while left and (chunk := file.read(min(left, _CHUNK_BYTES))):
+            left -= len(chunk)
+            yield chunk

@@ -117,8 +117,11 @@ class Tree:
             content = Content(path=tar, offset=member.offset_data, size=member.size)
             self._entries[name] = replace(owned, content=content)
 
-    def resolve(self, path: str) -> str:
-        """The path with its folders' links followed: `lib/x` is `usr/lib/x` on a merged /usr."""
+    def resolve(self, path: str, *, last: bool = False) -> str:
+        """The path with its folders' links followed: `lib/x` is `usr/lib/x` on a merged /usr.
+
+        With `last` a link at its end is followed, too.
+        """
         done: list[str] = []
         todo = _checked(path).split("/")
         links = 0
@@ -131,7 +134,7 @@ class Tree:
                 continue
             here = "/".join([*done, part])
             entry = self._entries.get(here)
-            if entry is not None and entry.kind == "link" and todo:
+            if entry is not None and entry.kind == "link" and (todo or last):
                 links += 1
                 if links > _MAX_LINKS:
                     raise DeployError(f"{path}: more than {_MAX_LINKS} links")
@@ -191,12 +194,6 @@ class Tree:
         except OSError as error:
             raise DeployError(f"{source}: {error.strerror or error}") from None
 
-    def merge(self, other: Tree) -> None:
-        """Takes another tree's entries over; a folder that is there keeps its own owner."""
-        for path, entry in other.items():
-            if entry.kind != "folder" or path not in self:
-                self.add(path, entry)
-
     def remove(self, path: str) -> None:
         """Takes a file, link or whole folder away; nothing there is no error."""
         place = self.resolve(path)
@@ -226,16 +223,10 @@ class Tree:
 
     def read(self, path: str) -> bytes:
         """A file's bytes, through symbolic links."""
-        place = self.resolve(path)
-        for _ in range(_MAX_LINKS):
-            entry = self[place]
-            if entry.kind == "file":
-                return entry.content.read()
-            if entry.kind != "link":
-                raise DeployError(f"/{path}: not a file")
-            above = "" if entry.target.startswith("/") else place.rpartition("/")[0] + "/"
-            place = self.resolve(_flat(above + entry.target.lstrip("/")))
-        raise DeployError(f"/{path}: more than {_MAX_LINKS} links")
+        entry = self[self.resolve(path, last=True)]
+        if entry.kind != "file":
+            raise DeployError(f"/{path}: not a file")
+        return entry.content.read()
 
     def items(self) -> Iterator[tuple[str, Entry]]:
         """All entries, each after its folder, in an order that nothing else has a hand in."""
@@ -273,16 +264,6 @@ def clamp(entry: Entry, epoch: int) -> int:
     Kept and not set to the epoch, since Python's compiled files hold their source's time.
     """
     return epoch if entry.mtime is None else max(0, min(entry.mtime, epoch))
-
-
-def _flat(path: str) -> str:
-    done: list[str] = []
-    for part in path.split("/"):
-        if part == "..":
-            done = done[:-1]
-        elif part not in ("", "."):
-            done.append(part)
-    return "/".join(done)
 
 
 def _checked(name: str) -> str:

@@ -22,7 +22,8 @@ from card_parts import (
 )
 
 from deploy.errors import DeployError
-from deploy.image import card, command, sparse
+from deploy.image import __main__ as command
+from deploy.image import card, sparse
 from deploy.image.packages import Kernel
 
 pytestmark = pytest.mark.skipif(
