@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from deploy.board import settings
-from deploy.board.card import Card, Owners, read_json
+from deploy.board.card import Card, Owners
 from deploy.board.disk import Disk, read_bounded
 from deploy.board.inputs import (
     CERTIFICATES,
@@ -24,6 +24,7 @@ from deploy.board.inputs import (
     Inputs,
     digest,
 )
+from deploy.board.releases import places
 from deploy.errors import DeployError
 from deploy.provisioning import (
     Provisioning,
@@ -59,7 +60,7 @@ class Record:
     @classmethod
     def read(cls, folder: Path) -> Record | None:
         """That of a folder; None when it is not there or not whole."""
-        document = read_json(folder / RECORD)
+        document = places.read(folder / RECORD) or {}
         if document.pop("schema", None) != SCHEMA:
             return None
         try:

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import grp
-import json
 import os
 import pwd
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from deploy.board.disk import Owner, read_bounded
+from deploy.board.disk import Owner
 from deploy.errors import DeployError
 from deploy.run import run
 
 USER = "blimp"
-_MOST_BYTES = 256 * 1024
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,6 @@ class Card:
         return self.root / "usr/share/blimp/payload.toml"
 
     @property
-    def board(self) -> Path:
-        return self.root / "usr/share/blimp/board.json"
-
-    @property
     def outcome(self) -> Path:
         """What provisioning came to in this boot."""
         return self.root / "run/blimp-board/provisioning.json"
@@ -67,15 +61,6 @@ class Card:
     def resolver(self) -> Path:
         """The name servers; /etc/resolv.conf points here."""
         return self.root / "run/blimp-board/resolv.conf"
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A small JSON object; empty when it is absent or is none."""
-    try:
-        document = json.loads(read_bounded(path, _MOST_BYTES) or b"")
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) else {}
 
 
 @contextlib.contextmanager

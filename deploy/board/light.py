@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from deploy.board import faults, journal, network, provision, status
-from deploy.board.card import Card, read_json
+from deploy.board.card import Card
 from deploy.board.disk import Disk
 from deploy.board.faults import Fault
 from deploy.board.network import Link
+from deploy.board.releases import places
+from deploy.board.releases.places import Places
 from deploy.board.releases.service import UNIT, Seen, Service
 from deploy.board.status import Status
 from deploy.board.status_led import StatusLed
@@ -126,7 +128,7 @@ def data_fault(root: Path) -> str:
 def look(card: Card, service: Service) -> View:
     """The card as it is now."""
     return View(
-        outcome=read_json(card.outcome),
+        outcome=places.read(card.outcome) or {},
         data=data_fault(card.root),
         firmware=service.seen(),
         links=tuple(network.links(card.root)),
@@ -151,12 +153,11 @@ def reason(fault: Fault | None, view: View) -> str:
 
 def text_of(card: Card, fault: Fault | None, view: View) -> bytes:
     """STATUS.txt for this moment."""
-    board, running = read_json(card.board), read_json(card.root / "run/blimp/release.json")
+    at = Places(card.root)
+    board, running = places.read(at.board) or {}, places.read(at.running) or {}
     version, how = (str(running.get(name, "")) for name in ("version", "how"))
     if not version:
-        version = str(
-            read_json(card.root / "usr/lib/blimp/release/release.json").get("version", "")
-        )
+        version = str((places.read(at.factory / "release.json") or {}).get("version", ""))
     shown = [f"{link.name} {link.address}" for link in view.links if link.address]
     return status.render(
         Status(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import socket
 import sys
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from deploy.board.candidate import (
 from deploy.board.card import USER, Card, Owners, writable
 from deploy.board.disk import Disk, read_bounded
 from deploy.board.inputs import Inputs, digest
-from deploy.board.releases import shelf
+from deploy.board.releases import places, shelf
 from deploy.board.releases.places import Places
 from deploy.errors import DeployError
 from deploy.provisioning import parse
@@ -190,9 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (card.root / "etc/hosts").write_text(hosts_text(name))
             socket.sethostname(name)
     card.outcome.parent.mkdir(parents=True, exist_ok=True)
-    part = card.outcome.with_name(card.outcome.name + ".part")
-    part.write_text(json.dumps(asdict(outcome)))
-    part.replace(card.outcome)
+    places.write(card.outcome, asdict(outcome), durable=False)
     words = [f"provision: {outcome.state}", outcome.payload_id, outcome.reason, outcome.warning]
     print(": ".join(word for word in words if word), flush=True)
     return 0

@@ -13,6 +13,7 @@ from deploy.board import faults, light, network, provision, status
 from deploy.board.faults import Fault
 from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Teller, View
 from deploy.board.network import Link
+from deploy.board.releases.places import Places
 from deploy.board.releases.service import Seen
 from deploy.board.status_led import StatusLed
 from deploy.errors import DeployError
@@ -182,7 +183,7 @@ def test_status_txt_names_everything_and_how_to_mend_it(
     person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     card = person.card
-    card.board.write_text(json.dumps({"board": "zero2w", "image": "2026.11"}))
+    Places(card.root).board.write_text(json.dumps({"board": "zero2w", "image": "2026.11"}))
     running = card.root / "run/blimp/release.json"
     running.parent.mkdir(parents=True)
     running.write_text(json.dumps({"version": "0.2.0", "how": "fell back\r\nFAULT: forged"}))

@@ -7,7 +7,6 @@ from pathlib import Path
 from pieces import Picker, as_json, changed, scratch, stretch
 
 from deploy.board import network
-from deploy.board.card import read_json
 from deploy.board.releases import choose, places
 from pi_firmware import release
 from pi_firmware.health import restarts
@@ -46,7 +45,7 @@ def fuzz(data: bytes) -> None:
     assert choice.how
     choose.size_fault(_AT, "1.2")
     restarts._read(_STATE)
-    read_json(_STATE)
+    places.read(_STATE)
     assert len(network.name_servers(_ROOT)) <= 3
     release.of_environment({release.ENVIRONMENT: picker.block().decode("latin-1")})
 
