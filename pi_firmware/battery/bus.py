@@ -43,6 +43,11 @@ class Counts:
     reopened: int = 0
     resets: int = 0
 
+    def refuse(self, reason: str) -> GaugeError:
+        """Counts a reading that cannot be; the error to raise about it."""
+        self.refused += 1
+        return GaugeError(reason)
+
 
 class WordBus:
     """16-bit registers, most significant byte first, of one chip.

@@ -11,6 +11,9 @@ from pi_firmware.settings import BatterySettings
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 
+CHARGING, DISCHARGING, GOOD, LIPO = 1, 2, 1, 3
+"""Of a battery's `power_supply_status`, `_health` and `_technology`."""
+
 
 class Gauge(Protocol):
     """Anything that can say how much charge is left, or voltage and current to find it from."""

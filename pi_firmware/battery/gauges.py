@@ -13,7 +13,7 @@ from pi_firmware import uri
 from pi_firmware.battery import chips
 from pi_firmware.battery.bus import Counts, Smbus, WordBus
 from pi_firmware.battery.cell import Cell
-from pi_firmware.battery.chip import Chip, Gauge, Shunt
+from pi_firmware.battery.chip import DISCHARGING, GOOD, LIPO, Chip, Gauge, Shunt
 from pi_firmware.settings import BatterySettings
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
@@ -22,7 +22,6 @@ from pi_firmware.wire.messages import Battery
 _CHARGE = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 _VOLTAGE_V = (3.27, 3.50, 3.61, 3.69, 3.77, 3.87, 4.02, 4.20)
 _RESISTANCE_OHM = 0.08
-_DISCHARGING, _GOOD, _LIPO = 2, 1, 3
 
 
 class FakeGauge:
@@ -54,9 +53,9 @@ class FakeGauge:
             charge=left * self._capacity_ah,
             capacity=self._capacity_ah,
             design_capacity=self._capacity_ah,
-            power_supply_status=_DISCHARGING,
-            power_supply_health=_GOOD,
-            power_supply_technology=_LIPO,
+            power_supply_status=DISCHARGING,
+            power_supply_health=GOOD,
+            power_supply_technology=LIPO,
             time_left_s=left * self._full_s,
         )
 

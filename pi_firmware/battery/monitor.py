@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from pi_firmware.battery.bus import Counts, GaugeError
 from pi_firmware.battery.charge import ChargeFilter
-from pi_firmware.battery.chip import Gauge
+from pi_firmware.battery.chip import CHARGING, Gauge
 from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages
@@ -23,7 +23,6 @@ _LOW_ENDS = 0.05  # above the threshold by this much the alarm is over
 _SILENT_AFTER = 3  # failed readings in a row before it is said
 _LONGEST_PAUSE_S = 30.0
 _JOIN_LIMIT_S = 2.0
-_CHARGING = 1
 
 
 class Monitor:
@@ -121,8 +120,7 @@ class Monitor:
         elif share is not None and not 0 <= share <= 1:
             reason = f"{share:g} is no state of charge"
         if reason:
-            self._gauge.counts.refused += 1
-            raise GaugeError(f"battery gauge: {reason}")
+            raise self._gauge.counts.refuse(f"battery gauge: {reason}")
         return reading
 
     def _failed(self, reason: str) -> float:
@@ -156,7 +154,7 @@ class Monitor:
     def _judge(self, reading: Battery) -> bool:
         """Sets the alarm; whether it has just been raised."""
         settings, share = self._settings, reading.percentage
-        charging = reading.power_supply_status == _CHARGING
+        charging = reading.power_supply_status == CHARGING
         empty = reading.voltage <= settings.critical_V or (
             share is not None and share <= settings.critical_percentage
         )

@@ -8,14 +8,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
-from pi_firmware.battery.chip import Chip, Shunt
+from pi_firmware.battery.chip import CHARGING, DISCHARGING, GOOD, LIPO, Chip, Shunt
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 
 CONFIGURATION, SHUNT_VOLTAGE, BUS_VOLTAGE, POWER, CURRENT, CALIBRATION = range(6)
 MANUFACTURER_ID, DIE_ID = 0xFE, 0xFF
 RESET = 0x8000
-_DISCHARGING, _CHARGING, _GOOD, _LIPO = 2, 1, 1, 3
 _INA219_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # of the programmable gain 1, 1/2, 1/4, 1/8
 
 
@@ -37,14 +36,18 @@ class _Ina(ABC):
         self._bus.close()
 
     @abstractmethod
-    def _prepare(self) -> None:
-        """Writes the settings, unless they are there."""
+    def _reset(self) -> None:
+        """Resets the chip; raises `GaugeError` where it is another one."""
 
     def _words(self) -> tuple[int, int, int]:
         """Shunt voltage, bus voltage and current as the registers have them, the first and last
         signed; what a chip says that a dip of its supply has reset is refused.
         """
-        self._prepare()
+        if not self._ready:
+            self._reset()
+            self._bus.write(CONFIGURATION, self._configuration)
+            self._bus.write(CALIBRATION, self._calibration)
+            self._ready = True
         drop = signed(self._bus.read(SHUNT_VOLTAGE))
         bus = self._bus.read(BUS_VOLTAGE)
         current = signed(self._bus.read(CURRENT))
@@ -52,7 +55,7 @@ class _Ina(ABC):
         if settings != (self._configuration, self._calibration):
             self._ready = False
             self.counts.resets += 1
-            raise _refused(self.counts, "the gauge has lost its settings; it is set up again")
+            raise self.counts.refuse("the gauge has lost its settings; it is set up again")
         return drop, bus, current
 
 
@@ -78,9 +81,9 @@ class Ina219(_Ina):
         """One reading; raises `GaugeError` when there is none that can be believed."""
         drop, bus, current = self._words()
         if bus & 0x1:
-            raise _refused(self.counts, "ina219: the current is beyond the calibrated range")
+            raise self.counts.refuse("ina219: the current is beyond the calibrated range")
         if abs(drop) >= round(_INA219_RANGES_V[self._gain] / 10e-6):
-            raise _refused(self.counts, "ina219: the shunt's voltage is beyond the range")
+            raise self.counts.refuse("ina219: the shunt's voltage is beyond the range")
         _check_agreement(self.counts, current, drop * self._calibration / 4096)
         # The chip measures at IN-, behind the shunt; the cell is before it while discharging.
         voltage = ina219_bus_voltage(bus)
@@ -88,9 +91,7 @@ class Ina219(_Ina):
             voltage += drop * 10e-6
         return _reading(time_ns, voltage, current * self._lsb_a, self._shunt)
 
-    def _prepare(self) -> None:
-        if self._ready:
-            return
+    def _reset(self) -> None:
         self._bus.write(CONFIGURATION, RESET)
         found = self._bus.read(CONFIGURATION)
         if found != self.AFTER_RESET:
@@ -98,9 +99,6 @@ class Ina219(_Ina):
                 f"ina219: after a reset its configuration is {found:#06x},"
                 f" not {self.AFTER_RESET:#06x}: another chip, or a disturbed bus"
             )
-        self._bus.write(CONFIGURATION, self._configuration)
-        self._bus.write(CALIBRATION, self._calibration)
-        self._ready = True
 
 
 class Ina226(_Ina):
@@ -122,13 +120,11 @@ class Ina226(_Ina):
         """One reading; raises `GaugeError` when there is none that can be believed."""
         drop, bus, current = self._words()
         if drop in (-0x8000, 0x7FFF):
-            raise _refused(self.counts, "ina226: the shunt's voltage is beyond the range")
+            raise self.counts.refuse("ina226: the shunt's voltage is beyond the range")
         _check_agreement(self.counts, current, drop * self._calibration / 2048)
         return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
 
-    def _prepare(self) -> None:
-        if self._ready:
-            return
+    def _reset(self) -> None:
         found = self._bus.read(MANUFACTURER_ID), self._bus.read(DIE_ID)
         if found != (self.MANUFACTURER, self.DIE):
             raise GaugeError(
@@ -136,9 +132,6 @@ class Ina226(_Ina):
                 f" not {self.MANUFACTURER:#06x} {self.DIE:#06x}: another chip"
             )
         self._bus.write(CONFIGURATION, RESET)
-        self._bus.write(CONFIGURATION, self._configuration)
-        self._bus.write(CALIBRATION, self._calibration)
-        self._ready = True
 
 
 def ina219_calibration(current_lsb_a: float, resistance_ohm: float) -> int:
@@ -177,12 +170,7 @@ def _check_agreement(counts: Counts, current: int, expected: float) -> None:
     between the two reads, and the next reading is good.
     """
     if abs(current - expected) > max(0.1 * abs(expected), 64):
-        raise _refused(counts, "the current contradicts the shunt's voltage")
-
-
-def _refused(counts: Counts, reason: str) -> GaugeError:
-    counts.refused += 1
-    return GaugeError(reason)
+        raise counts.refuse("the current contradicts the shunt's voltage")
 
 
 def _reading(time_ns: int, voltage: float, through_shunt_a: float, shunt: Shunt) -> Battery:
@@ -191,9 +179,9 @@ def _reading(time_ns: int, voltage: float, through_shunt_a: float, shunt: Shunt)
         time_ns=time_ns,
         voltage=voltage,
         current=current,
-        power_supply_status=_CHARGING if current > 0 else _DISCHARGING,
-        power_supply_health=_GOOD,
-        power_supply_technology=_LIPO,
+        power_supply_status=CHARGING if current > 0 else DISCHARGING,
+        power_supply_health=GOOD,
+        power_supply_technology=LIPO,
     )
 
 

@@ -6,7 +6,7 @@ Registers and units are those of Maxim's datasheet 19-6171, revision 7.
 from __future__ import annotations
 
 from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
-from pi_firmware.battery.chip import Chip
+from pi_firmware.battery.chip import CHARGING, DISCHARGING, GOOD, LIPO, Chip
 from pi_firmware.wire.messages import Battery
 
 VCELL, SOC, VERSION, CONFIG, CRATE, STATUS = 0x02, 0x04, 0x08, 0x0C, 0x16, 0x1A
@@ -14,7 +14,6 @@ RESET_INDICATOR = 0x0100
 _RCOMP_AT_20_C = 0x97
 _HIGHEST_SHARE = 1.1  # the register may pass 100 % a little; far beyond it is no state of charge
 _MIN_RATE_PER_H = 0.005
-_CHARGING, _DISCHARGING, _GOOD, _LIPO = 1, 2, 1, 3
 
 
 class Max17048:
@@ -37,11 +36,9 @@ class Max17048:
         if self._bus.read(STATUS) & RESET_INDICATOR:
             self._ready = False
             self.counts.resets += 1
-            self.counts.refused += 1
-            raise GaugeError("max17048: the gauge was reset; it is set up again")
+            raise self.counts.refuse("max17048: the gauge was reset; it is set up again")
         if share > _HIGHEST_SHARE:
-            self.counts.refused += 1
-            raise GaugeError(f"max17048: {100 * share:.0f} % is no state of charge")
+            raise self.counts.refuse(f"max17048: {100 * share:.0f} % is no state of charge")
         share = min(share, 1.0)
         return Battery(
             time_ns=time_ns,
@@ -49,9 +46,9 @@ class Max17048:
             percentage=share,
             charge=share * self._capacity_ah,
             time_left_s=3600 * share / -rate_per_h if rate_per_h <= -_MIN_RATE_PER_H else None,
-            power_supply_status=_CHARGING if rate_per_h > _MIN_RATE_PER_H else _DISCHARGING,
-            power_supply_health=_GOOD,
-            power_supply_technology=_LIPO,
+            power_supply_status=CHARGING if rate_per_h > _MIN_RATE_PER_H else DISCHARGING,
+            power_supply_health=GOOD,
+            power_supply_technology=LIPO,
         )
 
     def close(self) -> None:
