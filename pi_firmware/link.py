@@ -21,6 +21,7 @@ from pi_firmware.settings import LinkSettings
 from pi_firmware.wire import srtp, video
 from pi_firmware.wire.errors import StreamError
 from pi_firmware.wire.messages import LinkReport
+from pi_firmware.wire.telemetry import is_loopback
 
 DISCOVERED = "auto"
 """`link.host` that waits for a ground station to say where it is."""
@@ -261,11 +262,3 @@ def _is_numeric(host: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a numeric address is this machine's own."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

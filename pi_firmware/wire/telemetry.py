@@ -94,15 +94,19 @@ def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]
         raise TelemetryError(
             f"telemetry endpoint {endpoint!r:.80}: tls needs a folder of certificates (blimp keys)"
         )
-    try:
-        loopback = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = host == "localhost"
-    if not loopback:
+    if not is_loopback(host):
         raise TelemetryError(
             f"telemetry endpoint {endpoint!r:.80}: only loopback is allowed without certificates"
         )
     return match[2], int(match[3])
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a numeric address, or the name `localhost`, is this machine's own."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def open_session(
