@@ -5,13 +5,38 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import Protocol
 
+from pi_firmware.wire import files
 from pi_firmware.wire.errors import RecordingError
-from pi_firmware.wire.recorder.limits import Limits
 
 MB = 1_000_000
 _NAME = re.compile(r"flight-([0-9]{6,9})(?:-[0-9TZ]{16})?\.mcap")
 _HIGHEST = 999_999_999
+
+
+class Limits(Protocol):
+    """The bounds of a recorder; each side's `[recording]` table is one."""
+
+    @property
+    def folder(self) -> str:
+        """Where recordings go; empty: none are made."""
+
+    @property
+    def max_file_MB(self) -> int:
+        """A file ends at this size."""
+
+    @property
+    def max_total_MB(self) -> int:
+        """The oldest files are deleted beyond it."""
+
+    @property
+    def min_free_MB(self) -> int:
+        """What is left free on the disk."""
+
+    @property
+    def sync_s(self) -> float:
+        """The most that a power cut costs."""
 
 
 def number_of(name: str) -> int | None:
@@ -81,11 +106,7 @@ class Folder:
     def sync(self) -> None:
         """Makes names durable: of files that were begun, ended or deleted."""
         try:
-            handle = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+            files.sync(self.path)
         except OSError as error:
             raise self._fail(error) from None
 

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recorder.durable import OpenFile
 from pi_firmware.wire.recorder.file import CHUNK_BYTES, HEAD_BYTES, RecordingFile
-from pi_firmware.wire.recorder.folder import Folder
-from pi_firmware.wire.recorder.limits import Limits
+from pi_firmware.wire.recorder.folder import Folder, Limits
 from pi_firmware.wire.recorder.queue import Queue
 
 QUEUE_BYTES = 8_000_000
