@@ -8,10 +8,11 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pi_firmware.health import small_files
 from pi_firmware.wire import files
+from pi_firmware.wire.config import from_mapping, key
+from pi_firmware.wire.errors import ConfigError
 
 _SCHEMA = "blimp.restarts/1"
 _MOST_REBOOTS = 3
@@ -22,10 +23,10 @@ _LONGEST_BOOT_ID = 64
 @dataclass(frozen=True)
 class _Counts:
     boot_id: str = ""  # the boot in which the file was written
-    processes: int = 0  # started in that boot
-    without_frame: int = 0  # of them, the last ones in a row that sent no frame
-    reboots: int = 0  # asked for and done, since the file was made
-    reboots_in_a_row: int = 0  # asked for since the last frame
+    processes: int = key(0, low=0, high=_HIGHEST)  # started in that boot
+    without_frame: int = key(0, low=0, high=_HIGHEST)  # of them the last ones, in a row
+    reboots: int = key(0, low=0, high=_HIGHEST)  # asked for and done, since the file was made
+    reboots_in_a_row: int = key(0, low=0, high=_HIGHEST)  # asked for since the last frame
     reboot_pending: bool = False
 
 
@@ -142,16 +143,8 @@ class Restarts:
 def _read(path: Path) -> _Counts:
     try:
         document = json.loads(small_files.text(path) or "")
-    except (ValueError, RecursionError):
+        if not isinstance(document, dict) or document.pop("schema", None) != _SCHEMA:
+            return _Counts()
+        return from_mapping(document, _Counts)
+    except (ConfigError, ValueError, RecursionError):
         return _Counts()
-    if not isinstance(document, dict) or document.get("schema") != _SCHEMA:
-        return _Counts()
-    values = {field.name: document.get(field.name) for field in dataclasses.fields(_Counts)}
-    good = all(_is_good(values[f.name], f.default) for f in dataclasses.fields(_Counts))
-    return _Counts(**values) if good else _Counts()  # type: ignore[arg-type]
-
-
-def _is_good(value: Any, like: Any) -> bool:
-    if type(value) is not type(like):
-        return False
-    return not isinstance(value, int) or 0 <= value <= _HIGHEST
