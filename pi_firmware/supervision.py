@@ -119,7 +119,7 @@ class Supervision:
             PeriodicThread(self.table, CLOCK, ask, _complain),
             PeriodicThread(self.table, MEMORY, memory.collect, _complain),
         ]
-        self.table.begin(VIDEO)
+        self.table.beat(VIDEO)
         for thread in self._threads:
             thread.start()
 

@@ -20,27 +20,16 @@ class Task:
     period_s: float
     watchdog_s: float
 
-    def __post_init__(self) -> None:
-        if not 0 < self.period_s <= self.watchdog_s < float("inf"):
-            raise ValueError(
-                f"task {self.name!r}: period {self.period_s:g} s and watchdog {self.watchdog_s:g} s"
-                " must be above 0 and the watchdog no shorter than the period"
-            )
-
 
 class Table:
     """When each task was last heard of. Safe from any thread.
 
-    A task is watched from `begin` or its first beat on until `end`: one that this flight does
+    A task is watched from its first beat, as it begins, until `end`: one that this flight does
     without is never late. An unknown name is a `KeyError`.
     """
 
     def __init__(self, tasks: Iterable[Task], clock: Callable[[], float] = time.monotonic) -> None:
-        self._tasks: dict[str, Task] = {}
-        for task in tasks:
-            if task.name in self._tasks:
-                raise ValueError(f"task {task.name!r} is declared twice")
-            self._tasks[task.name] = task
+        self._tasks = {task.name: task for task in tasks}
         self._clock = clock
         self._lock = threading.Lock()
         self._heard: dict[str, float] = {}
@@ -48,12 +37,8 @@ class Table:
     def __getitem__(self, name: str) -> Task:
         return self._tasks[name]
 
-    def begin(self, name: str) -> None:
-        """The task runs from now on."""
-        self.beat(name)
-
     def beat(self, name: str) -> None:
-        """The task has done its work once more."""
+        """The task begins, or has done its work once more."""
         with self._lock:
             self._heard[self._tasks[name].name] = self._clock()
 
@@ -62,19 +47,15 @@ class Table:
         with self._lock:
             self._heard.pop(self._tasks[name].name, None)
 
-    def ages(self, now: float | None = None) -> dict[str, float]:
+    def ages(self) -> dict[str, float]:
         """Seconds since each running task's last beat, in the table's order."""
         with self._lock:
-            now = self._clock() if now is None else now
-            return {
-                name: max(now - self._heard[name], 0.0)
-                for name in self._tasks
-                if name in self._heard
-            }
+            now = self._clock()
+            return {name: now - self._heard[name] for name in self._tasks if name in self._heard}
 
-    def late(self, now: float | None = None) -> list[str]:
+    def late(self) -> list[str]:
         """Running tasks that missed their watchdog, in the table's order."""
-        ages = self.ages(now)
+        ages = self.ages()
         return [name for name, age_s in ages.items() if age_s > self._tasks[name].watchdog_s]
 
 
@@ -104,7 +85,7 @@ class PeriodicThread:
     def start(self) -> None:
         """Starts the thread, whose first call is at once; a second call does nothing."""
         if self._thread is None:
-            self._table.begin(self._task.name)
+            self._table.beat(self._task.name)
             self._thread = threading.Thread(target=self._run, name=self._task.name, daemon=True)
             self._thread.start()
 
