@@ -49,11 +49,9 @@ class ChargeFilter:
     def update(self, now_s: float, voltage: float, discharge_a: float) -> float:
         """The state of charge after a reading; `now_s` is of a clock that never steps.
 
-        A reading that is not later than the one before changes nothing. Raises `ValueError` for
-        numbers that are not finite.
+        A reading that is not later than the one before changes nothing. Its numbers are finite: the
+        monitor believes no others.
         """
-        if not all(map(math.isfinite, (now_s, voltage, discharge_a))):
-            raise ValueError("a reading's time, voltage and current must be finite")
         dt_s = now_s - self._last_s
         if self.charge is None or dt_s > _GAP_S:
             return self._begin(now_s, voltage, discharge_a)
