@@ -24,7 +24,7 @@ def choice(at: Places, state: choose.State) -> choose.Choice:
         if 0 <= state.starts < choose.STARTS and not _count(
             at.starts, state.trial["id"], state.starts
         ):
-            state.starts = -1
+            state = state._replace(starts=-1)
     elif state.current != places.FACTORY:
         _count(at.frameless, state.current, state.frameless)
     return choose.choose(state, lambda name: choose.size_fault(at, name))

@@ -8,12 +8,13 @@ import sys
 from pathlib import Path
 
 from deploy.board.releases import manifest
+from deploy.board.releases.choose import HEALTHY
 from deploy.errors import DeployError
 from deploy.image.packages import fetch_wheels, load_board
 from deploy.progress import Progress
 from deploy.update import bundle as bundles
 from deploy.update.bundle import CHECKOUT
-from deploy.update.card import Card, is_healthy
+from deploy.update.card import Card
 
 _CACHE = CHECKOUT / "out/cache/image"  # where the image builder keeps them, too
 _EXAMPLE = """example:
@@ -102,7 +103,7 @@ def _update(given: argparse.Namespace) -> int:
         return 0
     _say(f"{version} is on the card and on trial, which ends within {limit_s:g} s")
     last = card.follow(str(answer["id"]), limit_s, _say)
-    if is_healthy(last):
+    if last.get("outcome") == HEALTHY:
         _say(f"{version} is in force")
         return 0
     _say(f"{given.payload} went back to {last['previous'] or factory.version}: {last['reason']}")

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from deploy.board.releases.choose import HEALTHY
 from deploy.errors import DeployError, printable
 from deploy.run import need
 from deploy.update import bundle as bundles
@@ -199,11 +198,6 @@ class Card:
         if last.startswith("releases: "):
             return f"{self.name} refuses: {last.removeprefix('releases: ')}"
         return f"{self.host}: {last or f'ssh ended with status {status}'}"
-
-
-def is_healthy(last: Mapping[str, Any]) -> bool:
-    """Whether an outcome means that the new release is in force."""
-    return last.get("outcome") == HEALTHY
 
 
 def _drain(pipe: Any, said: list[bytes], at: int) -> None:

@@ -1,19 +1,16 @@
 """Which release to start: a pure decision, and the cheap look at a release that it needs.
 
-Imported at each start of the firmware: nothing heavier than `json` and `pathlib` in it.
+Imported at each start of the firmware: nothing heavier than `json` and `typing` in it.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from deploy.board.releases import places
 from deploy.board.releases.places import FACTORY, Places
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-    from typing import Any
 
 STARTS = 3
 """A release under trial is started so often at most before it has shown that it works."""
@@ -25,20 +22,15 @@ HEALTHY = "healthy"
 RELEASE, MANIFEST = "release.json", "manifest.json"
 
 
-class Choice:
+class Choice(NamedTuple):
     """The release to start, how it came to be that one, and for a way back the reason."""
 
-    def __init__(self, name: str, how: str, reason: str = "") -> None:
-        self.name, self.how, self.reason = name, how, reason
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Choice) and vars(self) == vars(other)
-
-    def __repr__(self) -> str:
-        return f"Choice({self.name!r}, {self.how!r}, {self.reason!r})"
+    name: str
+    how: str
+    reason: str = ""
 
 
-class State:
+class State(NamedTuple):
     """What the card says of its releases.
 
     `current` and `previous` are names ('' the image's release), `trial` and `last` the documents of
@@ -46,17 +38,12 @@ class State:
     negative when they cannot be counted; `frameless` those since the last frame of an update.
     """
 
-    def __init__(
-        self,
-        current: str = FACTORY,
-        previous: str = FACTORY,
-        trial: dict[str, Any] | None = None,
-        last: dict[str, Any] | None = None,
-        starts: int = 0,
-        frameless: int = 0,
-    ) -> None:
-        self.current, self.previous = current, previous
-        self.trial, self.last, self.starts, self.frameless = trial, last, starts, frameless
+    current: str = FACTORY
+    previous: str = FACTORY
+    trial: dict[str, Any] | None = None
+    last: dict[str, Any] | None = None
+    starts: int = 0
+    frameless: int = 0
 
     @property
     def on_trial(self) -> bool:

@@ -1,6 +1,6 @@
 """Where releases and their state lie, read so that nothing raises and written whole.
 
-Imported at each start of the firmware: nothing heavier than `json` and `pathlib` here.
+Imported at each start of the firmware: nothing heavier than `json` and `typing` here.
 """
 
 from __future__ import annotations
@@ -9,12 +9,9 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from deploy.board.disk import read_bounded
-
-if TYPE_CHECKING:
-    from typing import Any
 
 FACTORY = ""
 """The name of the release that came with the image."""

@@ -17,7 +17,7 @@ import pytest
 from card_stand import CHECKOUT, NEW, Card, contents, lay, release_json
 
 from deploy.board.releases import receive
-from deploy.board.releases.choose import Choice
+from deploy.board.releases.choose import HEALTHY, Choice
 from deploy.errors import DeployError
 from deploy.update import bundle as bundles
 from deploy.update import card as remote
@@ -204,7 +204,7 @@ def test_a_link_that_goes_and_comes_back_is_no_end() -> None:
     older = {"last": {"id": "s", "outcome": "fell back"}}
     said: list[str] = []
     card = Silent([{"last": None}, away, away, older, away, healthy])
-    assert remote.is_healthy(card.follow("t", 120, said.append, lambda s: None))
+    assert card.follow("t", 120, said.append, lambda s: None)["outcome"] == HEALTHY
     assert said == ["not reached, trying on: x: no route"] * 2
     now_s = [0.0]
 
@@ -278,7 +278,7 @@ def test_over_a_real_sshd(
     sizes: list[int] = []
     answer = card.give(made, held, sizes.append)
     assert sum(sizes) == bundles.size_to_send(made, held) > 3_000_000
-    assert remote.is_healthy(card.follow(answer["id"], 120, lambda line: None))
+    assert card.follow(answer["id"], 120, lambda line: None)["outcome"] == HEALTHY
     assert (stand.card.at.folder(NEW) / "site/big").read_bytes() == big["site/big"]
     # A refusal comes back as the card's own words, though the rest of the bundle is not read.
     stranger = bundles.make(contents("0.9.0", big), other_keys / "releases/1")
