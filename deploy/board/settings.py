@@ -5,7 +5,6 @@ the firmware's defaults < the board's < blimp/payload.toml < what blimp.toml say
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -22,11 +21,8 @@ def read(text: bytes, name: str) -> dict[str, Any]:
     """A TOML file's document; raises `DeployError` that begins with `name`."""
     try:
         return toml_text.read(text)
-    except UnicodeDecodeError:
-        raise DeployError(f"{name}: not UTF-8 text") from None
-    except (ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:160]
-        raise DeployError(f"{name}: not valid TOML: {reason}") from None
+    except DeployError as error:
+        raise DeployError(f"{name}: {error}") from None
 
 
 def merged(
@@ -91,17 +87,12 @@ def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else _string(key)
-
-
-def _string(text: str) -> str:
-    # JSON's escapes are TOML's; JSON lets DEL through, TOML does not.
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
+    return key if _BARE.fullmatch(key) else toml_text.string(key)
 
 
 def _value(value: Any, name: str) -> str:
     if isinstance(value, str):
-        return _string(value)
+        return toml_text.string(value)
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):

@@ -16,6 +16,7 @@ from deploy.provisioning.model import (
     Wifi,
     keeps_password,
 )
+from deploy.provisioning.toml_text import string
 
 FILE = "blimp.toml"
 SCHEMA = 1
@@ -69,13 +70,7 @@ def _document(text: bytes) -> dict[str, Any]:
         raise DeployError("it is UTF-16; save it as UTF-8")
     if b"\0" in text:
         raise DeployError("it holds a NUL byte: the file is cut or damaged, write it again")
-    try:
-        return toml_text.read(text)
-    except UnicodeDecodeError as error:
-        line = text.count(b"\n", 0, error.start) + 1
-        raise DeployError(f"line {line} is not UTF-8; save it as UTF-8") from None
-    except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError, too
-        raise DeployError(f"not valid TOML: {_one_line(error)}") from None
+    return toml_text.read(text)
 
 
 def _provisioning(document: dict[str, Any]) -> Provisioning:
@@ -168,13 +163,13 @@ schema = {SCHEMA}
 
 [payload]
 # Its name in telemetry, and in its certificate: 1 to 32 of a-z, 0-9, - and _.
-id = {_string(provisioning.payload_id)}
+id = {string(provisioning.payload_id)}
 """
         + _wifi_text(provisioning)
         + f"""
 [ground_station]
 # "auto": the one that telemetry finds in this network; or its address.
-host = {_string(ground.host)}
+host = {string(ground.host)}
 # UDP port of the video, 1 to 65535.
 video_port = {ground.video_port}
 # Endpoints of telemetry, as ["tls/HOST:7447"]. Empty: from the host.
@@ -217,42 +212,23 @@ def _wifi_text(provisioning: Provisioning) -> str:
     if wifi is None:
         return _NO_WIFI
     try:
-        ssid = f"ssid = {_string(wifi.ssid.decode())}"
+        ssid = f"ssid = {string(wifi.ssid.decode())}"
     except UnicodeDecodeError:
         ssid = f'ssid_hex = "{wifi.ssid.hex()}"'
     return _WIFI_HELP.format(
         ssid=ssid,
         note=_KEPT if keeps_password(provisioning) else "",
-        password=_string(wifi.password),
-        security=_string(wifi.security),
-        country=_string(wifi.country),
+        password=string(wifi.password),
+        security=string(wifi.security),
+        country=string(wifi.country),
         hidden="true" if wifi.hidden else "false",
     )
 
 
-_SHORT = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t"}
-# What some editors take for the end of a line, or leave out when they save.
-_ESCAPED = {0x7F, *range(0x80, 0xA0), 0x2028, 0x2029, 0xFEFF}
-
-
-def _string(text: str) -> str:
-    """A TOML basic string on one line."""
-    characters = []
-    for character in text:
-        code = ord(character)
-        if character in _SHORT:
-            characters.append(_SHORT[character])
-        elif code < 0x20 or code in _ESCAPED:
-            characters.append(f"\\u{code:04X}")
-        else:
-            characters.append(character)
-    return f'"{"".join(characters)}"'
-
-
 def _list(texts: tuple[str, ...]) -> str:
     if len(texts) < 2:
-        return f"[{''.join(map(_string, texts))}]"
-    return "[\n" + "".join(f"    {_string(text)},\n" for text in texts) + "]"
+        return f"[{''.join(map(string, texts))}]"
+    return "[\n" + "".join(f"    {string(text)},\n" for text in texts) + "]"
 
 
 def _shown(value: object) -> str:
@@ -263,7 +239,3 @@ def _shown(value: object) -> str:
     except (ValueError, RecursionError):  # such a number inside a list, or tables without end
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__

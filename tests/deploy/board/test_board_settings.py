@@ -87,7 +87,8 @@ def test_what_no_configuration_holds_is_refused(text: bytes, told: str) -> None:
 def test_what_is_no_toml_is_one_line(text: bytes) -> None:
     with pytest.raises(DeployError) as error:
         settings.read(text, "payload.toml")
-    assert str(error.value).startswith("payload.toml: not ") and "\n" not in str(error.value)
+    said = str(error.value)
+    assert said.startswith("payload.toml: ") and " not " in said and "\n" not in said
 
 
 def test_a_mark_of_windows_editors_is_not_in_the_way() -> None:
