@@ -11,7 +11,11 @@ from pathlib import Path
 from pi_firmware.autopilot import Autopilot
 from pi_firmware.capture import Capture
 from pi_firmware.ground import IDR_GAP_S, Ground
-from pi_firmware.health import Board, PeriodicThread, Restarts, Table, Task, Wifi, memory
+from pi_firmware.health import memory
+from pi_firmware.health.board import Board
+from pi_firmware.health.restarts import Restarts
+from pi_firmware.health.tasks import PeriodicThread, Table, Task
+from pi_firmware.health.wifi import Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.release import of_environment
 from pi_firmware.settings import Settings

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pi_firmware.health import Board, BoardState
+from pi_firmware.health.board import Board, BoardState
 from pi_firmware.wire import messages
 
 STAT = "cpu  {user} 0 100 {idle} 50 0 10 0 0 0\ncpu0 1 2 3 4 5 6 7 8 9 10\n"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from waiting import eventually
 
-from pi_firmware.health import Restarts
+from pi_firmware.health.restarts import Restarts
 
 
 class Card:
@@ -257,7 +257,7 @@ def test_what_a_power_cut_needs_is_synced_in_its_order(
 def test_killed_at_any_moment_the_file_is_whole(card: Card) -> None:
     program = (
         "import sys\n"
-        "from pi_firmware.health import Restarts\n"
+        "from pi_firmware.health.restarts import Restarts\n"
         "print('begun', flush=True)\n"
         "while True:\n"
         "    Restarts(sys.argv[1], 3).begin()\n"

@@ -6,7 +6,7 @@ import time
 import pytest
 from waiting import eventually
 
-from pi_firmware.health import PeriodicThread, Table, Task
+from pi_firmware.health.tasks import PeriodicThread, Table, Task
 
 LIMIT_S = 20.0
 TASKS = (Task("health", 1.0, 5.0), Task("battery", 1.0, 10.0), Task("wifi", 1.0, 30.0))

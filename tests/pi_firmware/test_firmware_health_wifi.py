@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 from waiting import eventually
 
-from pi_firmware.health import Wifi, WifiState, programs, radio
+from pi_firmware.health import programs, radio
 from pi_firmware.health.programs import ProgramError
+from pi_firmware.health.wifi import Wifi, WifiState
 from pi_firmware.settings import WifiSettings
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import ConfigError

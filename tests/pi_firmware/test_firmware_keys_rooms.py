@@ -22,7 +22,7 @@ from pi_firmware.autopilot.poses import PoseGate
 from pi_firmware.battery import Monitor
 from pi_firmware.battery.bus import Counts
 from pi_firmware.correction import Sender
-from pi_firmware.health import Wifi
+from pi_firmware.health.wifi import Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import Settings, load
 from pi_firmware.sources.schemes import libcamera, v4l2

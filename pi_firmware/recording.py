@@ -1,4 +1,7 @@
-"""Starts and stops recordings, and takes frames and telemetry without ever waiting for a disk."""
+"""Recordings on the payload's own card, of frames and telemetry, which never wait for a disk.
+
+How files get to it is shared with the ground station: `pi_firmware.wire.recorder`.
+"""
 
 from __future__ import annotations
 
