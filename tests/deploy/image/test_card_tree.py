@@ -13,7 +13,7 @@ import pytest
 from card_parts import EPOCH, commit, git
 
 from deploy.errors import DeployError
-from deploy.image import boot, checkout, cpio, release, sparse
+from deploy.image import boot, checkout, initrd, release, sparse
 from deploy.image.partitions import align, power_of_two
 from deploy.image.sparse import Range
 from deploy.image.tree import Tree
@@ -153,8 +153,8 @@ def test_the_cpio_archive_is_what_cpio_reads(tmp_path):
     tree.write("bin/tool", b"abcde", 0o755)
     tree.link("bin/sh", "tool")
     tree.folder("dev", 0o700)
-    archive = cpio.pack(tree)
-    assert len(archive) % 4 == 0 and archive == cpio.pack(tree)
+    archive = initrd.pack(tree)
+    assert len(archive) % 4 == 0 and archive == initrd.pack(tree)
     folder = tmp_path / "out"
     folder.mkdir()
     subprocess.run(["cpio", "-id", "--quiet"], input=archive, cwd=folder, check=True)
