@@ -104,19 +104,11 @@ def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) 
     kernel = unpack_kernel(board, cache_folder)
     say("packages (the first time this takes a quarter of an hour)")
     rootfs = build_rootfs(board, cache_folder, _ROOTFS_EPOCH)
-    assert board.kernel is not None  # unpack_kernel refuses a board without
-    given = card.Ingredients(
-        rootfs=rootfs,
-        modules=kernel.root,
-        kernel_release=kernel.version,
-        kernel=board.kernel.image,
-        boot=kernel.boot,
-        site=site,
-        machine=board.machine,
-        python=board.python,
-        compile=lambda folder, at: byte_compile(board, rootfs, folder, at, cache_folder),
-    )
-    card.build(image, board.name, given, _CHECKOUT, epoch, say)
+
+    def compile_at(folder: Path, at: str) -> None:
+        byte_compile(board, rootfs, folder, at, cache_folder)
+
+    card.build(image, board, kernel, rootfs, site, _CHECKOUT, epoch, compile_at, say)
     say("done")
 
 

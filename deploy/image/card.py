@@ -14,11 +14,12 @@ import shutil
 import tempfile
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.image import boot, ext4, fat, initrd, manifest, partitions, release, root
+from deploy.image.packages.board import Board
+from deploy.image.packages.kernel import Kernel
 from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two
 from deploy.image.sparse import sha256
 from deploy.image.tree import Tree
@@ -37,33 +38,6 @@ REAL_BOOT_BYTES = 256 * _MIB
 _NAMESPACE = uuid.UUID("9b5d3f1c-6a0e-4c57-9d0b-0f3a3c6b7a51")
 
 
-@dataclass(frozen=True)
-class Ingredients:
-    """What others made, as files.
-
-    Attributes:
-        rootfs: the packages' root, an uncompressed tar.
-        modules: a folder with `usr/lib/modules/RELEASE`, with depmod's tables.
-        kernel_release: as `uname -r` says on the card.
-        kernel: the name of the kernel's file in `boot`.
-        boot: a folder with what goes onto the boot partition: kernel, device trees, firmware.
-        site: a folder of unpacked wheels; None: none are needed.
-        machine, python: as `uname -m` says there, and as `3.13`.
-        compile: puts byte code beside all Python in a folder, which will lie at a path on the card;
-            None: the card compiles at each start.
-    """
-
-    rootfs: Path
-    modules: Path
-    kernel_release: str
-    kernel: str
-    boot: Path
-    site: Path | None
-    machine: str
-    python: str
-    compile: Callable[[Path, str], None] | None = None
-
-
 class Identifiers:
     """Identifiers that follow from what is on the card: another content, another card."""
 
@@ -80,20 +54,27 @@ class Identifiers:
 
 def build(
     image: Path,
-    board: str,
-    given: Ingredients,
+    board: Board,
+    kernel: Kernel,
+    rootfs: Path,
+    site: Path | None,
     checkout: Path,
     epoch: int,
+    compile: Callable[[Path, str], None] | None = None,
     say: Say = lambda line: None,
 ) -> None:
     """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
 
     Args:
         image: the final name; what is there stays until the new one is whole.
-        board: its name.
-        given: packages, kernel, wheels.
+        board: one with a kernel of its own.
+        kernel: that.
+        rootfs: the packages' root, an uncompressed tar.
+        site: a folder of unpacked wheels; None: none are needed.
         checkout: of this project, with git.
         epoch: the time of everything in it that is not older, s since 1970.
+        compile: puts byte code beside all Python in a folder, which will lie at a path on the card;
+            None: the card compiles at each start.
         say: takes a line of progress.
 
     Raises:
@@ -101,39 +82,34 @@ def build(
     """
     check_epoch(epoch)
     with building(image) as work:
-        _build(work / image.name, board, given, checkout, epoch, say)
-
-
-def _build(
-    image: Path, board: str, given: Ingredients, checkout: Path, epoch: int, say: Say
-) -> None:
-    say("reading the packages' root")
-    tree = Tree.from_tar(given.rootfs)
-    modules = f"usr/lib/modules/{given.kernel_release}"
-    if not (given.modules / modules / "modules.dep").is_file():
-        raise DeployError(f"{given.modules}/{modules}: no modules.dep in it")
-    tree.take(given.modules, [f"{modules}/{n}" for n in _files(given.modules / modules)])
-    firmware = release.build(checkout, given.site, given.machine, given.python, epoch)
-    units = root.customise(tree, checkout, board, firmware, epoch)
-    if given.compile is not None:
-        say("byte code of the card's programs")
-        root.add_byte_code(tree, given.compile)
-    new = Identifiers(board.encode(), tree.digest(epoch))
-    say(f"root: {len(tree)} files, {len(units)} units enabled")
-    first = initrd.build(tree, given.kernel_release)
-    files = Tree()
-    files.take(given.boot, _files(given.boot))
-    if given.kernel not in files:
-        raise DeployError(f"{given.boot}: no kernel '{given.kernel}' in it")
-    where = f"UUID={new.uuid('root')}"
-    front = boot.contents(board, given.kernel, given.machine, files, first, where)
-    say("root partition")
-    place = image.with_name("root")
-    size = align(ext4.bytes_needed(tree))
-    ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
-    say("boot and data partition, image, block map and checksums")
-    told = manifest.Told(board, checkout, epoch, manifest.packages_of(tree), given.site, units)
-    finish(image, front, place, new, told)
+        say("reading the packages' root")
+        tree = Tree.from_tar(rootfs)
+        modules = f"usr/lib/modules/{kernel.version}"
+        if not (kernel.root / modules / "modules.dep").is_file():
+            raise DeployError(f"{kernel.root}/{modules}: no modules.dep in it")
+        tree.take(kernel.root, [f"{modules}/{n}" for n in _files(kernel.root / modules)])
+        firmware = release.build(checkout, site, board.machine, board.python, epoch)
+        units = root.customise(tree, checkout, board.name, firmware, epoch)
+        if compile is not None:
+            say("byte code of the card's programs")
+            root.add_byte_code(tree, compile)
+        new = Identifiers(board.name.encode(), tree.digest(epoch))
+        say(f"root: {len(tree)} files, {len(units)} units enabled")
+        first = initrd.build(tree, kernel.version)
+        files = Tree()
+        files.take(kernel.boot, _files(kernel.boot))
+        if kernel.image not in files:
+            raise DeployError(f"{kernel.boot}: no kernel '{kernel.image}' in it")
+        where = f"UUID={new.uuid('root')}"
+        front = boot.contents(board.name, kernel.image, board.machine, files, first, where)
+        say("root partition")
+        place = work / "root"
+        size = align(ext4.bytes_needed(tree))
+        ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
+        say("boot and data partition, image, block map and checksums")
+        packages = manifest.packages_of(tree)
+        told = manifest.Told(board.name, checkout, epoch, packages, site, units)
+        finish(work / image.name, front, place, new, told)
 
 
 def finish(

@@ -36,12 +36,14 @@ class Kernel:
 
     Attributes:
         version: as `uname -r` says.
+        image: what its file in `boot` is called.
         boot: a folder of files and folders for the boot partition: the kernel under the board's
             name for it, device trees, `overlays/`, the first stage's programs.
         root: a tree to lay over the root file system: modules with their index, licences.
     """
 
     version: str
+    image: str
     boot: Path
     root: Path
 
@@ -66,7 +68,7 @@ def unpack_kernel(board: Board, cache_folder: Path) -> Kernel:
         if work is not None:
             _make(board, choice, work, work / target.name)
     (modules,) = (target / "root" / _MODULES).iterdir()
-    return Kernel(modules.name, target / "boot", target / "root")
+    return Kernel(modules.name, choice.image, target / "boot", target / "root")
 
 
 def _make(board: Board, choice: KernelChoice, work: Path, folder: Path) -> None:

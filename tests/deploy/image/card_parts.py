@@ -10,9 +10,11 @@ import shutil
 import subprocess
 import tarfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-from deploy.image.card import Ingredients
+from deploy.image import card
+from deploy.image.packages import Kernel, load_board
 
 CHECKOUT = Path(__file__).parents[3]
 EPOCH = 1_760_000_000
@@ -159,13 +161,28 @@ def write_tar(path: Path, members: dict[str, bytes | str | None], reverse: bool 
     return path
 
 
+@dataclass(frozen=True)
+class Ingredients:
+    """What others made, as files."""
+
+    kernel: Kernel
+    rootfs: Path
+    site: Path
+
+
+def build(image: Path, given: Ingredients, checkout: Path, epoch: int) -> None:
+    """A card for the emulator."""
+    board = load_board("qemu")
+    card.build(image, board, given.kernel, given.rootfs, given.site, checkout, epoch)
+
+
 def make_ingredients(folder: Path, reverse: bool = False) -> Ingredients:
-    """Everything that `card.build` takes, written into a folder."""
+    """Everything that `build` takes, written into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     write_tar(folder / "root.tar", root_members(), reverse)
-    kernel = folder / f"modules/usr/lib/modules/{RELEASE}"
+    tables = folder / f"modules/usr/lib/modules/{RELEASE}"
     boot, site = folder / "boot", folder / "site"
-    contents = [(kernel / name, data) for name, data in modules(RELEASE).items()]
+    contents = [(tables / name, data) for name, data in modules(RELEASE).items()]
     contents += [
         (boot / "vmlinuz", b"kernel " * 1000),
         (boot / "bcm2837-rpi-3-b.dtb", b"tree"),
@@ -176,16 +193,8 @@ def make_ingredients(folder: Path, reverse: bool = False) -> Ingredients:
     for path, data in reversed(contents) if reverse else contents:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    return Ingredients(
-        rootfs=folder / "root.tar",
-        modules=folder / "modules",
-        kernel_release=RELEASE,
-        kernel="vmlinuz",
-        boot=boot,
-        site=site,
-        machine="aarch64",
-        python="3.13",
-    )
+    kernel = Kernel(RELEASE, "vmlinuz", boot, folder / "modules")
+    return Ingredients(kernel, folder / "root.tar", site)
 
 
 def make_checkout(folder: Path) -> Path:

@@ -16,6 +16,7 @@ from card_parts import (
     EPOCH,
     RELEASE,
     ImageReader,
+    build,
     make_checkout,
     make_ingredients,
     missing_tools,
@@ -24,7 +25,6 @@ from card_parts import (
 from deploy.errors import DeployError
 from deploy.image import __main__ as command
 from deploy.image import card, sparse
-from deploy.image.packages import Kernel
 
 pytestmark = pytest.mark.skipif(
     (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
@@ -40,7 +40,7 @@ def checkout(tmp_path_factory):
 def image(tmp_path_factory, checkout):
     folder = tmp_path_factory.mktemp("image")
     place = folder / "out/blimp-qemu.img"
-    card.build(place, "qemu", make_ingredients(folder / "in"), checkout, EPOCH)
+    build(place, make_ingredients(folder / "in"), checkout, EPOCH)
     return place
 
 
@@ -286,7 +286,7 @@ def test_the_same_inputs_give_the_same_bytes(image, checkout, tmp_path):
     umask = os.umask(0o077)
     try:
         given = make_ingredients(tmp_path / "in", reverse=True)
-        card.build(again, "qemu", given, checkout, EPOCH)
+        build(again, given, checkout, EPOCH)
     finally:
         os.umask(umask)
     assert sparse.sha256(again) == sparse.sha256(image)
@@ -298,7 +298,7 @@ def test_another_content_gives_another_card(image, reader, checkout, tmp_path):
     given = make_ingredients(tmp_path / "in")
     (tmp_path / "in/site/mcap/__init__.py").write_text("x = 2\n")
     place = tmp_path / "blimp-qemu.img"
-    card.build(place, "qemu", given, checkout, EPOCH)
+    build(place, given, checkout, EPOCH)
     other = ImageReader(place, tmp_path / "parts")
     assert other.table["id"] != reader.table["id"]
     assert (
@@ -316,19 +316,19 @@ def _no_tar(given, folder):
 
 
 def _no_kernel(given, folder):
-    (given.boot / "vmlinuz").unlink()
+    (given.kernel.boot / "vmlinuz").unlink()
 
 
 def _no_tables(given, folder):
-    (given.modules / f"usr/lib/modules/{RELEASE}/modules.dep").unlink()
+    (given.kernel.root / f"usr/lib/modules/{RELEASE}/modules.dep").unlink()
 
 
 def _no_overlay(given, folder):
-    (given.modules / f"usr/lib/modules/{RELEASE}/modules.builtin").write_text("")
+    (given.kernel.root / f"usr/lib/modules/{RELEASE}/modules.builtin").write_text("")
 
 
 def _fat_kernel(given, folder):
-    with open(given.boot / "vmlinuz", "wb") as file:
+    with open(given.kernel.boot / "vmlinuz", "wb") as file:
         file.truncate(70 << 20)
 
 
@@ -352,7 +352,7 @@ def test_what_is_broken_or_too_big_is_one_line_and_the_old_image_stays(
     given = make_ingredients(tmp_path / "in")
     harm(given, tmp_path)
     with pytest.raises(DeployError, match=says) as failure:
-        card.build(place, "qemu", given, checkout, EPOCH)
+        build(place, given, checkout, EPOCH)
     assert "\n" not in str(failure.value)
     assert place.read_bytes() == b"the old one"
     assert list(place.parent.iterdir()) == [place], "nothing half-made is left"
@@ -366,7 +366,7 @@ def test_a_tool_that_fails_in_the_midst_leaves_nothing(checkout, tmp_path, monke
     (tools / "bmaptool").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
     with pytest.raises(DeployError, match=r"^bmaptool: No space left on device$"):
-        card.build(place, "qemu", make_ingredients(tmp_path / "in"), checkout, EPOCH)
+        build(place, make_ingredients(tmp_path / "in"), checkout, EPOCH)
     assert list(place.parent.iterdir()) == []
 
 
@@ -392,10 +392,9 @@ def test_the_command_makes_of_packages_kernel_and_wheels_the_same_image(
 ):
     given = make_ingredients(tmp_path / "in")
     compiled = []
-    kernel = Kernel(RELEASE, given.boot, given.modules)
     monkeypatch.setattr(command, "_CHECKOUT", checkout)
     monkeypatch.setattr(command, "fetch_wheels", lambda board, cache: given.site)
-    monkeypatch.setattr(command, "unpack_kernel", lambda board, cache: kernel)
+    monkeypatch.setattr(command, "unpack_kernel", lambda board, cache: given.kernel)
     monkeypatch.setattr(command, "build_rootfs", lambda board, cache, epoch: given.rootfs)
     monkeypatch.setattr(command, "byte_compile", lambda *given: compiled.append(given[3]))
     monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
@@ -409,4 +408,4 @@ def test_the_command_makes_of_packages_kernel_and_wheels_the_same_image(
 
 def test_a_time_that_fat_cannot_tell_is_refused(checkout, tmp_path):
     with pytest.raises(DeployError, match="--epoch 0: allowed: 315532800 to 4354819199"):
-        card.build(tmp_path / "x.img", "qemu", make_ingredients(tmp_path / "in"), checkout, 0)
+        build(tmp_path / "x.img", make_ingredients(tmp_path / "in"), checkout, 0)
