@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from deploy.board.inputs import SIGNERS
 from deploy.errors import DeployError, Interrupted
 from deploy.flash import customise, image, keys, refusals, wishes, write
 from deploy.flash.boot import BootPartition
@@ -148,7 +149,7 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
     Provisioning(payload)  # its name, before it is a folder's
     folder = options.keys or wishes.default_keys()
     held = keys.load(folder, payload) if options.payload else None
-    if held is not None and keys.SIGNERS not in held.files:
+    if held is not None and SIGNERS not in held.files:
         print(
             f"note: the card will take no updates: {folder} names no key of releases for it;"
             " make one, and set it up again: blimp keys release"

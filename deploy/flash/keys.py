@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from deploy.board.inputs import KNOWN, NEEDED
 from deploy.errors import DeployError
 from deploy.flash.wishes import read_file
 
-NEEDED = ("ca.pem", "certificate.pem", "key.pem", "access.json", "srtp.key")
-SIGNERS = "allowed_signers"  # whose releases the payload takes
-OPTIONAL = ("ssh_ed25519", "ssh_ed25519.pub", SIGNERS)
 FLASHED, FLASHED_SCHEMA = "flashed.json", "blimp.flashed/1"
 _ACCESS_SCHEMA = "blimp.access/1"
 
@@ -39,7 +37,7 @@ def load(folder: Path, payload: str) -> Keys:
             " (another folder: --keys)"
         )
     files = {name: read_file(place / name) for name in NEEDED}
-    files |= {name: read_file(place / name) for name in OPTIONAL if (place / name).exists()}
+    files |= {name: read_file(place / name) for name in KNOWN if (place / name).exists()}
     access = _access(place, files["access.json"])
     name, peers = access.get("name"), access.get("peers")
     if name != f"payload.{payload}":
