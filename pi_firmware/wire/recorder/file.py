@@ -46,7 +46,8 @@ class RecordingFile:
         self.kept = 0
         """Frames of these that are in the file for certain."""
         self._kinds = recording
-        self._pending_bytes = 0
+        self.pending_bytes = 0
+        """What a flush would write, about."""
         self._chunks = 0
         self._gop_bytes = self._longest_gop_bytes = 0
         self._unsynced = True
@@ -56,7 +57,8 @@ class RecordingFile:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from None
         try:
-            self._writer = self._opened(head)
+            self.writer = self._opened(head)
+            """What its other messages are written with; to be told of by `added`."""
         except BaseException:
             with contextlib.suppress(OSError):
                 self._file.close()
@@ -79,17 +81,12 @@ class RecordingFile:
     def size_bytes(self) -> int:
         """What the file would have if it ended now, at most."""
         index_bytes = HEAD_BYTES + _CHUNK_INDEX_BYTES * (self._chunks + 1)
-        return self._file.tell() + self._pending_bytes + index_bytes
+        return self._file.tell() + self.pending_bytes + index_bytes
 
     @property
     def written_bytes(self) -> int:
         """What it has."""
         return self._file.tell()
-
-    @property
-    def pending_bytes(self) -> int:
-        """What a flush would write, about."""
-        return self._pending_bytes
 
     @property
     def begun(self) -> bool:
@@ -100,11 +97,6 @@ class RecordingFile:
         """Whether another group of pictures, as long as the longest, would not fit."""
         too_long = self.size_bytes + self._longest_gop_bytes > limit_bytes
         return too_long or self._chunks >= _MAX_CHUNKS
-
-    @property
-    def writer(self) -> RecordingWriter:
-        """What its other messages are written with; to be told of by `added`."""
-        return self._writer
 
     def unit(
         self,
@@ -123,8 +115,8 @@ class RecordingFile:
         told = {"exposure_s": info.exposure_s, "gain": info.gain}
         known = {k: v for k, v in told.items() if v is not None and math.isfinite(v)}
         topic = prefix + self._kinds.VIDEO_TOPIC
-        self._writer.write_video(info.time_ns, access_unit, topic=topic, log_ns=log_ns)
-        self._writer.write_json(
+        self.writer.write_video(info.time_ns, access_unit, topic=topic, log_ns=log_ns)
+        self.writer.write_json(
             prefix + self._kinds.FRAME_INFO_TOPIC,
             log_ns,
             {"sequence": info.sequence, **known},
@@ -137,14 +129,14 @@ class RecordingFile:
 
     def added(self, content_bytes: int) -> None:
         """One more message, of so many bytes, was written with `writer`."""
-        self._pending_bytes += content_bytes + _RECORD_BYTES
+        self.pending_bytes += content_bytes + _RECORD_BYTES
         self._unsynced = True
 
     def flush(self) -> None:
         """Ends the chunk in progress: all so far is in the file."""
-        if self._pending_bytes:
-            self._writer.flush()
-            self._pending_bytes = 0
+        if self.pending_bytes:
+            self.writer.flush()
+            self.pending_bytes = 0
             self._chunks += 1
             self.kept = self.frames
 
@@ -166,8 +158,8 @@ class RecordingFile:
             return
         self._ended = True
         with contextlib.suppress(BlimpError):
-            self._writer.write_metadata("recording_end", end)
-        self._writer.close()
+            self.writer.write_metadata("recording_end", end)
+        self.writer.close()
         self.kept = self.frames
 
     @contextlib.contextmanager
