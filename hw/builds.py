@@ -12,8 +12,8 @@ from hw.parts import SOURCES, Part
 from hw.quantities import checked
 from pi_firmware.wire import config
 
-_SIGMAS = ("temperature_C", "pressure_hPa", "humidity_percent", "purity_percent",
-           "superpressure_Pa", "leak_percent_per_day")  # fmt: skip
+UNCERTAIN = ("temperature_C", "pressure_hPa", "humidity_percent", "purity_percent",
+             "superpressure_Pa", "leak_percent_per_day")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Conditions:
     helium_kg_m3: float | None = None
 
     def __post_init__(self) -> None:
-        for name in (*_SIGMAS, "days"):
+        for name in (*UNCERTAIN, "days"):
             checked(name, getattr(self, name))
         for name in ("altitude_m", "air_kg_m3", "helium_kg_m3"):
             if getattr(self, name) is not None:
                 checked(name, getattr(self, name))
-        for name in _SIGMAS:
+        for name in UNCERTAIN:
             sigma = self.sigma_of(name)
             if not (math.isfinite(sigma) and sigma >= 0):
                 raise HardwareError(f"the sigma of {name} is {sigma:g}; allowed: 0 and more")
@@ -119,6 +119,11 @@ class Hull:
             raise ValueError(f"film_spread_g_m2 is {self.film_spread_g_m2:g}; allowed: 0 and more")
         if self.free_lift_g is not None:
             checked("free_lift_g", self.free_lift_g)
+        for name, place in self.stations.items():
+            good = isinstance(place, list | tuple) and len(place) == 2
+            if not good or not all(isinstance(v, int | float) and abs(v) <= 50 for v in place):
+                raise ValueError(f"station {name!r} must be [forward m, up m], -50 to 50")
+            self.stations[name] = (float(place[0]), float(place[1]))
         _ = self.envelope  # refused now, not when it is first asked for
 
     @property

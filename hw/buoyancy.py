@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
-from hw.builds import Build, Conditions
+from hw.builds import UNCERTAIN, Build, Conditions
 from hw.quantities import RANGES, checked
 
 THESIS_GROSS_G = 202.1
 """What the thesis prints for 0.1905 m³, 1.2260 and 0.1693 kg/m³; the product is 201.3 g."""
-
-_UNCERTAIN = ("temperature_C", "pressure_hPa", "humidity_percent", "purity_percent",
-              "superpressure_Pa", "leak_percent_per_day")  # fmt: skip
 
 
 def gross_lift_g(volume_m3: float, air_kg_m3: float, helium_kg_m3: float) -> float:
@@ -98,7 +95,7 @@ def _sigmas_that_act(day: Conditions) -> list[str]:
         dead |= {"temperature_C", "pressure_hPa"}
     if day.altitude_m is not None:
         dead |= {"pressure_hPa"}
-    return [n for n in _UNCERTAIN if n not in dead and day.sigma_of(n) > 0]
+    return [n for n in UNCERTAIN if n not in dead and day.sigma_of(n) > 0]
 
 
 def _mass_spreads(build: Build) -> dict[str, float]:

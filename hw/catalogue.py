@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from hw.builds import Build, Conditions, Hull, with_ballast
 from hw.errors import HardwareError
@@ -15,8 +14,20 @@ from hw.quantities import checked
 from pi_firmware.wire import config
 
 BUILDS_FILE = Path(__file__).with_name("builds.toml")
-_BUILD_KEYS = ("name", "about", "hull", "parts", "conditions", "ballast_g", "ballast_station",
-               "ballast_to_mass_g")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A table [[build]] as the file has it."""
+
+    name: str
+    hull: str
+    conditions: str
+    about: str = ""
+    parts: dict[str, list[str]] = field(default_factory=dict)
+    ballast_g: float = 0.0
+    ballast_station: str = ""
+    ballast_to_mass_g: float | None = None
 
 
 @dataclass(frozen=True)
@@ -45,19 +56,19 @@ def load_builds(path: str | Path = BUILDS_FILE) -> Catalogue:
         raise HardwareError(f"{path}: unknown key {unknown[0]!r}")
     hulls: dict[str, Hull] = {}
     for entry in entries_of(document, "hull", path):
-        where = f"{path}: hull {entry.get('id')!r}"
-        entry = dict(entry)
-        stations = _stations(entry.pop("stations", {}), where)
-        entry_hull = config.from_mapping(entry, Hull, where=where)
-        hulls[entry_hull.id] = _with_stations(entry_hull, stations)
+        hull = config.from_mapping(entry, Hull, where=f"{path}: hull {entry.get('id')!r}")
+        hulls[hull.id] = hull
+    tables = document.get("conditions", {})
+    if not isinstance(tables, dict):
+        raise HardwareError(f"{path}: 'conditions' must be a table, not {tables!r}")
     days = {
         name: config.from_mapping(entry, Conditions, where=f"{path}: conditions {name!r}")
-        for name, entry in _table(document, "conditions", str(path)).items()
+        for name, entry in tables.items()
     }
     builds: dict[str, Build] = {}
     for entry in entries_of(document, "build", path):
         where = f"{path}: build {entry.get('name')!r}"
-        build = _build(entry, hulls, days, parts, where)
+        build = _build(config.from_mapping(entry, _Entry, where=where), hulls, days, parts, where)
         if build.name in builds:
             raise HardwareError(f"{where} stands there twice")
         builds[build.name] = build
@@ -73,53 +84,22 @@ def shipped_builds() -> Catalogue:
     return load_builds()
 
 
-def _table(document: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-    table = document.get(key, {})
-    if not isinstance(table, dict):
-        raise HardwareError(f"{where}: '{key}' must be a table, not {table!r}")
-    return table
-
-
-def _number(entry: dict[str, Any], key: str, where: str) -> float:
-    value = entry.get(key, 0.0)
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise HardwareError(f"{where}: '{key}' must be a number, not {value!r}")
-    return float(value)
-
-
-def _stations(entry: Any, where: str) -> dict[str, tuple[float, float]]:
-    stations = {}
-    for name, place in entry.items() if isinstance(entry, dict) else ():
-        good = isinstance(place, list) and len(place) == 2
-        if not good or not all(isinstance(v, int | float) and abs(v) <= 50 for v in place):
-            raise HardwareError(f"{where}: station {name!r} must be [forward m, up m], -50 to 50")
-        stations[name] = (float(place[0]), float(place[1]))
-    if not stations:
-        raise HardwareError(f"{where}: it has no stations")
-    return stations
-
-
-def _with_stations(hull: Hull, stations: dict[str, tuple[float, float]]) -> Hull:
-    hull.stations.update(stations)
-    return hull
-
-
 def _build(
-    entry: dict[str, Any],
+    entry: _Entry,
     hulls: dict[str, Hull],
     days: dict[str, Conditions],
     parts: dict[str, Part],
     where: str,
 ) -> Build:
-    known = ", ".join(_BUILD_KEYS)
-    unknown = sorted(set(entry) - set(_BUILD_KEYS))
-    if unknown:
-        raise HardwareError(f"{where}: unknown key {unknown[0]!r} (known here: {known})")
-    hull = hulls.get(str(entry.get("hull")))
+    hull, day = hulls.get(entry.hull), days.get(entry.conditions)
     if hull is None:
-        raise HardwareError(f"{where}: hull {entry.get('hull')!r}; there are: {', '.join(hulls)}")
+        raise HardwareError(f"{where}: hull {entry.hull!r}; there are: {', '.join(hulls)}")
+    if day is None:
+        raise HardwareError(
+            f"{where}: conditions {entry.conditions!r}; there are: {', '.join(days)}"
+        )
     placed = []
-    for station, ids in _table(entry, "parts", where).items():
+    for station, ids in entry.parts.items():
         if not isinstance(ids, list):
             raise HardwareError(f"{where}: parts.{station} must be a list of ids, not {ids!r}")
         if station not in hull.stations:
@@ -130,18 +110,12 @@ def _build(
             if not isinstance(part_id, str) or part_id not in parts:
                 raise HardwareError(f"{where}: part {part_id!r} is not in parts.toml")
             placed.append((parts[part_id], station))
-    conditions = days.get(str(entry.get("conditions")))
-    if conditions is None:
-        day = entry.get("conditions")
-        raise HardwareError(f"{where}: conditions {day!r}; there are: {', '.join(days)}")
-    station = str(entry.get("ballast_station", ""))
-    ballast = _number(entry, "ballast_g", where)
-    bare = Build(str(entry.get("name", "")), str(entry.get("about", "")), hull, tuple(placed),
-                 conditions)  # fmt: skip
-    if "ballast_to_mass_g" in entry:
-        ballast = _number(entry, "ballast_to_mass_g", where) - math.fsum(
-            i.mass_g for i in bare.items
+    bare = Build(entry.name, entry.about, hull, tuple(placed), day)
+    ballast = entry.ballast_g
+    if entry.ballast_to_mass_g is not None:
+        ballast = entry.ballast_to_mass_g - math.fsum(i.mass_g for i in bare.items)
+    if ballast and entry.ballast_station not in hull.stations:
+        raise HardwareError(
+            f"{where}: ballast_station {entry.ballast_station!r} is not one of the hull's"
         )
-    if ballast and station not in hull.stations:
-        raise HardwareError(f"{where}: ballast_station {station!r} is not one of the hull's")
-    return with_ballast(bare, checked("ballast_g", ballast), station)
+    return with_ballast(bare, checked("ballast_g", ballast), entry.ballast_station)
