@@ -21,15 +21,12 @@ def make_folder(path: Path) -> None:
 
 def write(path: Path, produce: Callable[[Path], object]) -> None:
     """Lets `produce` write beside `path` and renames; a disk's refusal is a `HardwareError`."""
-    part = path.with_name(f".{path.name}.part{path.suffix}")
     make_folder(path.parent)
     try:
-        produce(part)
-        files.replace(part, path)
+        with files.replacing(path) as part:
+            produce(part)
     except OSError as error:
         raise HardwareError(f"{path}: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

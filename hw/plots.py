@@ -28,7 +28,7 @@ def draw(build: Build, margin: Margin, wear: Wear, folder: Path) -> list[Path]:
              "endurance.png": _endurance(build, wear)}  # fmt: skip
     for name, figure in plots.items():
         path = folder / name
-        output.write(path, partial(figure.savefig, dpi=110))
+        output.write(path, partial(figure.savefig, dpi=110, format="png"))
         made.append(path)
     return made
 
