@@ -9,7 +9,7 @@ from waiting import eventually
 
 from pi_firmware import gstreamer, sources
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources import faults
+from pi_firmware.sources.schemes import test as faults
 from pi_firmware.wire.errors import SourceError
 
 LIMIT_S = 20.0
