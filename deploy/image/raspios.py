@@ -61,20 +61,11 @@ def build(
     epoch: int,
     say: card.Say = lambda line: None,
 ) -> None:
-    """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
+    """Builds the image as `card.build` does, but of a `base`.
 
-    Args:
-        image: the final name; what is there stays until the new one is whole.
-        board: the Zero W.
-        base: a Raspberry Pi OS Lite image, 32 bit, trixie; `.xz` is unpacked.
-        site: a folder of unpacked wheels for it.
-        cache_folder: where what is installed into the base is kept.
-        checkout: of this project, with git.
-        epoch: the time of everything that is ours, s since 1970.
-        say: takes a line of progress.
-
-    Raises:
-        DeployError: the base is not what it should be, with what it is; a tool fails.
+    That is a Raspberry Pi OS Lite image, 32 bit, trixie; `.xz` is unpacked. What is installed into
+    it is kept in `cache_folder`; `epoch` is the time of everything that is ours. Raises
+    `DeployError` for a base that is not what it should be, with what it is.
     """
     card.check_epoch(epoch)
     with building(image) as work:
