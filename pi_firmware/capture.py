@@ -153,10 +153,6 @@ class Capture:
             # Not on this thread: a source that hangs does not take the message.
             threading.Thread(target=self._source.stop, name="end", daemon=True).start()
 
-    def close(self) -> None:
-        """Stops and releases everything."""
-        self._shut()
-
     def force_idr(self) -> None:
         """Makes the next frame an IDR."""
         media = self._media
@@ -215,13 +211,13 @@ class Capture:
 
     def _use(self, camera: CameraSettings) -> None:
         before = self._settings
-        self._shut()
+        self.close()
         self._settings, self._trusted = dataclasses.replace(before, camera=camera), before
         try:
             self._open()
             self.start()
         except BlimpError:
-            self._shut()
+            self.close()
             self._go_back(before)
             raise
 
@@ -231,7 +227,7 @@ class Capture:
         """
         if self._trusted is None:
             raise error
-        self._shut()
+        self.close()
         self._go_back(self._trusted)
         self._announce(messages.EVENT_CAMERA_RESTARTED, f"{error}; as it was before")
 
@@ -260,7 +256,8 @@ class Capture:
         except BlimpError as error:
             self._fail(_CAMERA, error)
 
-    def _shut(self) -> None:
+    def close(self) -> None:
+        """Stops and releases everything; raises `UnrecoverableError` for what hangs."""
         source, media = self._source, self._media
         self._source = self._media = None
         stopped = True
@@ -295,7 +292,7 @@ class Capture:
         """Closes both; they are opened again after a pause, or `UnrecoverableError` is raised."""
         if not self.live or self._ending:
             raise error
-        self._shut()
+        self.close()
         limit = self._settings.supervision.restarts
         if self._in_a_row >= limit:
             raise UnrecoverableError(
