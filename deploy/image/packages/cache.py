@@ -16,6 +16,7 @@ from typing import Any
 
 from deploy.board.releases.places import sync_folder
 from deploy.errors import DeployError
+from deploy.image.sparse import sha256
 
 _KEY_DIGITS = 16
 
@@ -24,7 +25,7 @@ def key(*inputs: Any) -> str:
     """A short name for inputs: records, texts, numbers, and files by what is in them."""
     digest = hashlib.sha256()
     for item in inputs:
-        digest.update(json.dumps(_plain(item), sort_keys=True).encode())
+        digest.update(json.dumps(item, sort_keys=True, default=_plain).encode())
         digest.update(b"\0")
     return digest.hexdigest()[:_KEY_DIGITS]
 
@@ -72,12 +73,5 @@ def _clear(target: Path) -> None:
 
 
 def _plain(item: Any) -> Any:
-    if isinstance(item, Path):
-        return hashlib.sha256(item.read_bytes()).hexdigest()
-    if dataclasses.is_dataclass(item) and not isinstance(item, type):
-        return _plain(dataclasses.asdict(item))
-    if isinstance(item, dict):
-        return {str(name): _plain(value) for name, value in item.items()}
-    if isinstance(item, list | tuple):
-        return [_plain(value) for value in item]
-    return item
+    """What JSON has for a record, and for a file."""
+    return sha256(item) if isinstance(item, Path) else dataclasses.asdict(item)
