@@ -68,19 +68,8 @@ class BootPartition:
 
     def has(self, path: str) -> bool:
         """Whether a file or a folder is there."""
-        folder, _, name = path.rpartition("/")
-        try:
-            listed = self._run("mdir", "-b", "-a", self._path(folder) + "/").decode(
-                errors="replace"
-            )
-        except DeployError as error:
-            if "not found" in str(error):
-                return False
-            raise
-        names = {
-            line.strip().rstrip("/").rpartition("/")[2].lower() for line in listed.splitlines()
-        }
-        return name.lower() in names
+        folder = path.rpartition("/")[0]
+        return path.lower() in map(str.lower, self.files(folder))
 
     def read(self, path: str) -> bytes:
         """A file's bytes."""
