@@ -93,12 +93,8 @@ class Encoder:
         self._since_idr = 0
         self._beside_kbps = 0.0
         """What is sent again and corrections, beside what the encoder makes."""
-        self._set_kbps = encoder.bitrate_kbps
-
-    @property
-    def bitrate_kbps(self) -> int:
+        self.bitrate_kbps = encoder.bitrate_kbps
         """The bit rate last asked for."""
-        return self._set_kbps
 
     def set_bitrate(self, kbps: int) -> int:
         """Has no more than this sent, within the configured bounds; returns what is asked for.
@@ -108,8 +104,8 @@ class Encoder:
         self._adaptation.bitrate_kbps = self._adaptation.limited(kbps)
         own_kbps = self._adaptation.bitrate_kbps - self._beside_kbps
         limited = round(self._adaptation.limited(own_kbps))
-        if limited != self._set_kbps:
-            self._set_kbps = limited
+        if limited != self.bitrate_kbps:
+            self.bitrate_kbps = limited
             if self._settings.name == "x264enc":
                 self._element.set_property("bitrate", limited)
             else:

@@ -57,15 +57,11 @@ class Ground:
         self._on_heard = on_heard
         self._clock = clock
         self._lock = threading.Lock()
-        self._followed = ""
+        self.followed = ""
+        """The ground station that was found and gets the video; empty while there is none."""
         self._followed_s = 0.0
         self._idr_s = float("-inf")
         self._seen: Seen | None = None
-
-    @property
-    def followed(self) -> str:
-        """The ground station that was found and gets the video; empty while there is none."""
-        return self._followed
 
     @property
     def seen(self) -> Seen | None:
@@ -95,11 +91,11 @@ class Ground:
         self._capture.link_report(report, self.link.report(report, now_s))
 
     def _follow(self, report: LinkReport, now_s: float) -> None:
-        if report.ground != self._followed and self._followed:
+        if report.ground != self.followed and self.followed:
             recent = now_s - self._followed_s < _FOLLOWED_SILENT_S
-            if recent and self._telemetry.ground_address(self._followed) is not None:
+            if recent and self._telemetry.ground_address(self.followed) is not None:
                 return
         address = self._telemetry.ground_address(report.ground)
         if address is not None:
-            self._followed, self._followed_s = report.ground, now_s
+            self.followed, self._followed_s = report.ground, now_s
             self.link.redirect(address, report.video_port)

@@ -122,7 +122,8 @@ class Link:
             sender = Sender(link, ssrc, sends_again=self.rtx_ssrc is not None)
             self._correction = ForwardCorrection(self._pipeline, sender)
         self._first_ns: int | None = None
-        self._to: tuple[str, int] | None = None
+        self.destination: tuple[str, int] | None = None
+        """Numeric address and port that packets go to; None while there is none."""
         self._waits_for_idr = False
         self._closing = threading.Event()
         self._resolver: threading.Thread | None = None
@@ -141,11 +142,6 @@ class Link:
             self._resolver.start()
 
     @property
-    def destination(self) -> tuple[str, int] | None:
-        """Numeric address and port that packets go to; None while there is none."""
-        return self._to
-
-    @property
     def correction_ssrc(self) -> int | None:
         """Corrections come with it; None: there are never any."""
         return self._correction.sender.ssrc if self._correction is not None else None
@@ -160,13 +156,13 @@ class Link:
     def redirect(self, host: str, port: int) -> bool:
         """Sends to another numeric address from the next packet on; False if it must not."""
         if self._loopback_only and not is_loopback(host):
-            self._to = None
+            self.destination = None
             self.problem = _without_key(host)
             return False
-        if (host, port) != self._to:
+        if (host, port) != self.destination:
             self._sink.set_property("host", host)
             self._sink.set_property("port", port)
-            self._to = (host, port)
+            self.destination = (host, port)
             self.problem = ""
         return True
 
@@ -197,7 +193,7 @@ class Link:
         on until the next IDR: what hangs on a missing frame is worth nothing.
         """
         full = self._source.get_property("current-level-buffers") >= _QUEUE_UNITS
-        if self._to is None or full or (self._waits_for_idr and not idr):
+        if self.destination is None or full or (self._waits_for_idr and not idr):
             self._waits_for_idr = True
             return False
         self._waits_for_idr = False
