@@ -17,7 +17,6 @@ from pi_firmware.wire import annexb, messages, sei
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recorder import recorder, run
 from pi_firmware.wire.recorder.durable import DurableFile, OpenFile
-from pi_firmware.wire.recorder.file import RecordingFile
 from pi_firmware.wire.recorder.queue import Unit
 
 TELEMETRY_ROOT = "/blimp"
@@ -34,28 +33,8 @@ class Telemetry:
     arrived_s: float
 
 
-class FlightFile(RecordingFile):
-    """A file with telemetry beside the video."""
-
-    def message(self, kind: str, message: messages.Message, shift_ns: int) -> None:
-        """Adds a telemetry message, `shift_ns` after its own time.
-
-        Raises `TelemetryError` for what JSON cannot say.
-        """
-        text = messages.encode(message)
-        self.writer.write_json_text(
-            f"{TELEMETRY_ROOT}/{kind}",
-            message.time_ns + shift_ns,
-            text,
-            schema_name=message.SCHEMA,
-        )
-        self.added(len(text))
-
-
 class FlightRun(run.Run):
     """Takes `Unit` and `Telemetry`; times rise within each of its files."""
-
-    file_type = FlightFile
 
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
@@ -128,12 +107,14 @@ class FlightRun(run.Run):
             self._say(item)
 
     def _say(self, item: Telemetry) -> None:
-        if item.message.time_ns + self._shift_ns not in run.TIMES_NS:
+        message, file = item.message, self._current
+        time_ns = message.time_ns + self._shift_ns
+        if time_ns not in run.TIMES_NS:
             return
-        file = self._current
-        assert isinstance(file, FlightFile)
         try:
-            file.message(item.kind, item.message, self._shift_ns)
+            text, topic = messages.encode(message), f"{TELEMETRY_ROOT}/{item.kind}"
+            file.writer.write_json_text(topic, time_ns, text, schema_name=message.SCHEMA)
+            file.added(len(text))
         except RecordingError:
             raise
         except Exception:  # not JSON: its sender's error, and no reason to end a recording

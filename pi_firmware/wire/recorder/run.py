@@ -39,8 +39,6 @@ class Run(ABC):
     What an item is, where it goes and when the next file begins is a subclass's: `_put`.
     """
 
-    file_type: type[RecordingFile] = RecordingFile
-
     def __init__(
         self,
         limits: Limits,
@@ -217,7 +215,7 @@ class Run(ABC):
         self._first = self._first or path.name
         self._part += 1
         head = {"recording": {"first_file": self._first, "part": str(self._part)}, **self._head}
-        file = self.file_type(path, self._open_file, head)
+        file = RecordingFile(path, self._open_file, head)
         try:
             self._folder.sync()
         except RecordingError:
