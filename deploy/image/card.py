@@ -105,7 +105,7 @@ def build(
         say("root partition")
         place = work / "root"
         size = align(ext4.bytes_needed(tree))
-        ext4.make(place, size, tree, ext4.Ext4(ROOT_LABEL, new.uuid("root")), epoch)
+        ext4.make(place, size, tree, ROOT_LABEL, new.uuid("root"), epoch)
         say("boot and data partition, image, block map and checksums")
         packages = manifest.packages_of(tree)
         told = manifest.Told(board.name, checkout, epoch, packages, site, units)
@@ -124,8 +124,8 @@ def finish(
     boot_place, data_place = image.with_name("boot"), image.with_name("data")
     size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
     fat.make(boot_place, size, front, boot.LABEL, new.number("boot"), epoch)
-    kind = ext4.Ext4(DATA_LABEL, new.uuid("data"), journal=True)
-    ext4.make(data_place, DATA_BYTES, Tree(), kind, epoch)
+    data = new.uuid("data")
+    ext4.make(data_place, DATA_BYTES, Tree(), DATA_LABEL, data, epoch, journal=True)
     layout = [
         Partition("boot", FAT32_LBA, boot_place, fat.used_ranges(boot_place)),
         Partition("root", LINUX, root_place, ext4.used_ranges(root_place)),

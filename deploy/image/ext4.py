@@ -12,7 +12,6 @@ import re
 import tempfile
 import uuid
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError
@@ -36,15 +35,6 @@ _FORMATS = {"file": 0o100000, "folder": 0o040000, "link": 0o120000}
 _CHATTER = re.compile(r"debugfs \d|debugfs: |Allocated inode: |$")
 
 
-@dataclass(frozen=True)
-class Ext4:
-    """How a file system is made; `journal` for one that is written to in flight."""
-
-    label: str
-    identifier: uuid.UUID
-    journal: bool = False
-
-
 def bytes_needed(tree: Tree) -> int:
     """What a file system for this tree must have at least, with its tables, in whole MiB."""
     blocks = sum(max(1, -(-entry.content.size // BLOCK_BYTES)) for _, entry in tree.items())
@@ -54,27 +44,36 @@ def bytes_needed(tree: Tree) -> int:
     return -(-int(needed) // (1 << 20)) << 20
 
 
-def make(image: Path, size: int, tree: Tree, kind: Ext4, epoch: int) -> None:
+def make(
+    image: Path,
+    size: int,
+    tree: Tree,
+    label: str,
+    identifier: uuid.UUID,
+    epoch: int,
+    *,
+    journal: bool = False,
+) -> None:
     """Makes a file system of `size` bytes that holds the tree, and checks it.
+
+    `journal` is for one that is written to in flight.
 
     Raises:
         DeployError: the tree does not fit, or a tool fails.
     """
     needed = bytes_needed(tree)
     if size < needed:
-        raise DeployError(
-            f"{kind.label}: contents need {needed >> 20} MiB and get {size >> 20} MiB"
-        )
+        raise DeployError(f"{label}: contents need {needed >> 20} MiB and get {size >> 20} MiB")
     image.unlink(missing_ok=True)
     with open(image, "wb") as file:
         file.truncate(size)
-    features = _FEATURES + (",has_journal,resize_inode" if kind.journal else "")
-    extended = f"hash_seed={kind.identifier},lazy_itable_init=0,lazy_journal_init=0,root_owner=0:0"
+    features = _FEATURES + (",has_journal,resize_inode" if journal else "")
+    extended = f"hash_seed={identifier},lazy_itable_init=0,lazy_journal_init=0,root_owner=0:0"
     # A journal and a share of inodes for the card's size, which this grows into.
     grows = ["-J", f"size={_JOURNAL_MIB}", "-i", "65536"]
-    inodes = grows if kind.journal else ["-N", str(_inodes(tree))]
+    inodes = grows if journal else ["-N", str(_inodes(tree))]
     options = ["-b", str(BLOCK_BYTES), "-I", str(_INODE_BYTES), "-O", features, "-m", "0", *inodes]
-    names = ["-L", kind.label, "-U", str(kind.identifier), "-E", extended]
+    names = ["-L", label, "-U", str(identifier), "-E", extended]
     # A configuration of ours: /etc/mke2fs.conf is another on another machine.
     run(
         ["mke2fs", "-q", "-F", *options, *names, image],

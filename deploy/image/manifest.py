@@ -82,20 +82,16 @@ def write(image: Path, to: Path, digest: str, told: Told) -> None:
     to.write_text(json.dumps(document, indent=2) + "\n")
 
 
-def installed(status: str) -> list[tuple[str, str, str]]:
-    """Name, version and architecture of every package that dpkg's status calls installed."""
+def packages_of(tree: Tree) -> list[tuple[str, str, str]]:
+    """Name, version and architecture of what dpkg calls installed in a tree, if it was there."""
+    path = "var/lib/dpkg/status"
+    status = tree.read(path).decode("utf-8", "replace") if path in tree else ""
     found = []
     for stanza in status.split("\n\n"):
         fields = dict(line.split(": ", 1) for line in stanza.splitlines() if ": " in line[1:])
         if fields.get("Status", "").endswith(" installed"):
             found.append((fields["Package"], fields["Version"], fields["Architecture"]))
     return sorted(found)
-
-
-def packages_of(tree: Tree) -> list[tuple[str, str, str]]:
-    """What is installed in a tree; nothing where dpkg never was."""
-    path = "var/lib/dpkg/status"
-    return installed(tree.read(path).decode("utf-8", "replace")) if path in tree else []
 
 
 def wheels(site: Path | None) -> list[dict[str, str]]:

@@ -66,7 +66,7 @@ def write_base(path: Path, tree: Tree, size: int, parts: int = 2) -> Path:
     """The image: a FAT with kernels and firmware, and the tree in a root that can be written."""
     work = path.with_name(path.name + ".work")
     work.mkdir()
-    ext4.make(work / "root", size, tree, ext4.Ext4("rootfs", UUID, journal=True), EPOCH - 1000)
+    ext4.make(work / "root", size, tree, "rootfs", UUID, EPOCH - 1000, journal=True)
     boot = Tree()
     room = fat.bytes_needed(boot)
     for name in ("kernel.img", "kernel7.img", "bootcode.bin", "start.elf", "fixup.dat",

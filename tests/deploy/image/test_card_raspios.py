@@ -160,7 +160,7 @@ def test_a_base_that_is_cut_or_none_is_refused(base, checkout, tmp_path):
 def test_a_root_with_too_few_inodes_gets_more(tmp_path):
     """Of small files a base has room for the bytes long before it has inodes for the number."""
     place, tree = tmp_path / "root", Tree()
-    ext4.make(place, 48 << 20, tree, ext4.Ext4("rootfs", uuid.UUID(int=1), journal=True), EPOCH)
+    ext4.make(place, 48 << 20, tree, "rootfs", uuid.UUID(int=1), EPOCH, journal=True)
     before = int(ext4.facts(place)["Free inodes"])
     for number in range(before + 100):
         tree.write(f"{number:04d}", "x")
