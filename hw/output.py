@@ -9,24 +9,20 @@ from typing import Any
 
 from hw.errors import HardwareError
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import told
 
 
 def make_folder(path: Path) -> None:
     """Makes a folder with those above it; a disk's refusal is a `HardwareError`."""
-    try:
+    with told(path, HardwareError):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HardwareError(f"{path}: {error.strerror or error}") from None
 
 
 def write(path: Path, produce: Callable[[Path], object]) -> None:
     """Lets `produce` write beside `path` and renames; a disk's refusal is a `HardwareError`."""
     make_folder(path.parent)
-    try:
-        with files.replacing(path) as part:
-            produce(part)
-    except OSError as error:
-        raise HardwareError(f"{path}: {error.strerror or error}") from None
+    with told(path, HardwareError), files.replacing(path) as part:
+        produce(part)
 
 
 def write_text(path: Path, text: str) -> None:

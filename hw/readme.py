@@ -12,6 +12,7 @@ from hw.endurance import Wear
 from hw.errors import HardwareError
 from hw.parts import shipped_parts
 from hw.wiring import GAUGES, drawing
+from pi_firmware.wire.errors import told
 
 PAGE = Path(__file__).with_name("README.md")
 
@@ -51,10 +52,8 @@ def drawings() -> dict[Path, str]:
 
 def write() -> list[Path]:
     """Writes tables into the page, and the drawings beside it; raises `HardwareError`."""
-    try:
+    with told(PAGE, HardwareError):
         page = PAGE.read_text(encoding="utf-8")
-    except OSError as error:
-        raise HardwareError(f"{PAGE}: {error.strerror or error}") from None
     output.write_text(PAGE, filled(page))
     for path, text in drawings().items():
         output.write_text(path, text)

@@ -1,5 +1,8 @@
 """The exception family: every error a person can cause is a `BlimpError` with a one-line text."""
 
+import contextlib
+from collections.abc import Iterator
+
 from pi_firmware.wire.text import printable
 
 _LONGEST = 2000
@@ -38,3 +41,12 @@ class TelemetryError(BlimpError):
 
 class SourceError(BlimpError):
     """A camera or gauge that cannot be opened, named by its URI."""
+
+
+@contextlib.contextmanager
+def told(what: object, kind: type[BlimpError]) -> Iterator[None]:
+    """A disk's refusal as an error of that kind, whose line begins with `what`."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror or error}") from None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
 from pi_firmware.wire import sei
-from pi_firmware.wire.errors import BlimpError, RecordingError
+from pi_firmware.wire.errors import BlimpError, RecordingError, told
 from pi_firmware.wire.recorder.durable import OpenFile
 
 if TYPE_CHECKING:
@@ -52,10 +52,8 @@ class RecordingFile:
         self._gop_bytes = self._longest_gop_bytes = 0
         self._unsynced = True
         self._ended = False
-        try:
+        with told(path, RecordingError):
             self._file = open_file(path)
-        except OSError as error:
-            raise RecordingError(f"{path}: {error.strerror or error}") from None
         try:
             self.writer = self._opened(head)
             """What its other messages are written with; to be told of by `added`."""
@@ -73,7 +71,7 @@ class RecordingFile:
         )
         for name, values in head.items():
             writer.write_metadata(name, values)
-        with self._disk():
+        with told(self.path, RecordingError):
             self._file.sync()
         return writer
 
@@ -144,7 +142,7 @@ class RecordingFile:
         """Flushes, and waits until the card has it; does nothing when it has all."""
         if self._unsynced:
             self.flush()
-            with self._disk():
+            with told(self.path, RecordingError):
                 self._file.sync()
             self._unsynced = False
 
@@ -161,10 +159,3 @@ class RecordingFile:
             self.writer.write_metadata("recording_end", end)
         self.writer.close()
         self.kept = self.frames
-
-    @contextlib.contextmanager
-    def _disk(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise RecordingError(f"{self.path}: {error.strerror or error}") from None

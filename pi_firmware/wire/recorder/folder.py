@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
 from pi_firmware.wire import files
-from pi_firmware.wire.errors import RecordingError
+from pi_firmware.wire.errors import RecordingError, told
 
 MB = 1_000_000
 _NAME = re.compile(r"flight-([0-9]{6,9})(?:-[0-9TZ]{16})?\.mcap")
@@ -65,11 +66,9 @@ class Folder:
 
     def next_path(self, stamp: str = "") -> Path:
         """Looks through the folder, made if missing; the path of the file to write next."""
-        try:
+        with self._told():
             self.path.mkdir(exist_ok=True)
             highest = self._scan()
-        except OSError as error:
-            raise self._fail(error) from None
         if highest >= _HIGHEST:
             raise RecordingError(f"recording.folder '{self.path}': no number above {highest}")
         return self.path / f"flight-{highest + 1:06d}{stamp}.mcap"
@@ -82,20 +81,14 @@ class Folder:
         """
         while self._earlier and self._earlier_bytes + file_bytes > self._total_bytes:
             _, path, size = self._earlier[0]
-            try:
+            with told(f"{path}: the oldest recording cannot be deleted", RecordingError):
                 path.unlink(missing_ok=True)
-            except OSError as error:
-                raise RecordingError(
-                    f"{path}: the oldest recording cannot be deleted: {error.strerror or error}"
-                ) from None
             del self._earlier[0]
             self._earlier_bytes -= size
         if not self._min_free_bytes:
             return  # until the disk itself is full
-        try:
+        with self._told():
             disk = os.statvfs(self.path)
-        except OSError as error:
-            raise self._fail(error) from None
         free_bytes = disk.f_bavail * disk.f_frsize
         if free_bytes - more_bytes < self._min_free_bytes:
             raise RecordingError(
@@ -105,10 +98,8 @@ class Folder:
 
     def sync(self) -> None:
         """Makes names durable: of files that were begun, ended or deleted."""
-        try:
+        with self._told():
             files.sync(self.path)
-        except OSError as error:
-            raise self._fail(error) from None
 
     def _scan(self) -> int:
         """Notes our files, oldest first; the highest number taken."""
@@ -130,5 +121,5 @@ class Folder:
         self._earlier_bytes = sum(size for _, _, size in self._earlier)
         return highest
 
-    def _fail(self, error: OSError) -> RecordingError:
-        return RecordingError(f"recording.folder '{self.path}': {error.strerror or error}")
+    def _told(self) -> AbstractContextManager[None]:
+        return told(f"recording.folder '{self.path}'", RecordingError)
