@@ -26,13 +26,9 @@ from deploy.board.inputs import (
 )
 from deploy.board.releases import places
 from deploy.errors import DeployError
-from deploy.provisioning import (
-    Provisioning,
-    parse,
-    render,
-    without_secrets,
-    wpa_supplicant_conf,
-)
+from deploy.provisioning.model import Provisioning, without_secrets
+from deploy.provisioning.text import parse, render
+from deploy.provisioning.wpa import wpa_supplicant_conf
 from deploy.run import run
 
 SCHEMA = "blimp.provisioned/1"

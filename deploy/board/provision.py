@@ -31,7 +31,7 @@ from deploy.board.inputs import Inputs, digest
 from deploy.board.releases import places, shelf
 from deploy.board.releases.places import Places
 from deploy.errors import DeployError
-from deploy.provisioning import parse
+from deploy.provisioning.text import parse
 
 IN_FORCE, NONE, REFUSED = "in force", "none", "refused"
 

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from deploy.errors import DeployError
-from deploy.provisioning import Provisioning, toml_text
+from deploy.provisioning import toml_text
+from deploy.provisioning.model import Provisioning
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
 CABLE, RADIO = "eth0", "wlan0"

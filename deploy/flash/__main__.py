@@ -17,7 +17,7 @@ from deploy.flash.customise import Content
 from deploy.flash.disks import Disk, Machine
 from deploy.flash.target import Target
 from deploy.flash.wishes import WifiOptions
-from deploy.provisioning import Provisioning, Wifi
+from deploy.provisioning.model import Provisioning, Wifi
 
 _INTERRUPTED = 130  # as a shell says it: 128 and SIGINT's number
 _EXAMPLE = """example:

@@ -17,7 +17,8 @@ from deploy.errors import DeployError, Interrupted
 from deploy.flash.boot import FOLDER, BootPartition
 from deploy.flash.keys import Keys
 from deploy.flash.target import Target
-from deploy.provisioning import Provisioning, parse, render
+from deploy.provisioning.model import Provisioning
+from deploy.provisioning.text import parse, render
 from deploy.run import run
 
 TOML, PAYLOAD_TOML, CERTIFICATES = (

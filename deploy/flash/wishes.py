@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError, printable
-from deploy.provisioning import GroundStation, Provisioning, Wifi
-from deploy.provisioning.model import OPEN, WPA2
+from deploy.provisioning.model import OPEN, WPA2, GroundStation, Provisioning, Wifi
 from deploy.provisioning.text import parse_wifi
 
 MAX_FILE_BYTES = 64 * 1024

@@ -12,14 +12,11 @@ from pathlib import Path
 
 from deploy.errors import DeployError
 from deploy.image import card, checkout, raspios
-from deploy.image.packages import (
-    build_rootfs,
-    byte_compile,
-    fetch_wheels,
-    load_board,
-    unpack_kernel,
-    with_archives,
-)
+from deploy.image.packages.board import load_board, with_archives
+from deploy.image.packages.kernel import unpack_kernel
+from deploy.image.packages.python import byte_compile
+from deploy.image.packages.rootfs import build_rootfs
+from deploy.image.packages.wheels import fetch_wheels
 
 _CHECKOUT = Path(__file__).parents[2]
 _BOARDS = ("qemu", "zero2w", "zerow")

@@ -7,7 +7,8 @@ first stages and reads the same file.
 from __future__ import annotations
 
 from deploy.image.tree import Tree
-from deploy.provisioning import Provisioning, Wifi, render
+from deploy.provisioning.model import Provisioning, Wifi
+from deploy.provisioning.text import render
 
 LABEL = "BLIMPBOOT"
 INITRD = "initrd.img"

@@ -28,7 +28,8 @@ from deploy.image import (
     root,
 )
 from deploy.image.card import Identifiers, building
-from deploy.image.packages import add_packages, layer
+from deploy.image.packages import layer
+from deploy.image.packages.base import add_packages
 from deploy.image.packages.board import Board
 from deploy.image.partitions import FAT32_LBA, LINUX
 from deploy.image.sparse import Range, cut_out, sha256

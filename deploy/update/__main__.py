@@ -10,7 +10,8 @@ from pathlib import Path
 from deploy.board.releases import manifest
 from deploy.board.releases.choose import HEALTHY
 from deploy.errors import DeployError
-from deploy.image.packages import fetch_wheels, load_board
+from deploy.image.packages.board import load_board
+from deploy.image.packages.wheels import fetch_wheels
 from deploy.progress import Progress
 from deploy.update import bundle as bundles
 from deploy.update.bundle import CHECKOUT

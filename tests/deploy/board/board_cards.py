@@ -10,7 +10,8 @@ from deploy.board.candidate import Check
 from deploy.board.card import Card, Owners
 from deploy.board.disk import Disk
 from deploy.board.provision import Outcome, provision
-from deploy.provisioning import Provisioning, Wifi, render
+from deploy.provisioning.model import Provisioning, Wifi
+from deploy.provisioning.text import render
 
 PASSWORD = "kept out of sight"
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f someone"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from board_cards import BLIMP, Cut, CutDisk, Person, certificates, renamed
 
-from deploy.provisioning import parse, render
+from deploy.provisioning.text import parse, render
 
 
 def first(person: Person) -> None:

@@ -16,7 +16,9 @@ from deploy.board import provision
 from deploy.board.candidate import firmware_check
 from deploy.board.card import Card
 from deploy.errors import DeployError
-from deploy.provisioning import GroundStation, Provisioning, parse, render, wpa_supplicant_conf
+from deploy.provisioning.model import GroundStation, Provisioning
+from deploy.provisioning.text import parse, render
+from deploy.provisioning.wpa import wpa_supplicant_conf
 
 ROOT = Path(__file__).parents[3]
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from deploy.board import settings
 from deploy.errors import DeployError
-from deploy.provisioning import GroundStation, Provisioning
+from deploy.provisioning.model import GroundStation, Provisioning
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 SCALARS = TEXTS | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False)

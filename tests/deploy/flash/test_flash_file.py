@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from card_bench import BOOT_OFFSET, GAP_MIB, MEBI, Bench, make_image, refused, run, tool
 
-from deploy.provisioning import parse, wpa_supplicant_conf
-from deploy.provisioning.wpa import psk
+from deploy.provisioning.text import parse
+from deploy.provisioning.wpa import psk, wpa_supplicant_conf
 from ground_station.keys.authority import Authority
 
 BOOT_MIB, ROOT_MIB = 8, 8

@@ -22,7 +22,8 @@ from deploy.flash import customise, image, keys, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
 from deploy.flash.target import Target
-from deploy.provisioning import Provisioning, parse
+from deploy.provisioning.model import Provisioning
+from deploy.provisioning.text import parse
 
 SECTOR = 512
 

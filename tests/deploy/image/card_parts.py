@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.image import card
-from deploy.image.packages import Kernel, load_board
+from deploy.image.packages.board import load_board
+from deploy.image.packages.kernel import Kernel
 
 CHECKOUT = Path(__file__).parents[3]
 EPOCH = 1_760_000_000

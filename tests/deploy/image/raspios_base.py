@@ -9,7 +9,7 @@ from pathlib import Path
 from card_parts import EPOCH, root_members, write_tar
 
 from deploy.image import ext4, fat, partitions
-from deploy.image.packages import load_board
+from deploy.image.packages.board import load_board
 from deploy.image.partitions import FAT32_LBA, LINUX, Partition
 from deploy.image.tree import Tree
 

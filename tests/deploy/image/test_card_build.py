@@ -93,7 +93,7 @@ def test_the_boot_partition_has_what_the_first_stages_read(reader):
 
 
 def test_the_example_on_the_boot_partition_is_a_valid_provisioning(reader):
-    from deploy.provisioning import parse
+    from deploy.provisioning.text import parse
 
     text = reader.boot_text("blimp/blimp-example.toml")
     assert parse(text.encode()).payload_id == "blimp-1"

@@ -19,7 +19,7 @@ from raspios_base import make_base
 
 from deploy.errors import DeployError
 from deploy.image import card, ext4, raspios, sparse
-from deploy.image.packages import load_board
+from deploy.image.packages.board import load_board
 from deploy.image.tree import Tree
 
 pytestmark = pytest.mark.skipif(

@@ -27,8 +27,8 @@ from waiting import eventually
 
 from deploy.errors import DeployError
 from deploy.image import card, raspios
-from deploy.image.packages import apt, base, load_board
-from deploy.image.packages.board import Board, Group
+from deploy.image.packages import apt, base
+from deploy.image.packages.board import Board, Group, load_board
 from deploy.run import run
 from tests.deploy.image.local_archive import TOOLS, Key, LocalArchive, need_tools, new_key
 
@@ -340,8 +340,7 @@ def test_stopped_or_killed_in_the_middle_nothing_half_is_left(
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from pathlib import Path\n"
         "from deploy.image import raspios\n"
-        "from deploy.image.packages import load_board\n"
-        "from deploy.image.packages.board import Group\n"
+        "from deploy.image.packages.board import Group, load_board\n"
         f"board = dataclasses.replace(load_board('zerow'), packages=(Group('x', ({name!r},)),),\n"
         f"    architecture={stand.board.architecture!r})\n"
         f"places = {[str(path) for path in (place, stand.base, cache, stand.checkout)]}\n"

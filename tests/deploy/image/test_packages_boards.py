@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.image.packages import load_board, with_archives
-from deploy.image.packages.board import BOARDS_FOLDER
+from deploy.image.packages.board import BOARDS_FOLDER, load_board, with_archives
 from deploy.run import run
 
 _FIRMWARE = Path(__file__).parents[3] / "pi_firmware"

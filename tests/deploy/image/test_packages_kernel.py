@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.image.packages import load_board, unpack_kernel
-from deploy.image.packages.board import Board
-from deploy.image.packages.kernel import with_dependencies
+from deploy.image.packages.board import Board, load_board
+from deploy.image.packages.kernel import unpack_kernel, with_dependencies
 from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
 
 _VERSION = "6.12.1+rpt-rpi-v8"

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.image.packages import byte_compile, load_board
-from deploy.image.packages.board import Board
+from deploy.image.packages.board import Board, load_board
+from deploy.image.packages.python import byte_compile
 
 _PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
 # Called as `qemu-aarch64-static -L ROOT ROOT/usr/bin/python ARGUMENTS`.

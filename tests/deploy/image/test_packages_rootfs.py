@@ -19,8 +19,8 @@ import pytest
 from waiting import eventually
 
 from deploy.errors import DeployError
-from deploy.image.packages import build_rootfs, load_board
-from deploy.image.packages.board import Board
+from deploy.image.packages.board import Board, load_board
+from deploy.image.packages.rootfs import build_rootfs
 from deploy.run import run
 from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
 
@@ -160,7 +160,8 @@ def test_stopped_or_killed_it_leaves_nothing_half_made(
         # A suite that runs in the background inherits an ignored SIGINT; a person's shell does not.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from pathlib import Path\n"
-        "from deploy.image.packages import build_rootfs, load_board, with_archives\n"
+        "from deploy.image.packages.board import load_board, with_archives\n"
+        "from deploy.image.packages.rootfs import build_rootfs\n"
         "os.geteuid = lambda: 0\n"
         "board = load_board('qemu')\n"
         "group = dataclasses.replace(board.packages[0], names=('tool',))\n"

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.image.packages import fetch_wheels, load_board
-from deploy.image.packages.board import Board, Wheel
-from deploy.image.packages.wheels import requirement, unpack
+from deploy.image.packages.board import Board, Wheel, load_board
+from deploy.image.packages.wheels import fetch_wheels, requirement, unpack
 
 _LOCK = Path(__file__).parents[3] / "requirements.lock"
 

@@ -13,16 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.errors import DeployError
-from deploy.provisioning import (
+from deploy.provisioning.countries import CODES
+from deploy.provisioning.model import (
     GroundStation,
     Provisioning,
     Wifi,
     keeps_password,
-    parse,
-    render,
     without_secrets,
 )
-from deploy.provisioning.countries import CODES
+from deploy.provisioning.text import parse, render
 
 REPOSITORY = Path(__file__).parents[3]
 ED25519 = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f a pilot"
@@ -244,7 +243,9 @@ def test_it_needs_nothing_but_the_standard_library(tmp_path: Path) -> None:
         shutil.copy(REPOSITORY / "deploy" / name, package)
     shutil.copytree(REPOSITORY / "deploy/provisioning", package / "provisioning")
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from deploy.provisioning import *;"
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r});"
+        "from deploy.provisioning.text import parse, render;"
+        "from deploy.provisioning.wpa import wpa_supplicant_conf;"
         f"p = parse({GOOD.encode()!r}); assert parse(render(p).encode()) == p;"
         "print(wpa_supplicant_conf(p))"
     )

@@ -10,15 +10,9 @@ from pathlib import Path
 import pytest
 
 from deploy.errors import DeployError
-from deploy.provisioning import (
-    Provisioning,
-    Wifi,
-    parse,
-    render,
-    without_secrets,
-    wpa_supplicant_conf,
-)
-from deploy.provisioning.wpa import psk
+from deploy.provisioning.model import Provisioning, Wifi, without_secrets
+from deploy.provisioning.text import parse, render
+from deploy.provisioning.wpa import psk, wpa_supplicant_conf
 
 SUPPLICANT = shutil.which("wpa_supplicant", path="/usr/sbin:/sbin:/usr/bin:/usr/local/sbin")
 

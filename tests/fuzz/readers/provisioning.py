@@ -6,9 +6,10 @@ from pieces import Picker, refusing, stretch
 
 from deploy.board import settings
 from deploy.errors import DeployError
-from deploy.provisioning import Provisioning, parse, render, wpa_supplicant_conf
+from deploy.provisioning.model import Provisioning
 from deploy.provisioning.ssh_keys import check_authorized_key
-from deploy.provisioning.text import parse_wifi
+from deploy.provisioning.text import parse, parse_wifi, render
+from deploy.provisioning.wpa import wpa_supplicant_conf
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f a@b"
 WHOLE = f"""\

@@ -340,7 +340,8 @@ def update(rig: Rig, place: Path) -> tuple[int, str]:
 
 def site() -> Path:
     """The wheels that the image was built with: the newest ones in the builder's cache."""
-    from deploy.image.packages import fetch_wheels, load_board
+    from deploy.image.packages.board import load_board
+    from deploy.image.packages.wheels import fetch_wheels
 
     return fetch_wheels(load_board("qemu"), OUT / "cache/image")
 
