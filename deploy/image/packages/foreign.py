@@ -1,9 +1,18 @@
-"""How a command is started here so that it can run programs of the board's architecture."""
+"""Runs programs of the board's architecture here, by emulation where this machine is another.
+
+    python -m deploy.image.packages.foreign arm64 chroot ROOT python3 -V
+
+That command gets a user and a mount namespace of its own with a private binfmt_misc (Linux 6.7), so
+that nothing of the system's is touched. Needs root and qemu-user-static.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
+import signal
+import struct
 import sys
 from pathlib import Path
 
@@ -12,7 +21,15 @@ from deploy.run import need
 
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 
+_ALL_IDS = 65536
+
+# mount(2), sched.h, elf.h, prctl.h.
+_MS_REC, _MS_PRIVATE = 1 << 14, 1 << 18
+_CLONE_NEWNS, _CLONE_NEWUSER = 0x20000, 0x10000000
 _ELF_CLASS_32, _ELF_CLASS_64 = 1, 2
+_ELF_LITTLE_ENDIAN = 1
+_ET_EXEC = 2
+_PR_SET_PDEATHSIG = 1
 
 # Debian's architecture: (this machine's name for it, QEMU's name, ELF class, ELF machine).
 ARCHITECTURES = {
@@ -42,7 +59,7 @@ def prefix(architecture: str) -> list[str]:
             f"programs of {architecture} run here only as root: sudo, or apt-get install "
             "qemu-user-static and binfmt-support on a system of your own"
         )
-    return [sys.executable, "-m", "deploy.image.packages.binfmt", architecture]
+    return [sys.executable, "-m", "deploy.image.packages.foreign", architecture]
 
 
 def environment() -> dict[str, str]:
@@ -69,3 +86,94 @@ def _handled(qemu: str) -> bool:
     words = rule.split()
     flags = next((words[i + 1] for i, word in enumerate(words[:-1]) if word == "flags:"), "")
     return rule.startswith("enabled") and "F" in flags
+
+
+def elf_rule(name: str, elf_class: int, machine: int, emulator: str) -> bytes:
+    """A line for binfmt_misc's `register` (Linux, admin-guide/binfmt-misc): little-endian ELF
+    executables, fixed or relocatable, of any system's ABI, of one machine.
+
+    Flags: the caller's argv[0] and credentials are kept, and the interpreter is opened now (`F`),
+    so that it needs no copy in a chroot.
+    """
+    ident = struct.pack("<4sBBB9x", b"\x7fELF", elf_class, _ELF_LITTLE_ENDIAN, 1)
+    magic = ident + struct.pack("<HH", _ET_EXEC, machine)
+    mask = b"\xff" * 7 + b"\x00" + b"\xff" * 8 + b"\xfe\xff" + b"\xff\xff"
+    return f":{name}:M::{_escaped(magic)}:{_escaped(mask)}:{emulator}:OCPF".encode()
+
+
+def _escaped(data: bytes) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in data)
+
+
+def _enter(architecture: str) -> None:
+    """Registers the interpreter in this process's own namespaces."""
+    libc = ctypes.CDLL(None, use_errno=True)
+
+    def check(result: int, what: str) -> None:
+        if result != 0:
+            raise DeployError(f"{what}: {os.strerror(ctypes.get_errno())}")
+
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    check(libc.mount(b"none", b"/", None, _MS_REC | _MS_PRIVATE, None), "a mount namespace")
+    mounted = libc.mount(b"binfmt_misc", os.fsencode(BINFMT), b"binfmt_misc", 0, None)
+    check(mounted, "a private binfmt_misc (Linux 6.7)")
+    program = need(interpreter(architecture))
+    _, qemu, elf_class, machine = ARCHITECTURES[architecture]
+    try:
+        (BINFMT / "register").write_bytes(elf_rule(f"qemu-{qemu}", elf_class, machine, program))
+    except OSError as error:
+        raise DeployError(f"binfmt_misc: {error.strerror}") from None
+
+
+def _child(architecture: str, words: list[str], ready: int, go: int) -> int:
+    libc = ctypes.CDLL(None, use_errno=True)
+    try:
+        if libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNS) != 0:
+            raise DeployError(f"namespaces: {os.strerror(ctypes.get_errno())}")
+        os.write(ready, b"1")
+        if os.read(go, 1) != b"1":
+            return 2
+        os.setresgid(0, 0, 0)
+        os.setresuid(0, 0, 0)
+        _enter(architecture)
+        os.execvp(words[0], words)
+    except DeployError as error:
+        print(f"foreign: {error}", file=sys.stderr)
+    except OSError as error:
+        print(f"foreign: {words[0]}: {error.strerror}", file=sys.stderr)
+    return 2
+
+
+def main(arguments: list[str]) -> int:
+    """Runs `arguments[1:]` with the programs of architecture `arguments[0]`; its exit status."""
+    if len(arguments) < 2 or arguments[0] not in ARCHITECTURES:
+        known = "|".join(sorted(ARCHITECTURES))
+        print(f"foreign: an architecture ({known}) and a command", file=sys.stderr)
+        return 2
+    ready_read, ready_write = os.pipe()
+    go_read, go_write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(ready_read)
+        os.close(go_write)
+        os._exit(_child(arguments[0], arguments[1:], ready_write, go_read))
+    os.close(ready_write)
+    os.close(go_read)
+    # Ctrl-C reaches the command by itself; this one waits for its end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, _: os.kill(child, number))
+    if os.read(ready_read, 1) == b"1":
+        try:
+            for kind in ("uid", "gid"):
+                Path(f"/proc/{child}/{kind}_map").write_text(f"0 0 {_ALL_IDS}")
+            os.write(go_write, b"1")
+        except OSError as error:
+            print(f"foreign: user ids: {error.strerror} (root?)", file=sys.stderr)
+    os.close(go_write)
+    _, status = os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(status)
+    return code if code >= 0 else 128 - code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -13,7 +13,6 @@ import pytest
 
 from deploy.errors import DeployError
 from deploy.image.packages import foreign
-from deploy.image.packages.binfmt import elf_rule
 from deploy.image.packages.bytecode import settle
 from deploy.image.packages.libraries import missing, needed
 
@@ -103,7 +102,7 @@ def test_the_rule_of_an_architecture_takes_its_programs_only() -> None:
     def header(elf_class: int, kind: int, machine: int, abi: int = 0) -> bytes:
         return struct.pack("<4sBBBB8xHH", b"\x7fELF", elf_class, 1, 1, abi, kind, machine)
 
-    rule = elf_rule("qemu-aarch64", 2, 183, "/usr/bin/qemu-aarch64-static")
+    rule = foreign.elf_rule("qemu-aarch64", 2, 183, "/usr/bin/qemu-aarch64-static")
     assert rule.startswith(b":qemu-aarch64:M::") and b":/usr/bin/qemu-aarch64-static:" in rule
     # Fixed and relocatable programs, System V's and GNU's ABI.
     assert all(_fits(rule, header(2, kind, 183, abi)) for kind in (2, 3) for abi in (0, 3))
@@ -111,7 +110,7 @@ def test_the_rule_of_an_architecture_takes_its_programs_only() -> None:
     assert not _fits(rule, header(2, 2, 62))
     assert not _fits(rule, header(1, 2, 40))
     assert not _fits(rule, header(2, 1, 183))
-    arm = elf_rule("qemu-arm", 1, 40, "/usr/bin/qemu-arm-static")
+    arm = foreign.elf_rule("qemu-arm", 1, 40, "/usr/bin/qemu-arm-static")
     assert _fits(arm, header(1, 3, 40)) and not _fits(arm, header(2, 3, 183))
 
 
@@ -121,7 +120,7 @@ def test_an_architecture_is_native_or_emulated_or_refused(monkeypatch: pytest.Mo
     monkeypatch.setattr(foreign, "need", lambda tool: f"/usr/bin/{tool}")
     assert foreign.prefix("amd64") == []
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    assert foreign.prefix("arm64")[-2:] == ["deploy.image.packages.binfmt", "arm64"]
+    assert foreign.prefix("arm64")[-2:] == ["deploy.image.packages.foreign", "arm64"]
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(DeployError, match="programs of arm64 run here only as root"):
         foreign.prefix("arm64")
