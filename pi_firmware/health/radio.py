@@ -102,14 +102,9 @@ def power_save_is_off(run: Run, name: str) -> bool:
     return run(["iw", "dev", name, "get", "power_save"]).strip().lower().endswith(": off")
 
 
-def switch_off(run: Run, name: str) -> None:
-    """Takes the interface down; raises `ProgramError`."""
-    run(["ip", "link", "set", "dev", name, "down"])
-
-
-def switch_on(run: Run, name: str) -> None:
-    """Brings the interface up; raises `ProgramError`."""
-    run(["ip", "link", "set", "dev", name, "up"])
+def switch(run: Run, name: str, to: str) -> None:
+    """Takes the interface `down`, or brings it `up`; raises `ProgramError`."""
+    run(["ip", "link", "set", "dev", name, to])
 
 
 def _is_radio(root: Path, name: str) -> bool:

@@ -146,12 +146,12 @@ class Wifi:
         with self._lock:
             heard_at = self._heard_at or 0.0
             silent_s = self._clock() - heard_at
-        fault = self._switched(radio.switch_off, name)
+        fault = self._switched(name, "down")
         # Whatever came of that, it is switched on: an `ip` that hung may have done its work.
         on_fault: ProgramError | None = None
         for _ in range(_ON_ATTEMPTS):
             self._end.wait(self._off_s)
-            on_fault = self._switched(radio.switch_on, name)
+            on_fault = self._switched(name, "up")
             if on_fault is None:
                 break
         with self._lock:
@@ -177,13 +177,13 @@ class Wifi:
             return
         self._on_at = now + self._on_pause_s
         self._on_pause_s = min(self._on_pause_s * 2, _LONGEST_PAUSE_S)
-        fault = self._switched(radio.switch_on, name)
+        fault = self._switched(name, "up")
         if fault:
             self._failed("restart", str(fault))
 
-    def _switched(self, switch: Callable[[radio.Run, str], None], name: str) -> ProgramError | None:
+    def _switched(self, name: str, to: str) -> ProgramError | None:
         try:
-            switch(self._run, name)
+            radio.switch(self._run, name, to)
         except ProgramError as error:
             return error
         return None

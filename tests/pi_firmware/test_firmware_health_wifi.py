@@ -539,11 +539,11 @@ def up():
     return struct.unpack("16sh14x", answer)[1] & 1
 
 found = [up()]
-for switch in (radio.switch_on, radio.switch_off, radio.switch_on):
-    switch(programs.run, "lo")
+for to in ("up", "down", "up"):
+    radio.switch(programs.run, "lo", to)
     found.append(up())
 try:
-    radio.switch_on(programs.run, "wlan7")
+    radio.switch(programs.run, "wlan7", "up")
 except programs.ProgramError as error:
     found.append(str(error))
 print(found)
