@@ -7,7 +7,6 @@ import grp
 import os
 import pwd
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,49 +17,25 @@ from deploy.run import run
 USER = "blimp"
 
 
-@dataclass(frozen=True)
 class Card:
     """The card's folders below `root` ('/' on a card, a folder in tests)."""
 
-    root: Path = Path("/")
-
-    @property
-    def partition(self) -> Path:
+    def __init__(self, root: Path = Path("/")) -> None:
+        self.root = root
+        self.partition = root / "boot/firmware"
         """The boot partition, mounted read-only."""
-        return self.root / "boot/firmware"
-
-    @property
-    def boot(self) -> Path:
+        self.boot = self.partition / "blimp"
         """What a person sees and edits: blimp.toml, payload.toml, certificates/, STATUS.txt."""
-        return self.partition / "blimp"
-
-    @property
-    def data(self) -> Path:
-        return self.root / "data"
-
-    @property
-    def blimp(self) -> Path:
+        self.data = root / "data"
+        self.blimp = self.data / "blimp"
         """The provisioning in force."""
-        return self.data / "blimp"
-
-    @property
-    def ssh(self) -> Path:
-        return self.data / "ssh"
-
-    @property
-    def defaults(self) -> Path:
-        """The board's own payload.toml."""
-        return self.root / "usr/share/blimp/payload.toml"
-
-    @property
-    def outcome(self) -> Path:
+        self.ssh = self.data / "ssh"
+        self.defaults = root / "usr/share/blimp/payload.toml"
+        """The board's own."""
+        self.outcome = root / "run/blimp-board/provisioning.json"
         """What provisioning came to in this boot."""
-        return self.root / "run/blimp-board/provisioning.json"
-
-    @property
-    def resolver(self) -> Path:
+        self.resolver = root / "run/blimp-board/resolv.conf"
         """The name servers; /etc/resolv.conf points here."""
-        return self.root / "run/blimp-board/resolv.conf"
 
 
 @contextlib.contextmanager
