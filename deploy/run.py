@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -45,14 +46,8 @@ _SYSTEM_FOLDERS = ("/usr/local/sbin", "/usr/sbin", "/sbin")
 
 def find(tool: str) -> str | None:
     """The tool's path, also from the system folders; None when it is not installed."""
-    if "/" in tool:
-        return tool if os.access(tool, os.X_OK) else None
-    folders = [*os.environ.get("PATH", os.defpath).split(os.pathsep), *_SYSTEM_FOLDERS]
-    for folder in folders:
-        path = Path(folder or ".") / tool
-        if os.access(path, os.X_OK) and path.is_file():  # what may not be looked into holds none
-            return str(path)
-    return None
+    folders = [os.environ.get("PATH", os.defpath), *_SYSTEM_FOLDERS]
+    return shutil.which(tool, path=os.pathsep.join(folders))
 
 
 def need(tool: str) -> str:
