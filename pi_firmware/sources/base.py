@@ -16,7 +16,7 @@ class Stamp:
     `time_ns`, since 1970, is the middle of the exposure of the picture's middle row: the instant
     whose pose the ground station estimates, from which it counts the other rows of a rolling
     shutter. A live camera's timestamp is brought there by the sensor's readout and exposure, as far
-    as these are known (`shutter.to_middle_ns`); a recording's capture times are this already.
+    as these are known (`live.to_middle_ns`); a recording's capture times are this already.
     `clock_ns` is the payload's clock at that instant; in a replay, when the frame was handed over.
     `exposure_s`, of each row, and `gain` are None where the device does not tell.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import time
 from fractions import Fraction
 from typing import Any
@@ -9,11 +10,37 @@ from typing import Any
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.base import Source, Stamp
-from pi_firmware.sources.shutter import Mark, to_middle_ns
 from pi_firmware.uri import Uri
 
 _GOOD_NS = 100_000  # a tenth of the millisecond that capture times are good for
 _ATTEMPTS = 5
+
+
+class Mark(enum.Enum):
+    """Which instant of a frame a camera stamps, with a rolling shutter as with a global one."""
+
+    EXPOSURE_START = "the first row begins to be exposed"
+    READOUT_START = "the first row has been exposed, and its transfer begins"
+    READOUT_END = "the last row has been transferred"
+    MIDDLE = "the middle of the middle row's exposure"
+
+
+def to_middle_ns(mark: Mark, exposure_s: float | None, readout_s: float) -> int:
+    """What to add to a timestamp to get the middle of the middle row's exposure, ns.
+
+    `readout_s` is the time from the first row to the last, 0 for a global shutter. Where the
+    exposure is unknown (None) it counts as none: the result is then wrong by half of it.
+    """
+    half_exposure_s = (exposure_s or 0.0) / 2
+    if mark is Mark.EXPOSURE_START:
+        offset_s = readout_s / 2 + half_exposure_s
+    elif mark is Mark.READOUT_START:
+        offset_s = readout_s / 2 - half_exposure_s
+    elif mark is Mark.READOUT_END:
+        offset_s = -readout_s / 2 - half_exposure_s
+    else:
+        offset_s = 0.0
+    return round(offset_s * 1e9)
 
 
 def wall_at(pipeline: Any, running_ns: int) -> int:

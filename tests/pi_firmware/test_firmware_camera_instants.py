@@ -9,9 +9,8 @@ import pytest
 from pi_firmware import gstreamer, uri
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources import live
-from pi_firmware.sources.live import LiveSource
+from pi_firmware.sources.live import LiveSource, Mark, to_middle_ns
 from pi_firmware.sources.schemes import v4l2
-from pi_firmware.sources.shutter import Mark, to_middle_ns
 
 _SOE, _EOF = 0x00010000, 0
 _MONOTONIC = 0x00002000

@@ -8,8 +8,7 @@ from typing import Any
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.live import LiveSource, caps, check_exposure, post_error, readout_s
-from pi_firmware.sources.shutter import Mark
+from pi_firmware.sources.live import LiveSource, Mark, caps, check_exposure, post_error, readout_s
 from pi_firmware.uri import Uri
 
 EXPOSURE_MODES = ("normal", "short", "long")

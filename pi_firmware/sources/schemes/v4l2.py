@@ -11,8 +11,7 @@ from pathlib import Path
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
-from pi_firmware.sources.live import LiveSource, caps, check_exposure, readout_s
-from pi_firmware.sources.shutter import Mark
+from pi_firmware.sources.live import LiveSource, Mark, caps, check_exposure, readout_s
 from pi_firmware.uri import Uri
 
 _CAPABILITY = struct.Struct("=16s88x")
