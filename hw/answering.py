@@ -15,8 +15,7 @@ from hw.catalogue import shipped_builds
 from hw.command import CONDITIONS, MASSES, WEAR
 from hw.endurance import Wear
 from hw.envelopes import Envelope, of_shape, of_volume
-from hw.errors import HardwareError
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 
 _GEOMETRY = ("volume_m3", "shape", "free_lift_g")
 _THESIS = (0.1905, 1.2260, 0.1693)

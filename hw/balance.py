@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from hw.builds import Build
 from hw.buoyancy import margin_g
-from hw.errors import HardwareError
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 
 GRAVITY_M_S2 = 9.80665
 

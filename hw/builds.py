@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 
 from hw import envelopes, gases
 from hw.envelopes import Envelope
-from hw.errors import HardwareError
 from hw.parts import SOURCES, Part
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 from pi_firmware.wire import config
 
 UNCERTAIN = ("temperature_C", "pressure_hPa", "humidity_percent", "purity_percent",

@@ -8,9 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from hw.builds import Build, Conditions, Hull, with_ballast
-from hw.errors import HardwareError
 from hw.parts import Part, entries_of, shipped_parts
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 from pi_firmware.wire import config
 
 BUILDS_FILE = Path(__file__).with_name("builds.toml")

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from hw.errors import HardwareError
-from hw.quantities import RANGES, checked, unit_of
+from hw.quantities import RANGES, HardwareError, checked, unit_of
 
 CONDITIONS = ("temperature_C", "pressure_hPa", "altitude_m", "humidity_percent",
                "purity_percent", "superpressure_Pa", "leak_percent_per_day", "days",

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.builds import Build
-from hw.errors import HardwareError
 from hw.inverse import payload_cell
 from hw.parts import Part
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 from pi_firmware.battery.cell import Cell
 
 MODES = ("idle", "stream", "peak")

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from scipy.special import ellipe, ellipk
 
-from hw.errors import HardwareError
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 
 SHAPES = ("ellipsoid", "sphere", "pillow")
 

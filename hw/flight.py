@@ -7,7 +7,7 @@ from functools import lru_cache
 
 from hw.balance import balance_of
 from hw.catalogue import shipped_builds
-from hw.errors import HardwareError
+from hw.quantities import HardwareError
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from hw.errors import HardwareError
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 
 STANDARD_PRESSURE_HPA = 1013.25
 _KELVIN = 273.15

@@ -9,8 +9,8 @@ from scipy.optimize import brentq
 from hw.builds import Build, with_ballast
 from hw.buoyancy import lift_in, margin_g
 from hw.envelopes import Envelope
-from hw.errors import HardwareError
 from hw.parts import Part
+from hw.quantities import HardwareError
 
 _SCALES = (0.05, 20.0)
 

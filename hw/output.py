@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hw.errors import HardwareError
+from hw.quantities import HardwareError
 from pi_firmware.wire import files
 from pi_firmware.wire.errors import told
 

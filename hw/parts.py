@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.errors import HardwareError
-from hw.quantities import checked
+from hw.quantities import HardwareError, checked
 from pi_firmware.wire import config
 
 PARTS_FILE = Path(__file__).with_name("parts.toml")

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import math
 
-from hw.errors import HardwareError
+from pi_firmware.wire.errors import BlimpError
+
+
+class HardwareError(BlimpError):
+    """A part, build or physical input that cannot be; one line that names value and limit."""
+
 
 RANGES: dict[str, tuple[float, float]] = {
     "temperature_C": (-40.0, 60.0),

@@ -9,8 +9,8 @@ from hw import output, tables
 from hw.buoyancy import reckon
 from hw.catalogue import shipped_builds
 from hw.endurance import Wear
-from hw.errors import HardwareError
 from hw.parts import shipped_parts
+from hw.quantities import HardwareError
 from hw.wiring import GAUGES, drawing
 from pi_firmware.wire.errors import told
 

@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 
 from hw.builds import Build
-from hw.errors import HardwareError
 from hw.parts import entries_of
+from hw.quantities import HardwareError
 from pi_firmware.wire import config
 
 WIRING_FILE = Path(__file__).with_name("wiring.toml")

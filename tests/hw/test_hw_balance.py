@@ -10,8 +10,8 @@ import pytest
 from hw.balance import GRAVITY_M_S2, balance_of, climb_of, climb_s
 from hw.builds import Build, Conditions, Hull, with_ballast
 from hw.catalogue import shipped_builds
-from hw.errors import HardwareError
 from hw.parts import load_parts
+from hw.quantities import HardwareError
 
 
 def build_of(*placed: tuple[str, tuple[float, float]]) -> Build:

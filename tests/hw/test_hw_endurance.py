@@ -10,9 +10,9 @@ import pytest
 from hw.builds import Build
 from hw.catalogue import shipped_builds
 from hw.endurance import MODES, Wear, drain, fly, load_of
-from hw.errors import HardwareError
 from hw.inverse import cell_of, with_cell
 from hw.parts import load_parts
+from hw.quantities import HardwareError
 from pi_firmware.battery.cell import Cell
 from pi_firmware.wire import config
 

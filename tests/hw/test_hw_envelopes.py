@@ -10,8 +10,8 @@ from scipy.integrate import quad
 
 from hw.buoyancy import gross_lift_g
 from hw.envelopes import SHAPES, ellipsoid, of_shape, of_volume, pillow, sphere
-from hw.errors import HardwareError
 from hw.gases import air_kg_m3, helium_kg_m3
+from hw.quantities import HardwareError
 
 
 def surface_of_revolution(a: float, b: float) -> float:

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from hw.errors import HardwareError
 from hw.gases import air_kg_m3, helium_kg_m3, pressure_at_altitude
+from hw.quantities import HardwareError
 
 R = 8.314462618  # J/(mol K), exact
 AIR_KG_MOL, HELIUM_KG_MOL, WATER_KG_MOL = 0.0289655, 0.0040026, 0.0180153

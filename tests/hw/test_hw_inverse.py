@@ -12,8 +12,8 @@ from hw.builds import Build, with_ballast
 from hw.buoyancy import margin_g
 from hw.catalogue import shipped_builds
 from hw.endurance import fly
-from hw.errors import HardwareError
 from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_envelope, with_cell
+from hw.quantities import HardwareError
 
 BUILDS = tuple(shipped_builds().builds)
 

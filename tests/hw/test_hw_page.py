@@ -13,7 +13,7 @@ import pytest
 
 from hw import readme
 from hw.catalogue import shipped_builds
-from hw.errors import HardwareError
+from hw.quantities import HardwareError
 from hw.wiring import GAUGES, WIRING_FILE, drawing, load_wiring, variant_of
 from pi_firmware.wire.errors import BlimpError
 

@@ -13,8 +13,8 @@ from ground_station.simulator.plans import Reference, plan_named
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, prepare_flight
 from hw.catalogue import shipped_builds
-from hw.errors import HardwareError
 from hw.flight import flight_model
+from hw.quantities import HardwareError
 
 FLOWN = {
     "semi_length_m": 0.85, "semi_width_m": 0.31, "mass_kg": 0.352, "added_axial": 0.14,

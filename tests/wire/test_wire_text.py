@@ -6,7 +6,7 @@ import pytest
 
 from deploy.errors import DeployError
 from ground_station.errors import GroundStationError
-from hw.errors import HardwareError
+from hw.quantities import HardwareError
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.text import printable
 
