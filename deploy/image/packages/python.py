@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tarfile
 import tempfile
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from deploy.errors import DeployError
 from deploy.image.packages import cache
 from deploy.image.packages.board import Board
 from deploy.image.packages.foreign import interpreter
+from deploy.image.tree import Tree
 from deploy.run import run
 
 # Of a root file system, what Python needs to compile: itself and the libraries it is linked with.
@@ -82,29 +82,17 @@ def _compile(board: Board, rootfs: Path, tree: Path, files: list[Path], installe
 
 
 def _take(board: Board, rootfs: Path, root: Path) -> None:
-    standard_library = f"./usr/lib/python{board.python}/"
+    program, standard_library = (f"usr/{part}/python{board.python}" for part in ("bin", "lib"))
     (root / "usr/lib").mkdir(parents=True)
     (root / "lib").symlink_to("usr/lib")
-    try:
-        with tarfile.open(rootfs) as file:
-            for member in file:
-                name, last = member.name, member.name.rsplit("/", 1)[-1]
-                library = name.startswith("./usr/lib/") and last.startswith(_LIBRARIES)
-                python = name == f"./usr/bin/python{board.python}" or name.startswith(
-                    standard_library
-                )
-                if library or python:
-                    _put(file, member, root / name)
-    except (OSError, tarfile.TarError) as error:
-        raise DeployError(f"{rootfs}: {error}") from None
-
-
-def _put(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    content = tar.extractfile(member) if member.isfile() else None
-    if content is not None or member.issym():
-        target.parent.mkdir(parents=True, exist_ok=True)
-    if content is not None:
-        target.write_bytes(content.read())
-        target.chmod(member.mode & 0o777)
-    elif member.issym():
-        target.symlink_to(member.linkname)
+    for path, entry in Tree.from_tar(rootfs).items():
+        library = path.startswith("usr/lib/") and path.rpartition("/")[2].startswith(_LIBRARIES)
+        if not library and path != program and not path.startswith(f"{standard_library}/"):
+            continue
+        place = root / path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if entry.kind == "file":
+            place.write_bytes(entry.content.read())
+            place.chmod(entry.mode & 0o777)
+        elif entry.kind == "link":
+            place.symlink_to(entry.target)
