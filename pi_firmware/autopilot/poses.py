@@ -41,7 +41,14 @@ class PoseGate:
         self.counts = PoseCounts()
         self.reset_counter = 0
         self._settings = settings
-        self._mounting = mounting_of(settings)
+        x, y, z = settings.mount_m
+        self._mounting = Mounting(
+            roll_deg=settings.mount_roll_deg,
+            pitch_deg=settings.mount_pitch_deg,
+            yaw_deg=settings.mount_yaw_deg,
+            position_m=(x, y, z),
+            heading_deg=settings.world_heading_deg,
+        )
         self._last: tuple[int, VehiclePose] | None = None
         self._interrupted = False
 
@@ -107,15 +114,3 @@ class PoseGate:
             moved_m > settings.jump_m + _SPEED_M_S * dt_s
             or turned_deg > settings.jump_deg + _TURN_DEG_S * dt_s
         )
-
-
-def mounting_of(settings: AutopilotSettings) -> Mounting:
-    """The mounting that the settings describe."""
-    x, y, z = settings.mount_m
-    return Mounting(
-        roll_deg=settings.mount_roll_deg,
-        pitch_deg=settings.mount_pitch_deg,
-        yaw_deg=settings.mount_yaw_deg,
-        position_m=(x, y, z),
-        heading_deg=settings.world_heading_deg,
-    )
