@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import functools
 import os
 import re
 import shutil
 import socket
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ground_station.doctor import sockets
 from ground_station.doctor.findings import Finding, ok, problem, warning
+from ground_station.service.asking import ask
 from ground_station.service.settings import HttpSettings, StationSettings
 from ground_station.service.web import access
 from ground_station.stream.udp import BUFFER_BYTES
@@ -24,6 +27,8 @@ from pi_firmware.wire.telemetry import check_endpoint
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _SCOUTING_GROUP, _SCOUTING_PORT = "224.0.0.224", 7446
 _COMMAND_S = 3.0
+_HOLDER = re.compile(r'\("([^"]*)",pid=(\d+)')
+"""How `ss` names a process that has a socket open."""
 _REFUSES = re.compile(r"\b(drop|reject)\b", re.IGNORECASE)
 """What a firewall that lets not everything pass says somewhere, be it nft's or iptables'."""
 _SERVICE = Path("/etc/blimp")
@@ -81,22 +86,23 @@ def reach(settings: StationSettings) -> Finding:
 
 def ports(settings: StationSettings) -> Iterator[Finding]:
     """Each port is free, or the service's own."""
+    serves = functools.cache(lambda: _serves(settings.http))  # asked once, where any is held
     for port in ports_of(settings):
-        yield _port(port)
+        yield _port(port, serves)
 
 
-def _port(port: Port) -> Finding:
+def _port(port: Port, serves: Callable[[], bool]) -> Finding:
     name = f"port {port.number}/{port.protocol}"
-    error = sockets.refusal(port.kind, port.host, port.number)
+    error = refusal(port)
     if error is None:
         return ok(name, f"free at {port.host} ({port.setting})")
-    if sockets.in_use(error):
-        holders = sockets.holders(port.kind, port.number)
-        if holders and all(holder.service for holder in holders):
+    if error.errno == errno.EADDRINUSE:
+        if serves():  # one that lacks a port ends, or its page says so
             return ok(name, f"held by the service itself ({port.setting})")
-        who = " and ".join(map(str, holders)) or "a process that cannot be seen"
-        pids = [str(holder.pid) for holder in holders if holder.pid is not None]
-        end = f"end it (kill {' '.join(pids)})" if pids else "look again as root, and end it"
+        held = holders(port)
+        who = " and ".join(f"process {pid} ({program})" for pid, program in held.items())
+        end = f"end it (kill {' '.join(held)})" if held else "look again as root, and end it"
+        who = who or "a process that cannot be seen"
         return problem(name, f"held by {who}", f"{end}, or set {port.setting} to another")
     reason = error.strerror or str(error)
     addresses = "ip -brief address shows this machine's"
@@ -104,6 +110,36 @@ def _port(port: Port) -> Finding:
     if isinstance(error, PermissionError):
         fix = f"ports below 1024 are root's: set {port.setting} to a higher one"
     return problem(name, f"{port.host} cannot be listened on: {reason}", fix)
+
+
+def refusal(port: Port) -> OSError | None:
+    """Why the port cannot be bound now; None when it can. It is given back at once."""
+    try:
+        family, *_, address = socket.getaddrinfo(port.host, port.number, type=port.kind)[0]
+        with socket.socket(family, port.kind) as probe:
+            if port.kind == socket.SOCK_STREAM:  # connections that have just ended do not count
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            if port.kind == socket.SOCK_STREAM:
+                probe.listen(1)
+    except OSError as error:
+        return error
+    return None
+
+
+def _serves(http: HttpSettings) -> bool:
+    """Whether a station answers at the page's port."""
+    with contextlib.suppress(OSError, ValueError):
+        return bool(ask(http, "/healthz") == {"status": "ok"})
+    return False
+
+
+def holders(port: Port) -> dict[str, str]:
+    """The programs that listen on a port, by process id, as far as this user may see."""
+    words = ["ss", "--listening", "--processes", f"--{port.protocol}", f"sport = :{port.number}"]
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        return {pid: program for program, pid in _HOLDER.findall(_output(words))}
+    return {}
 
 
 def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import shutil
-import socket
 import subprocess
 import time
 from pathlib import Path
 
-from ground_station.doctor import ROOT, network, sockets, versions
+from ground_station.doctor import ROOT, network, versions
 from ground_station.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import StationSettings
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
@@ -63,7 +62,7 @@ def payloads(settings: StationSettings, listen_s: float = _LISTEN_S) -> Finding:
     """
     telemetry = settings.telemetry
     ports = [port for port in network.ports_of(settings) if port.setting == "telemetry.listen"]
-    if any(sockets.refusal(socket.SOCK_STREAM, port.host, port.number) for port in ports):
+    if any(network.refusal(port) for port in ports):
         return ok("payloads", "not listened for: the telemetry port is held")
     try:
         with TelemetryListener(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ground_station.service import add_settings_arguments
 
@@ -21,8 +21,6 @@ examples:
 It changes nothing. Where the station runs, it is asked, and tells what its page does under "Steps";
 otherwise it is told by what lies in this folder."""
 
-_TIMEOUT_S = 3.0
-_ANSWER_BYTES = 1 << 20
 _WIDTH = 100
 
 
@@ -72,22 +70,13 @@ def _lines(number: int, step: Step) -> list[str]:
 
 def _ask(http: HttpSettings) -> tuple[str, list[Step]] | None:
     """The folder and steps of the station that runs; None where none answers as ours does."""
-    import json
-    import urllib.request
-
+    from ground_station.service.asking import ask
     from ground_station.service.web.access import read_token
     from ground_station.service.web.guide import Step, Way
     from pi_firmware.wire.errors import BlimpError
 
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(http.host, http.host)
-    place = f"[{host}]" if ":" in host else host
-    request = urllib.request.Request(f"http://{place}:{http.port}/api/guide")
-    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        if token := read_token(http):
-            request.add_header("Authorization", f"Bearer {token}")
-        with direct.open(request, timeout=_TIMEOUT_S) as answer:
-            document: Any = json.loads(answer.read(_ANSWER_BYTES))
+        document = ask(http, "/api/guide", read_token(http))
         steps = [
             Step(**{**item, "ways": [Way(**way) for way in item["ways"]]})
             for item in document["steps"]

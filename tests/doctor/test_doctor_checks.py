@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,29 @@ def test_a_port_that_is_held_names_its_holder() -> None:
         assert names[f"port {http.port}/tcp"].level == PROBLEM
     again = {f.name: f for f in network.ports(only(StationSettings(), video=video))}
     assert again[f"port {video.port}/udp"].level == OK
+
+
+@pytest.mark.parametrize(
+    ("answer", "level"),
+    [(b'HTTP/1.0 200 OK\r\n\r\n{"status":"ok"}', OK), (b"220 mail\r\n", PROBLEM)],
+)
+def test_ports_are_the_service_s_own_where_it_answers(answer: bytes, level: str) -> None:
+    def serve(page: socket.socket) -> None:
+        with page.accept()[0] as client:
+            client.recv(4096)
+            client.sendall(answer)
+
+    with (
+        socket.create_server(("127.0.0.1", 0)) as page,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held,
+    ):
+        held.bind(("127.0.0.1", 0))
+        http = HttpSettings(port=page.getsockname()[1])
+        video = VideoSettings(port=held.getsockname()[1])
+        threading.Thread(target=serve, args=(page,), daemon=True).start()
+        found = network.ports(only(StationSettings(), http=http, video=video))
+        names = {f"port {video.port}/udp", f"port {http.port}/tcp"}
+        assert {f.level for f in found if f.name in names} == {level}
 
 
 def test_an_address_of_another_machine_cannot_be_listened_on() -> None:

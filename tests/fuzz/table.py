@@ -56,7 +56,6 @@ READERS = (
     Reader("poses", "poses on their way to the autopilot"),
     Reader("commands", "commands and their numbers"),
     Reader("board", "the kernel's files and the output of iw and ip"),
-    Reader("sockets", "the kernel's table of sockets"),
     Reader("web", "the dashboard's HTTP API"),
     Reader("live", "the dashboard's WebSocket"),
     Reader("cases", "replay cases, accepted runs and runs' folders"),
