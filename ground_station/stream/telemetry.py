@@ -94,9 +94,9 @@ class TelemetryListener:
     An endpoint `tcp/127.0.0.1:0` takes a free port, which `endpoints` then tells. Raises
     `TelemetryError` with one line when an endpoint is in use. `certificates` is the folder that
     `blimp keys ground` wrote, without which only loopback is spoken to; payloads that look for a
-    ground station on the interface `discoverable` find this one. `on_event` is called with
-    the payload's id for each event, on a thread of the session. `session` is there for what else
-    the ground station says to its payloads; `name` is the ground station's own.
+    ground station on the interface `discoverable` find this one. `on_message` is called with the
+    payload's id, the key's kind and each message, on a thread of the session. `session` is there
+    for what else the ground station says to its payloads; `name` is the ground station's own.
     """
 
     def __init__(
@@ -106,11 +106,11 @@ class TelemetryListener:
         connect: Sequence[str] = (),
         certificates: str | Path = "",
         discoverable: str = "",
-        on_event: Callable[[str, messages.Event], None] | None = None,
+        on_message: Callable[[str, str, messages.Message], None] | None = None,
     ) -> None:
         self._states: dict[str, PayloadState] = {}
         self._changed = threading.Condition()
-        self._on_event = on_event
+        self._on_message = on_message
         self._held = credentials.load(certificates) if str(certificates) else None
         self.name = self._held.member if self._held else LOCAL_NAME
         self.session = open_session(
@@ -204,8 +204,8 @@ class TelemetryListener:
 
     def _take(self, sample: Any) -> None:
         key = str(sample.key_expr)
-        kind = _KINDS.get(key.rpartition("/")[2])
-        if kind is None:
+        kind = key.rpartition("/")[2]
+        if (of := _KINDS.get(kind)) is None:
             return
         message: messages.Message | None = None
         with self._changed:
@@ -213,13 +213,13 @@ class TelemetryListener:
             if state is None:
                 return
             try:
-                message = messages.decode(kind, sample.payload.to_bytes())
+                message = messages.decode(of, sample.payload.to_bytes())
                 _keep(state, message)
             except TelemetryError:
                 state.refused += 1
             self._changed.notify_all()
-        if isinstance(message, messages.Event) and self._on_event is not None:
-            self._on_event(state.payload_id, message)
+        if message is not None and self._on_message is not None:
+            self._on_message(state.payload_id, kind, message)
 
     def _take_liveliness(self, sample: Any) -> None:
         import zenoh

@@ -181,17 +181,18 @@ def test_clocks_of_those_that_are_gone_are_let_go(monkeypatch: pytest.MonkeyPatc
         assert "last" in alone._served and len(alone._served) <= 4
 
 
-def test_events_are_handed_on_as_they_come() -> None:
-    heard: list[tuple[str, str]] = []
+def test_messages_are_handed_on_as_they_come() -> None:
+    heard: list[tuple[str, str, messages.Message]] = []
     with TelemetryListener(
         ["tcp/127.0.0.1:0"],
-        on_event=lambda payload_id, event: heard.append((payload_id, event.name)),
+        on_message=lambda *said: heard.append(said),
     ) as listener:
         telemetry = payload(listener)
-        telemetry.publish(messages.Event(time_ns=1, name="hello", text=""))
+        event = messages.Event(time_ns=1, name="hello", text="")
+        telemetry.publish(event)
         assert listener.wait_for_event("blimp-1", "hello", LIMIT_S)
         telemetry.close()
-    assert heard == [("blimp-1", "hello")]
+    assert heard == [("blimp-1", "event", event)]
 
 
 def test_an_endpoint_in_use_is_one_line(listener: TelemetryListener) -> None:

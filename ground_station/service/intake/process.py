@@ -33,8 +33,7 @@ from ground_station.stream.feedback import Awaited, Feedback, Video
 from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
-from pi_firmware.wire import keys, messages
-from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire import messages
 
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
@@ -57,13 +56,6 @@ _LEVELS: dict[str, Level] = {
     messages.EVENT_RADIO_RESTARTED: bus_messages.WARNING,
     messages.EVENT_RADIO_FAILED: bus_messages.WARNING,
     messages.EVENT_SOURCE_CUT: bus_messages.WARNING,
-}
-_MESSAGES: dict[str, type[messages.Message]] = {
-    keys.BATTERY: messages.Battery,
-    keys.GATE: messages.Gate,
-    keys.EVENT: messages.Event,
-    keys.AUTOPILOT: messages.Autopilot,
-    keys.HEALTH: messages.Health,
 }
 
 
@@ -118,13 +110,10 @@ class Intake:
             connect=settings.telemetry.connect,
             certificates=certificates,
             discoverable=settings.telemetry.discoverable,
-            on_event=self._payload_said,
+            on_message=self._heard,
         )
         self._stack.callback(self._listener.close)
         self._feed = poses.PoseFeed(self._listener.session)
-        self._subscriber = self._listener.session.zenoh.declare_subscriber(
-            keys.every_payload("*"), self._heard
-        )
         self.video = MultiStreamReceiver(
             settings.video.port,
             settings.video.host,
@@ -222,19 +211,12 @@ class Intake:
                 payload.follow(self.video.stream_of(payload_id))
             payload.take(frame)
 
-    def _heard(self, sample: Any) -> None:
+    def _heard(self, payload_id: str, kind: str, message: messages.Message) -> None:
         """A message of a payload, on a thread of the session."""
-        payload_id = keys.payload_of(str(sample.key_expr))
-        kind = str(sample.key_expr).rpartition("/")[2]
-        of = _MESSAGES.get(kind)
-        if payload_id is None or of is None:
-            return
-        try:
-            message = messages.decode(of, sample.payload.to_bytes())
-        except TelemetryError:
-            return  # the listener counts it
         if isinstance(message, messages.Gate):
             self._announced.said(payload_id, message.ssrc)
+        elif isinstance(message, messages.Event):
+            self._payload_said(payload_id, message)
         payload = self._roster.get(payload_id)
         if payload is not None:
             payload.seen_ns = time.time_ns()

@@ -34,7 +34,7 @@ def fuzz(data: bytes) -> None:
     picker = Picker(data)
     listener = TelemetryListener.__new__(TelemetryListener)
     listener._states, listener._changed = {}, threading.Condition()
-    listener._on_event = lambda *_: None
+    listener._on_message = lambda *_: None
     taken = 0
     while taken < 100:
         if not picker.left():
