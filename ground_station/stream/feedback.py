@@ -12,10 +12,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 from ground_station.stream.arrivals import Flow
 from ground_station.stream.counters import Counters
+from ground_station.stream.multi_stream import Stream
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import keys, messages
 
@@ -33,43 +34,9 @@ _EARLY_QUEUE_S = 0.03
 _EARLY_DROPPED = 0.1
 
 
-class Video(Protocol):
-    """What is asked of a receiver."""
-
-    @property
-    def port(self) -> int:
-        """The UDP port it takes the video at."""
-        ...
-
-    @property
-    def ssrc(self) -> int | None:
-        """The stream it takes; None while there is none."""
-        ...
-
-    @property
-    def counters(self) -> Counters:
-        """What came so far."""
-        ...
-
-    def flow(self) -> Flow | None:
-        """How it comes of late; None while there is too little of it."""
-        ...
-
-    def retransmits(self, rtx_ssrc: int | None, round_trip_s: float | None) -> None:
-        """Hears whether its payload sends again what is asked for, and after how long it may come.
-
-        None: it does not, or its round trip is not known.
-        """
-        ...
-
-    def corrects(self, ssrc: int | None) -> None:
-        """Hears with what SSRC its payload sends corrections; None: it never does."""
-        ...
-
-
 @dataclass(frozen=True)
 class Awaited:
-    """A receiver's `port` for a payload of which nothing came yet: it must hear where to send."""
+    """For a `Stream` of which nothing came yet: its payload must hear where to send."""
 
     port: int
     ssrc: None = None
@@ -83,6 +50,9 @@ class Awaited:
 
     def corrects(self, ssrc: int | None) -> None:
         """Nothing is corrected."""
+
+
+Video = Stream | Awaited
 
 
 @dataclass(frozen=True)
@@ -216,8 +186,8 @@ class _Short:
 class Feedback:
     """Publishes a `messages.LinkReport` a second to each living payload; a context manager.
 
-    `video_of` gives the receiver of a payload's video, or None for a payload whose video is not
-    taken here: it gets no report. To be closed before its listener.
+    `video_of` gives a payload's stream, or None for one whose video is not taken here: it gets no
+    report. To be closed before its listener.
     """
 
     def __init__(
