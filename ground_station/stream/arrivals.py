@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from ground_station.stream.rtp import HEADER_BYTES, MAX_JUMP, Packet
+from ground_station.stream.rtp import CLOCK_HZ, HEADER_BYTES, MAX_JUMP, Packet
 from pi_firmware.wire.delay import WINDOW_NS, StandingDelay
 
 LOSS_NS = 1_000_000_000
@@ -23,7 +23,6 @@ _ENOUGH = 10
 _JUMP_NS = 10_000_000_000
 _FLAT_NS = 15_000_000
 _FLAT_FOR_NS = 3_000_000_000
-_TICKS_PER_S = 90_000  # RFC 6184, 8.2.1
 
 
 @dataclass(frozen=True)
@@ -146,13 +145,13 @@ class Arrivals:
         if self._timestamp is not None:
             step = (packet.timestamp - self._timestamp) & 0xFFFFFFFF
             step -= (step & 0x80000000) << 1
-            apart_ns = now_ns - self._frames[-1].arrival_ns - step * 10**9 // _TICKS_PER_S
+            apart_ns = now_ns - self._frames[-1].arrival_ns - step * 10**9 // CLOCK_HZ
             if abs(apart_ns) > _JUMP_NS:  # no queue: the sender's clock is another now
                 self._forget_delays()
             else:
                 self._ticks += step
         self._timestamp = packet.timestamp
-        delay_ns = now_ns - self._ticks * 10**9 // _TICKS_PER_S
+        delay_ns = now_ns - self._ticks * 10**9 // CLOCK_HZ
         self._frames.append(_Frame(now_ns, delay_ns, len(packet.payload)))
         self._delay.add(now_ns, delay_ns)
 

@@ -82,7 +82,7 @@ class Stream:
         """Of the packets that came, as RTP."""
         self.failure = ""
         """Why its frames are not taken any more, in words."""
-        self.began_ns = self.last_ns = time.monotonic_ns()
+        self.last_ns = time.monotonic_ns()
         self._counters = counters
         self._assembly = Assembly(self.ssrc, counters)
         self._on_frame, self._send = on_frame, send

@@ -147,12 +147,12 @@ class Unprotector:
     """Takes SRTP packets apart; `keys` are master keys with salt (30 bytes) by payload id.
 
     Unauthenticated packets go to `counters.refused`, repeated or very old ones to
-    `counters.replayed`. With `ssrc`, only that stream is looked at, and others go to
-    `counters.other_streams`. Raises `StreamError` for a key of another length.
+    `counters.replayed`. Raises `StreamError` for a key of another length.
 
     A stream is a payload's key with an SSRC, so that who sends with another's SSRC does not shut
-    it out. What a payload sent in an earlier flight is authentic, too: only `ssrc`, from telemetry,
-    tells today's stream from one played back to a receiver that has just started.
+    it out. What a payload sent in an earlier flight is authentic, too: only its SSRC, which
+    telemetry announces, tells today's stream from one played back to a receiver that has just
+    started.
     """
 
     def __init__(
@@ -160,7 +160,6 @@ class Unprotector:
         keys: Mapping[str, bytes],
         counters: Counters | None = None,
         *,
-        ssrc: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = counters or Counters()
@@ -171,7 +170,6 @@ class Unprotector:
         self._keys = [
             SessionKeys(payload_id, master, SRTP_LABEL) for payload_id, master in keys.items()
         ]
-        self._ssrc = ssrc
         self._streams: dict[str, dict[int, _Stream]] = {payload_id: {} for payload_id in keys}
         # Apart, so that a flood of unknown streams does not keep a known one from coming back.
         self._to_join, self._to_follow = _Budget(clock), _Budget(clock)
@@ -184,9 +182,6 @@ class Unprotector:
         packet = _parse(datagram)
         if packet is None:
             self.counters.refused += 1
-            return None
-        if self._ssrc is not None and packet.ssrc != self._ssrc:
-            self.counters.other_streams += 1
             return None
         found = self._find(packet)
         if found is None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ground_station.stream.rtp import CLOCK_HZ
 from pi_firmware.wire.sei import FrameInfo
 
-_TICK_NS = 1e9 / 90_000  # RFC 6184, 8.2.1
+_TICK_NS = 1e9 / CLOCK_HZ
 _MOST_OFF_NS = 2_000_000
 """The camera's clock against the RTP clock from frame to frame: a blimp goes millimetres in it."""
 _MOST_OFF = 0.2

@@ -228,14 +228,6 @@ def test_what_cannot_be_the_videos_is_refused_without_a_search(sender: SrtpSende
     assert unprotector.counters.refused == 5 and unprotector.tags_searched == 0
 
 
-def test_only_the_stream_asked_for_is_looked_at(sender: SrtpSender) -> None:
-    own, other = sender.protect([rtp(1, ssrc=1)]), sender.protect([rtp(1, ssrc=2)])
-    unprotector = Unprotector({ID: KEY}, ssrc=1)
-    assert unprotector.unprotect(other[0]) is None and unprotector.tags_searched == 0
-    assert unprotector.unprotect(own[0]) == rtp(1, ssrc=1)
-    assert unprotector.counters.other_streams == 1
-
-
 def test_a_flood_of_streams_is_searched_within_bounds_and_kept_out(sender: SrtpSender) -> None:
     clock = Clock()
     unprotector = Unprotector({ID: KEY, "blimp-2": OTHER_KEY}, clock=clock)
