@@ -11,7 +11,7 @@ from ground_station.service import add_settings_arguments
 
 if TYPE_CHECKING:
     from ground_station.service.settings import HttpSettings
-    from ground_station.service.web.guide import Step
+    from ground_station.service.web.models import Step
 
 _EPILOG = """\
 examples:
@@ -72,7 +72,7 @@ def _ask(http: HttpSettings) -> tuple[str, list[Step]] | None:
     """The folder and steps of the station that runs; None where none answers as ours does."""
     from ground_station.service.asking import ask
     from ground_station.service.web.access import read_token
-    from ground_station.service.web.guide import Step, Way
+    from ground_station.service.web.models import Step, Way
     from pi_firmware.wire.errors import BlimpError
 
     try:

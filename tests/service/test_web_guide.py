@@ -20,8 +20,9 @@ from ground_station.service.settings import (
     StationSettings,
     TelemetrySettings,
 )
-from ground_station.service.web.guide import Guide, Step, first_way
+from ground_station.service.web.guide import Guide, first_way
 from ground_station.service.web.maps import Maps
+from ground_station.service.web.models import Step
 from ground_station.service.web.recordings import Recordings
 
 CAMERA = """width_px = 640

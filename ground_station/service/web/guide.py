@@ -11,9 +11,8 @@ import os
 import shlex
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import load_camera
@@ -22,41 +21,17 @@ from ground_station.mapping.construction.verdict import first_line
 from ground_station.service import lan
 from ground_station.service.settings import DEMO_PAYLOAD, SAMPLE, StationSettings
 from ground_station.service.web.maps import Maps
+from ground_station.service.web.models import Step, Way
 from ground_station.service.web.problems import NotFound
 from ground_station.service.web.recordings import Recordings
 from pi_firmware.wire.errors import BlimpError
 
-State = Literal["done", "ready", "waiting"]
 CAMERA, BOARD, REPORT = "camera.toml", "board.toml", "calibration.html"
 PLAN = "floorplan.png"
 NAMED = ("build", "extend")
 """Steps whose jobs make a map, which wants a name."""
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 _CHOICES = 50
-
-
-@dataclass(frozen=True)
-class Way:
-    """A command that goes on, and when it is the one; without a command, what to do by hand."""
-
-    text: str
-    command: str = ""
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step: `ready` can be taken now, `waiting` needs another first.
-
-    `choices` are what the page's own button may be given: recordings, or names of maps.
-    """
-
-    name: str
-    title: str
-    state: State
-    found: str
-    check: str
-    ways: list[Way] = field(default_factory=list)
-    choices: list[str] = field(default_factory=list)
 
 
 class Guide:

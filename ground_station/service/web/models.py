@@ -5,11 +5,13 @@ What is taken is checked against these; what is given is built from notes and on
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
+from ground_station.service.alarms import Alarm
 from ground_station.service.bus_messages import EstimateMessage, PayloadMessage, RecordingMessage
 
 PAYLOAD_PATTERN = "^[a-z0-9][a-z0-9_-]{0,31}$"
@@ -40,30 +42,35 @@ class JobRequest(_Model):
     map: Annotated[str, StringConstraints(pattern=MAP_PATTERN)] | None = None
 
 
-class WayModel(BaseModel):
-    """A command that goes on, and when it is the one; none where it is done by hand."""
+@dataclass(frozen=True)
+class Way:
+    """A command that goes on, and when it is the one; without a command, what to do by hand."""
 
     text: str
-    command: str
+    command: str = ""
 
 
-class StepModel(BaseModel):
-    """A step from payload to flight; `choices` are what a job of it may be given."""
+@dataclass(frozen=True)
+class Step:
+    """A step from payload to flight: `ready` can be taken now, `waiting` needs another first.
+
+    `choices` are what the page's own button may be given: recordings, or names of maps.
+    """
 
     name: str
     title: str
     state: Literal["done", "ready", "waiting"]
     found: str
     check: str
-    ways: list[WayModel]
-    choices: list[str]
+    ways: list[Way] = field(default_factory=list)
+    choices: list[str] = field(default_factory=list)
 
 
 class GuideModel(BaseModel):
     """The steps as the station sees them from the folder that its commands are given in."""
 
     folder: str
-    steps: list[StepModel]
+    steps: list[Step]
 
 
 class JobModel(BaseModel):
@@ -179,16 +186,6 @@ class EventModel(BaseModel):
     payload: str
 
 
-class AlarmModel(BaseModel):
-    """An alarm that stands; `payload` is "-" where it is of none."""
-
-    id: str
-    level: Literal["info", "warning", "alarm"]
-    payload: str
-    text: str
-    since_ns: int
-
-
 class OtherStationModel(BaseModel):
     """Another station: its clock less this one's (`clock_s`), the payloads that fly with it."""
 
@@ -234,7 +231,7 @@ class StateModel(BaseModel):
     recording: RecordingMessage | None
     recording_age_s: float | None
     events: list[EventModel]
-    alarms: list[AlarmModel]
+    alarms: list[Alarm]
     job: JobModel | None
     fleet: FleetModel | None = None
 
