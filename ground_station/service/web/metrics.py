@@ -46,12 +46,12 @@ _GAUGES = (
 )
 
 
-class Metrics:
+class Metrics(Collector):
     """All metrics of the station, in a registry of their own. Safe from any thread."""
 
     def __init__(self, snapshot: Snapshot) -> None:
         disable_created_metrics()  # text format 0.0.4 has no place for them but series of their own
-        self.registry = CollectorRegistry(auto_describe=False)
+        self.registry = CollectorRegistry()
         self.answers: Counter[tuple[str, str]] = Counter()
         """HTTP answers by method and status class."""
         self.viewers: Callable[[], int] = lambda: 0
@@ -78,7 +78,7 @@ class Metrics:
             "Pictures that viewers who left were too slow to take.",
             registry=self.registry,
         )
-        self.registry.register(_Notes(self))
+        self.registry.register(self)
 
     def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Counts a pose's latency and the time of its stages."""
@@ -110,83 +110,65 @@ class Metrics:
         """Everything in Prometheus's text format 0.0.4."""
         return generate_latest(self.registry)
 
-    def stages(self) -> dict[tuple[str, str], tuple[int, float]]:
-        """Count and sum (s) by payload and stage."""
-        with self._lock:
-            return dict(self._stages)
-
-    def state(self) -> dict[str, Any]:
-        """The station's state, without trails."""
-        return self._snapshot.document(full=False)
-
-
-class _Notes(Collector):
-    """Reads the notes at each scrape."""
-
-    def __init__(self, metrics: Metrics) -> None:
-        self._metrics = metrics
-
-    def describe(self) -> list[Metric]:
-        return []
-
     def collect(self) -> Iterator[Metric]:
-        state = self._metrics.state()
+        """What the notes say, read at each scrape."""
+        state = self._snapshot.document(full=False)
         yield from _of_station(state)
         yield from _of_payloads(state["payloads"])
         yield from _of_processes(state["processes"])
         stages = SummaryMetricFamily(
             "blimp_stage_seconds", "Time of the localizer's stages.", labels=["payload", "stage"]
         )
-        for key, (count, sum_s) in self._metrics.stages().items():
-            stages.add_metric(key, count, sum_s)
+        with self._lock:
+            for key, (count, sum_s) in self._stages.items():
+                stages.add_metric(key, count, sum_s)
         yield stages
-        yield GaugeMetricFamily(
-            "blimp_viewers", "Live connections.", value=float(self._metrics.viewers())
+        yield GaugeMetricFamily("blimp_viewers", "Live connections.", value=self.viewers())
+        yield CounterMetricFamily(
+            "blimp_bus_dropped",
+            "What this process heard on the bus that was no message.",
+            value=self.bus_dropped(),
         )
-        dropped = CounterMetricFamily(
-            "blimp_bus_dropped", "What this process heard on the bus that was no message."
-        )
-        dropped.add_metric([], self._metrics.bus_dropped())
-        yield dropped
         pictures = CounterMetricFamily(
             "blimp_pictures", "Frames that viewers wanted, by what became of them.", labels=["fate"]
         )
-        for fate, count in self._metrics.video().items():
+        for fate, count in self.video().items():
             pictures.add_metric([fate], count)
         yield pictures
         answers = CounterMetricFamily(
             "blimp_http_answers", "HTTP answers.", labels=["method", "status"]
         )
-        for (method, status), count in list(self._metrics.answers.items()):
+        for (method, status), count in list(self.answers.items()):
             answers.add_metric([method, status], count)
         yield answers
 
 
 def _of_station(state: Mapping[str, Any]) -> Iterator[Metric]:
     station = state["station"]
-    info = InfoMetricFamily("blimp_station", "This station.")
-    info.add_metric([], {name: str(station[name]) for name in ("name", "version", "map")})
-    yield info
+    about = {name: str(station[name]) for name in ("name", "version", "map")}
+    yield InfoMetricFamily("blimp_station", "This station.", about)
     alarms = GaugeMetricFamily(
         "blimp_alarm", "1 for each alarm that stands.", labels=["alarm", "level", "payload"]
     )
     for alarm in state["alarms"]:
-        _add(alarms, [alarm["id"][:64], alarm["level"], alarm["payload"]], 1)
+        alarms.add_metric([alarm["id"][:64], alarm["level"], alarm["payload"]], 1)
     yield alarms
-    recording = state["recording"]
-    if recording is None:
+    if (recording := state["recording"]) is None:
         return
-    gauge = GaugeMetricFamily("blimp_recording_active", "1 while the station records.")
-    _add(gauge, [], bool(recording["active"]))
-    yield gauge
-    gauge = GaugeMetricFamily("blimp_recording_free_bytes", "Free on the recordings' disk.")
-    _add(gauge, [], _scaled(recording["free_MB"], 1e6))
-    yield gauge
-    counter = CounterMetricFamily(
-        "blimp_recording_dropped", "Messages of this recording that a slow disk did not take."
+    free_MB = recording["free_MB"]
+    yield GaugeMetricFamily(
+        "blimp_recording_active", "1 while the station records.", value=recording["active"]
     )
-    _add(counter, [], recording["dropped"])
-    yield counter
+    yield GaugeMetricFamily(
+        "blimp_recording_free_bytes",
+        "Free on the recordings' disk.",
+        value=None if free_MB is None else 1e6 * free_MB,
+    )
+    yield CounterMetricFamily(
+        "blimp_recording_dropped",
+        "Messages of this recording that a slow disk did not take.",
+        value=recording["dropped"],
+    )
 
 
 def _of_payloads(payloads: Mapping[str, Any]) -> Iterator[Metric]:
@@ -212,22 +194,24 @@ def _of_payloads(payloads: Mapping[str, Any]) -> Iterator[Metric]:
         for name, _, _, text in _GAUGES
     }
     for payload_id, view in payloads.items():
-        _add(up, [payload_id], view["alive"])
+        up.add_metric([payload_id], view["alive"])
         if (estimate := view["estimate"]) is not None:
             for state in State:
-                _add(states, [payload_id, state.value], estimate["state"] == state.value)
+                states.add_metric([payload_id, state.value], estimate["state"] == state.value)
             for fate in ("processed", "localized", "skipped"):
-                _add(frames, [payload_id, fate], estimate[fate])
+                frames.add_metric([payload_id, fate], estimate[fate])
         if (note := view["payload"]) is None:
             continue
         for family, table in ((frames, note["frames"]), (stream, note["stream"])):
-            for name, count in list(table.items())[:32] if isinstance(table, dict) else ():
-                _add(family, [payload_id, str(name)[:32]], count)
-        _add(lost, [payload_id], note["lost_share"])
-        _add(rate, [payload_id], _scaled(note["bitrate_kbps"], 1e3))
+            for name, count in list(table.items())[:32]:
+                family.add_metric([payload_id, name[:32]], count)
+        lost.add_metric([payload_id], note["lost_share"])
+        rate.add_metric([payload_id], 1e3 * note["bitrate_kbps"])
         for name, message, field, _ in _GAUGES:
-            if isinstance(note[message], dict) and message not in view["stale"]:
-                _add(values[name], [payload_id], note[message].get(field))
+            if note[message] and message not in view["stale"]:
+                value = note[message][field]
+                if value is not None:
+                    values[name].add_metric([payload_id], value)
     yield from (up, states, frames, stream, lost, rate, *values.values())
 
 
@@ -243,19 +227,9 @@ def _of_processes(processes: list[Mapping[str, Any]]) -> Iterator[Metric]:
         "blimp_process_restarts", "Times it was restarted.", labels=["process"]
     )
     for process in processes:
-        name = [str(process["name"])[:64]]
-        _add(memory, name, _scaled(process["memory_MB"], 1e6))
-        _add(cpu, name, process["cpu"])
-        _add(silent, name, process["age_s"])
-        _add(restarts, name, process["restarts"])
+        name = [process["name"][:64]]
+        memory.add_metric(name, 1e6 * process["memory_MB"])
+        cpu.add_metric(name, process["cpu"])
+        silent.add_metric(name, process["age_s"])
+        restarts.add_metric(name, process["restarts"])
     yield from (memory, cpu, silent, restarts)
-
-
-def _add(family: Any, labels: list[str], value: Any) -> None:
-    """Adds a sample where there is a number."""
-    if isinstance(value, int | float):
-        family.add_metric(labels, float(value))
-
-
-def _scaled(value: Any, factor: float) -> float | None:
-    return value * factor if isinstance(value, int | float) else None
