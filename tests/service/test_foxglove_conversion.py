@@ -157,12 +157,12 @@ def test_stamps_are_the_captures_or_the_next_best() -> None:
     ("schema", "document"),
     [
         (
-            documents.estimate_schema(),
+            documents.ESTIMATE,
             documents.estimate(PAYLOAD, estimate(), conversion.solved(estimate())),
         ),
-        (documents.event_schema(), documents.event("-", EventMessage(1, "web", "info", "a", "b"))),
-        (documents.status_schema(), documents.status(PayloadMessage(True, 5, clock={"a": 1}))),
-        (documents.recording_schema(), as_document(RecordingMessage(True, "f", free_MB=1.5))),
+        (documents.EVENT, documents.event("-", EventMessage(1, "web", "info", "a", "b"))),
+        (documents.STATUS, documents.status(PayloadMessage(True, 5, clock={"a": 1}))),
+        (documents.RECORDING, as_document(RecordingMessage(True, "f", free_MB=1.5))),
     ],
 )
 def test_what_is_said_is_what_the_schema_says(schema: dict, document: dict) -> None:

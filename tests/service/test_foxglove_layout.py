@@ -12,7 +12,7 @@ from test_foxglove_server import PAYLOAD, SCHEMAS
 from ground_station.service.foxglove import documents, layout
 from pi_firmware.wire.errors import BlimpError
 
-OF_JSON = {"estimate": documents.estimate_schema(), "battery": documents.battery_schema()}
+OF_JSON = {"estimate": documents.ESTIMATE, "battery": documents.BATTERY}
 
 
 def test_every_topic_in_it_is_one_of_the_stations_and_every_path_one_of_its_fields() -> None:

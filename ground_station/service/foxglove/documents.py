@@ -24,7 +24,8 @@ _TYPES = {int: "integer", float: "number", str: "string", bool: "boolean", dict:
 _LEFT_OUT = (
     "position_m", "quaternion_xyzw", "covariance", "position_sigma_m", "points_px",
 )  # fmt: skip
-_MESSAGES = ("battery", "health", "autopilot")
+_OF_THEIR_OWN = ("battery", "health")
+_TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
 
 
 def _object(**properties: Any) -> dict[str, Any]:
@@ -33,14 +34,14 @@ def _object(**properties: Any) -> dict[str, Any]:
 
 _HEADER = _object(
     stamp=_object(sec={"type": "integer"}, nanosec={"type": "integer"}),
-    frame_id={"type": "string"},
+    frame_id=_TEXT,
 )
 _POSE = _object(
     pose=_object(
-        position=_object(**{name: {"type": "number"} for name in "xyz"}),
-        orientation=_object(**{name: {"type": "number"} for name in "xyzw"}),
+        position=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER),
+        orientation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER),
     ),
-    covariance={"type": "array", "items": {"type": "number"}},
+    covariance={"type": "array", "items": _NUMBER},
 )
 
 
@@ -100,63 +101,11 @@ def event(payload_id: str, note: EventMessage) -> dict[str, Any]:
 def status(note: PayloadMessage) -> dict[str, Any]:
     """A payload's account, without the messages that have topics of their own."""
     document = bus_messages.as_document(note)
-    return {name: document[name] for name in document if name not in _MESSAGES[:2]}
+    return {name: document[name] for name in document if name not in _OF_THEIR_OWN}
 
 
-def estimate_schema() -> dict[str, Any]:
-    """Of `estimate`."""
-    return _schema(
-        "blimp.Estimate",
-        {
-            "header": _HEADER,
-            "child_frame_id": {"type": "string"},
-            "pose": _POSE,
-            **_properties(EstimateMessage, leave=_LEFT_OUT),
-        },
-    )
-
-
-def neighbours_schema() -> dict[str, Any]:
-    """Of `neighbours`."""
-    one = _object(
-        payload={"type": "string"},
-        child_frame_id={"type": "string"},
-        pose=_POSE,
-        age_s={"type": "number"},
-        distance_m={"type": "number"},
-        distance_sigma_m={"type": "number"},
-    )
-    listed = {"type": "array", "items": one}
-    return _schema("blimp.Neighbours", {"header": _HEADER, "neighbours": listed})
-
-
-def event_schema() -> dict[str, Any]:
-    """Of `event`."""
-    return _schema("blimp.Event", {"payload": {"type": "string"}, **_properties(EventMessage)})
-
-
-def recording_schema() -> dict[str, Any]:
-    """Of a `RecordingMessage`."""
-    return _schema("blimp.Recording", _properties(RecordingMessage))
-
-
-def status_schema() -> dict[str, Any]:
-    """Of `status`."""
-    return _schema("blimp.Payload", _properties(PayloadMessage, leave=_MESSAGES[:2]))
-
-
-def battery_schema() -> dict[str, Any]:
-    """Of a payload's battery message."""
-    return _schema("blimp.Battery", _properties(messages.Battery))
-
-
-def health_schema() -> dict[str, Any]:
-    """Of a payload's health message."""
-    return _schema("blimp.Health", _properties(messages.Health))
-
-
-def _schema(title: str, properties: dict[str, Any]) -> dict[str, Any]:
-    return {"title": title, "type": "object", "properties": properties}
+def _schema(title: str, **properties: Any) -> dict[str, Any]:
+    return {"title": title, **_object(**properties)}
 
 
 def _properties(of: type, leave: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -175,3 +124,28 @@ def _property(hint: Any) -> dict[str, Any]:
     if origin is Literal:
         return {"type": "string"}
     return {"type": "object" if dataclasses.is_dataclass(hint) else _TYPES[origin or hint]}
+
+
+ESTIMATE = _schema(
+    "blimp.Estimate",
+    header=_HEADER,
+    child_frame_id=_TEXT,
+    pose=_POSE,
+    **_properties(EstimateMessage, leave=_LEFT_OUT),
+)
+_NEIGHBOUR = _object(
+    payload=_TEXT,
+    child_frame_id=_TEXT,
+    pose=_POSE,
+    age_s=_NUMBER,
+    distance_m=_NUMBER,
+    distance_sigma_m=_NUMBER,
+)
+NEIGHBOURS = _schema(
+    "blimp.Neighbours", header=_HEADER, neighbours={"type": "array", "items": _NEIGHBOUR}
+)
+EVENT = _schema("blimp.Event", payload=_TEXT, **_properties(EventMessage))
+RECORDING = _schema("blimp.Recording", **_properties(RecordingMessage))
+STATUS = _schema("blimp.Payload", **_properties(PayloadMessage, leave=_OF_THEIR_OWN))
+BATTERY = _schema("blimp.Battery", **_properties(messages.Battery))
+HEALTH = _schema("blimp.Health", **_properties(messages.Health))

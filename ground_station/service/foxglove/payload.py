@@ -71,14 +71,14 @@ class Payload:
         )
         self._pose = Topic(PoseInFrameChannel(f"{root}/pose", context=context))
         self._scene = Topic(SceneUpdateChannel(f"{root}/scene", context=context), self._drawn)
-        self._estimate = json_topic(f"{root}/estimate", documents.estimate_schema(), context)
-        self._neighbours = json_topic(f"{root}/neighbours", documents.neighbours_schema(), context)
+        self._estimate = json_topic(f"{root}/estimate", documents.ESTIMATE, context)
+        self._neighbours = json_topic(f"{root}/neighbours", documents.NEIGHBOURS, context)
         self._messages = {
             name: json_topic(f"{root}/{name}", schema, context, recall(name))
             for name, schema in {
-                "battery": documents.battery_schema(),
-                "health": documents.health_schema(),
-                "status": documents.status_schema(),
+                "battery": documents.BATTERY,
+                "health": documents.HEALTH,
+                "status": documents.STATUS,
             }.items()
         }
         self.topics = (

@@ -139,11 +139,9 @@ class Publishing:
         self._tf = Topic(FrameTransformsChannel("/tf", context=context))
         self._plan = Topic(GridChannel("/map/floorplan", context=context))
         self._landmarks = Topic(PointCloudChannel("/map/landmarks", context=context))
-        self._event = json_topic("/events", documents.event_schema(), context, self._happened)
+        self._event = json_topic("/events", documents.EVENT, context, self._happened)
         self._log = Topic(LogChannel("/log", context=context), self._logged)
-        self._recorded = json_topic(
-            "/recording", documents.recording_schema(), context, self._recalled
-        )
+        self._recorded = json_topic("/recording", documents.RECORDING, context, self._recalled)
         topics = (self._tf, self._event, self._log, self._recorded)
         self._topics = {topic.id: topic for topic in topics}
         self._of_map = (self._plan.id, self._landmarks.id)
