@@ -211,7 +211,7 @@ def test_sessions_end_by_time_number_and_word():
     sessions = access.Sessions(lambda: now_s[0])
     first = sessions.begin()
     assert sessions.holds(first)
-    for forged in ("", ".", first[:-1], first + "x", first.partition(".")[0], "a.b", "ü.ü"):
+    for forged in ("", ".", first[:-1], first + "x", first[:10], "a.b", "ü.ü"):
         assert not sessions.holds(forged)
     other = access.Sessions().begin()
     assert not sessions.holds(other)
