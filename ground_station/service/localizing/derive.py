@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -59,17 +59,17 @@ def heading_deg(wTc: F64) -> float | None:
     return float(np.rad2deg(np.arctan2(y, x)))
 
 
-def shown(observations: Observations, most: int = MOST_POINTS) -> Indices:
-    """Which observations are told: the inliers, at most `most`, evenly chosen in their order."""
+def shown(observations: Observations) -> Indices:
+    """Which observations are told: the inliers, at most 300, evenly chosen in their order."""
     inliers = np.flatnonzero(observations.inlier)
-    if len(inliers) > most:
-        inliers = inliers[np.arange(most) * len(inliers) // most]
+    if len(inliers) > MOST_POINTS:
+        inliers = inliers[np.arange(MOST_POINTS) * len(inliers) // MOST_POINTS]
     return inliers
 
 
-def points_px(observations: Observations, most: int = MOST_POINTS) -> list[float]:
+def points_px(observations: Observations) -> list[float]:
     """Their pixels in the frame as it was taken (distorted), u, v by turns, to a tenth."""
-    pixels = observations.pixel_px[shown(observations, most)]
+    pixels = observations.pixel_px[shown(observations)]
     rounded: list[float] = np.round(pixels.astype(np.float64), 1).ravel().tolist()
     return rounded
 
@@ -94,14 +94,10 @@ def estimate_note(
             covariance = None
     twist = estimate.twist
     velocity = world_velocity(wTc, twist)
-    return EstimateMessage(
-        sequence=frame.sequence,
-        time_ns=frame.time_ns,
-        clock_ns=frame.clock_ns,
-        capture_ns=frame.capture_ns,
-        done_ns=done_ns,
-        state=estimate.state.value,
-        reason=estimate.reason,
+    return replace(
+        unsolved_note(
+            frame, estimate.state, estimate.reason, accounts, map_name, done_ns, estimate
+        ),
         position_m=wTc[:3, 3].tolist(),
         quaternion_xyzw=to_quaternion(wTc).tolist(),
         covariance=None if covariance is None else covariance.ravel().tolist(),
@@ -113,14 +109,7 @@ def estimate_note(
         height_m=float(wTc[2, 3]),
         relocalized=estimate.relocalized,
         tracked=estimate.tracked,
-        inliers=estimate.counts.inliers,
-        expected=estimate.counts.projected,
         points_px=points_px(estimate.observations),
-        stage_ms=_stages(estimate),
-        map=map_name,
-        processed=accounts.processed,
-        localized=accounts.localized,
-        skipped=accounts.skipped,
     )
 
 
@@ -155,7 +144,8 @@ def unsolved_note(
     estimate: PoseEstimate | None = None,
 ) -> EstimateMessage:
     """A frame without a pose, and why; `estimate` where the localizer saw it."""
-    counts = None if estimate is None else estimate.counts
+    counts = estimate.counts if estimate else Counts()
+    stage_ms = estimate.stage_ms if estimate else {}
     return EstimateMessage(
         sequence=frame.sequence,
         time_ns=frame.time_ns,
@@ -164,15 +154,9 @@ def unsolved_note(
         done_ns=done_ns,
         state=state.value,
         reason=reason,
-        inliers=counts.inliers if counts else 0,
-        expected=counts.projected if counts else 0,
-        stage_ms=_stages(estimate) if estimate else {},
+        inliers=counts.inliers,
+        expected=counts.projected,
+        stage_ms={stage: round(value, 3) for stage, value in stage_ms.items()},
         map=map_name,
-        processed=accounts.processed,
-        localized=accounts.localized,
-        skipped=accounts.skipped,
+        **asdict(accounts),
     )
-
-
-def _stages(estimate: PoseEstimate) -> dict[str, float]:
-    return {stage: round(value, 3) for stage, value in estimate.stage_ms.items()}
