@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ FLEET_PORT = 7448
 """Where other stations join."""
 
 
+MAP_NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
+
+
 @dataclass(frozen=True)
 class MapSettings:
     """Where poses are in."""
@@ -36,6 +40,21 @@ class MapSettings:
     folder: str = "maps/atrium"
     shelf: str = "maps"
     camera: str = ""
+
+    def folder_of(self, name: object) -> Path | None:
+        """Where the map of a name lies, on the shelf or as the configured one; else None.
+
+        None, too, for what is no plain name, and for a link that leads off the shelf.
+        """
+        if not isinstance(name, str) or not re.fullmatch(MAP_NAME, name):
+            return None
+        shelf, configured = Path(self.shelf), Path(self.folder)
+        folder = shelf / name
+        if (folder / "map.toml").is_file() and folder.resolve().parent == shelf.resolve():
+            return folder
+        if configured.name == name and (configured / "map.toml").is_file():
+            return configured
+        return None
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
-"""Maps for a running localizer: found by name on the shelf, loaded beside the frames."""
+"""Maps for a running localizer, loaded beside the frames."""
 
 from __future__ import annotations
 
-import re
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,27 +12,8 @@ from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings, for_live, load_preset
 from ground_station.map import store
 from ground_station.service.cameras import camera_of
-from ground_station.service.settings import Run, StationSettings
+from ground_station.service.settings import Run
 from pi_firmware.wire.errors import BlimpError
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
-
-
-def folder_of(settings: StationSettings, name: object) -> Path:
-    """The folder of the map that is asked for by name: one on the shelf, or the configured one.
-
-    Raises `MapError` for what is no plain name, for a name that is not there, and for a link that
-    leads elsewhere.
-    """
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise MapError(f"map {name!r:.80}: a plain name is needed, as 'atrium'")
-    shelf, configured = Path(settings.map.shelf), Path(settings.map.folder)
-    folder = shelf / name
-    if folder.is_dir() and folder.resolve().parent == shelf.resolve():
-        return folder
-    if configured.name == name and configured.is_dir():
-        return configured
-    raise MapError(f"map {name!r}: there is none of that name in {shelf}")
 
 
 def settings_of(run: Run) -> LocalizerSettings:

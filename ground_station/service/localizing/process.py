@@ -27,7 +27,7 @@ from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
 from ground_station.service.localizing import derive
 from ground_station.service.localizing.derive import Accounts
-from ground_station.service.localizing.maps import Loader, Loading, folder_of
+from ground_station.service.localizing.maps import Loader, Loading
 from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.settings import Run
 from pi_firmware.wire import files
@@ -289,7 +289,14 @@ class Localizing:
         raise LocalizingError(f"do: {what!r:.40} is not known (known: relocalize, map)")
 
     def _choose_map(self, name: object) -> Mapping[str, Any]:
-        loading = self._loader.begin(folder_of(self._run.station, name))
+        settings = self._run.station.map
+        folder = settings.folder_of(name)
+        if folder is None:
+            raise MapError(
+                f"map {name!r:.80}: there is none of that name in {settings.shelf}; a plain name is"
+                " needed, as 'atrium'"
+            )
+        loading = self._loader.begin(folder)
         if not loading.taken.wait(_ANSWER_S):
             return {"map": loading.name, "loading": True}
         if loading.refused:

@@ -5,7 +5,7 @@ Only what is asked for is read, once, and kept until the file changes.
 
 from __future__ import annotations
 
-import re
+import contextlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from fastapi import APIRouter, Request, Response
 
 from ground_station.errors import MapError
 from ground_station.service.settings import MapSettings
-from ground_station.service.web.models import MAP_PATTERN, MapDetailsModel, MapModel, MapName
+from ground_station.service.web.models import MapDetailsModel, MapModel, MapName
 from ground_station.service.web.problems import NotFound, problems
 from pi_firmware.wire.errors import BlimpError
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 LANDMARKS = 20_000
 _KEPT = 16
 _MAPS = 100
-_NAME = re.compile(MAP_PATTERN)
 T = TypeVar("T")
 
 
@@ -35,28 +34,18 @@ class Maps:
     """The maps on the shelf and the configured one. Safe from any thread."""
 
     def __init__(self, settings: MapSettings) -> None:
-        self._shelf, self._configured = Path(settings.shelf), Path(settings.folder)
         self._settings = settings
         self._lock = threading.Lock()
         self._kept: OrderedDict[tuple[str, str], tuple[tuple[int, ...], Any]] = OrderedDict()
 
     def names(self) -> list[str]:
         """All that can be asked for."""
-        found = []
-        try:
-            for folder in sorted(self._shelf.iterdir())[: 10 * _MAPS]:
-                if _NAME.fullmatch(folder.name) and (folder / "map.toml").is_file():
-                    found.append(folder.name)
-        except OSError:
-            pass
-        name = self._configured.name
-        if (
-            name not in found
-            and _NAME.fullmatch(name)
-            and (self._configured / "map.toml").is_file()
-        ):
-            found.append(name)
-        return found[:_MAPS]
+        names: list[str] = []
+        with contextlib.suppress(OSError):
+            names = sorted(path.name for path in Path(self._settings.shelf).iterdir())[: 10 * _MAPS]
+        names.append(Path(self._settings.folder).name)
+        found = dict.fromkeys(name for name in names if self._settings.folder_of(name))
+        return [*found][:_MAPS]
 
     def list(self) -> list[dict[str, Any]]:
         """All maps in short; one that cannot be read is left out."""
@@ -157,18 +146,11 @@ class Maps:
         return self._once(name, "floorplan", ("floorplan.yaml", "floorplan.png"), read)
 
     def folder(self, name: str) -> Path:
-        """Where a map lies; raises `NotFound`.
-
-        The same rule as the localizer's: a name on the shelf, or the configured map's.
-        """
-        if _NAME.fullmatch(name):
-            folder = self._shelf / name
-            inside = folder.is_dir() and folder.resolve().parent == self._shelf.resolve()
-            if inside and (folder / "map.toml").is_file():
-                return folder
-            if self._configured.name == name and (self._configured / "map.toml").is_file():
-                return self._configured
-        raise NotFound(f"there is no map {name[:64]!r}")
+        """Where a map lies; raises `NotFound`."""
+        folder = self._settings.folder_of(name)
+        if folder is None:
+            raise NotFound(f"there is no map {name[:64]!r}")
+        return folder
 
     def _once(self, name: str, what: str, files: tuple[str, ...], read: Callable[[], T]) -> T:
         """What `read` gives, kept until one of the files is another."""

@@ -13,9 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from ground_station.service.alarms import Alarm
 from ground_station.service.bus_messages import EstimateMessage, PayloadMessage, RecordingMessage
+from ground_station.service.settings import MAP_NAME
 
 PAYLOAD_PATTERN = "^[a-z0-9][a-z0-9_-]{0,31}$"
-MAP_PATTERN = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+MAP_PATTERN = f"^{MAP_NAME}$"
 FILE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.:+-]{0,127}\.mcap$"
 
 PayloadId = Annotated[str, Path(pattern=PAYLOAD_PATTERN, description="As blimp-1.")]
