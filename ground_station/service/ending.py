@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
+from collections.abc import Callable
+
+from pi_firmware.wire.errors import BlimpError
 
 LIMIT_S = 1.5
 
@@ -28,3 +32,15 @@ def ending(limit_s: float | None = LIMIT_S) -> threading.Event:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, end)
     return stop
+
+
+def status_of(name: str, serve: Callable[..., int]) -> int:
+    """A process's exit status: what `serve` gives for its arguments.
+
+    A `BlimpError` is one line on standard error, and 2, or 3 where a new process may fix it.
+    """
+    try:
+        return serve(*sys.argv[1:])
+    except BlimpError as error:
+        print(f"{name}: {error}", file=sys.stderr, flush=True)
+        return 3 if error.restart else 2

@@ -153,8 +153,9 @@ class Child:
         # A parent that is killed takes its children with it, whoever started it.
         if setpriv := shutil.which("setpriv"):
             command = [setpriv, "--pdeathsig", "KILL", "--", *command]
-        # One that crashes writes where each of its threads was.
-        environment = {**os.environ, "PYTHONFAULTHANDLER": "1"}
+        # One that crashes writes where each of its threads was. As in `blimp`, threads are ours to
+        # schedule and not BLAS's.
+        environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, "PYTHONFAULTHANDLER": "1"}
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment)
         self._started_s, self._heard_s, self._due_s = self._clock(), None, None
         self.started = True

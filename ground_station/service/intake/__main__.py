@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is first imported
 
 from ground_station.service import bus_messages, heaps
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage, EventMessage, LeaveMessage
 from ground_station.service.cameras import camera_of
-from ground_station.service.ending import ending
+from ground_station.service.ending import ending, status_of
 from ground_station.service.intake import resuming
 from ground_station.service.intake.process import Intake
 from ground_station.service.settings import load_run
-from pi_firmware.wire.errors import BlimpError
 
 _STEP_S = 0.1
 
 
-def serve(folder: Path, stop: threading.Event) -> None:
-    """Runs until `stop` is set; raises a `BlimpError` with one line when it cannot."""
+def serve(run_folder: str) -> int:
+    """Runs until it is told to end; raises a `BlimpError` with one line when it cannot."""
+    heaps.few()
+    stop = ending(None)  # a recording ends in its own time
+    import cv2
+
+    cv2.setNumThreads(1)  # a table over one picture is not worth a second thread
+    folder = Path(run_folder)
     run = load_run(folder)
     settings = run.station
     camera = camera_of(settings.map, settings.map.folder)
@@ -41,25 +43,8 @@ def serve(folder: Path, stop: threading.Event) -> None:
         while not stop.wait(_STEP_S):
             intake.step()
             bus.heartbeat()
-
-
-def main() -> int:
-    """The exit status: 0 after a signal, 2 for bad input, 3 where a new process may fix it."""
-    if len(sys.argv) != 2:
-        print("usage: python -m ground_station.service.intake RUN_FOLDER", file=sys.stderr)
-        return 2
-    heaps.few()
-    stop = ending(None)  # a recording ends in its own time
-    import cv2
-
-    cv2.setNumThreads(1)  # a table over one picture is not worth a second thread
-    try:
-        serve(Path(sys.argv[1]), stop)
-    except BlimpError as error:
-        print(f"intake: {error}", file=sys.stderr)
-        return 3 if error.restart else 2
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(status_of("intake", serve))

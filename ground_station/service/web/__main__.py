@@ -9,9 +9,9 @@ import signal
 import sys
 from pathlib import Path
 
+from ground_station.service.ending import status_of
 from pi_firmware.wire.errors import BlimpError
 
-_BAD_INPUT, _FAILED = 2, 1
 _BEAT_S = 0.5
 _EXPOSED = (
     "{host} is reached by others, who need the token; plain HTTP does not hide it from who listens"
@@ -22,20 +22,13 @@ _EXPOSED = (
 class ServerEnded(BlimpError):
     """The server stopped although nobody asked it to."""
 
+    restart = True
 
-def main(arguments: list[str]) -> int:
-    """Serves until it is told to end; 0, or 2 with one line for bad input."""
-    if len(arguments) != 1:
-        print("usage: python -m ground_station.service.web RUN_FOLDER", file=sys.stderr)
-        return _BAD_INPUT
-    # As in `blimp`: threads are ours to schedule, and BLAS reads this when numpy is imported.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+def serve(run_folder: str) -> int:
+    """Serves until it is told to end."""
     gc.disable()  # a sixth of the time until the page is there; modules are no garbage
-    try:
-        asyncio.run(_serve(Path(arguments[0])))
-    except BlimpError as error:
-        print(f"web: {error}", file=sys.stderr, flush=True)
-        return _FAILED if isinstance(error, ServerEnded) else _BAD_INPUT
+    asyncio.run(_serve(Path(run_folder)))
     return 0
 
 
@@ -86,7 +79,7 @@ async def _serve(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    status = main(sys.argv[1:])
+    status = status_of("web", serve)
     sys.stdout.flush()
     # Not sys.exit: it waits for threads that may wait for an answer of another process.
     os._exit(status)
