@@ -56,17 +56,12 @@ def read_poses(path: str | Path, topic: str | None = None) -> Poses:
     return Poses(topic, usable, len(samples) - len(usable), again, reason)
 
 
-def tum_lines(path: str | Path, topic: str | None = None) -> Iterator[str]:
-    """A recording's poses as the lines of a TUM file, each with its end; see `read_poses`.
-
-    Timestamps are the camera's, in seconds. Raises as `read_poses` does, at once and not at the
-    first line. What is left out is told in a comment, and where the camera's time begins again.
-    """
-    return tum(read_poses(path, topic))
-
-
 def tum(poses: Poses) -> Iterator[str]:
-    """The same of poses that were read."""
+    """Poses that were read as the lines of a TUM file, each with its end.
+
+    Timestamps are the camera's, in seconds. What is left out is told in a comment, and where the
+    camera's time begins again.
+    """
     yield HEADER
     last_ns: int | None = None
     for sample in poses.samples:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import pytest
 
 from ground_station.errors import InputError
 from ground_station.geometry.trajectory import read_tum
-from ground_station.recording.export import AGAIN, HEADER, tum_lines
+from ground_station.recording.export import AGAIN, HEADER, read_poses, tum
 from ground_station.recording.flight import trajectory_of
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recording import (
@@ -36,6 +36,10 @@ def record(path: Path, topics: dict[str, Iterable[tuple[int, float]]]) -> Path:
             for time_ns, x_m in samples:
                 writer.write_pose(time_ns, (x_m, 2.0, 3.0), UPRIGHT, topic=topic)
     return path
+
+
+def tum_lines(path: Path, topic: str | None = None) -> Iterator[str]:
+    return tum(read_poses(path, topic))
 
 
 def blimp(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -117,7 +117,8 @@ def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypa
     from ground_station.recording import export
 
     station.write_recording(shelf / "a.mcap")
-    monkeypatch.setattr(export, "tum_lines", lambda path: iter(["# tum\n", "1 2 3 4 5 6 7 8\n"]))
+    monkeypatch.setattr(export, "read_poses", lambda path: path)
+    monkeypatch.setattr(export, "tum", lambda path: iter(["# tum\n", "1 2 3 4 5 6 7 8\n"]))
     for _ in range(3):  # each ends and lets the next one in
         answer = client.get("/api/recordings/a.mcap/trajectory.txt")
         assert answer.text == "# tum\n1 2 3 4 5 6 7 8\n"
@@ -126,7 +127,7 @@ def test_a_trajectory_is_sent_as_lines_and_one_at_a_time(served, shelf, monkeypa
     def refuses(_):
         raise BlimpError("a.mcap: no poses in it")
 
-    monkeypatch.setattr(export, "tum_lines", refuses)
+    monkeypatch.setattr(export, "read_poses", refuses)
     for _ in range(2):
         answer = client.get("/api/recordings/a.mcap/trajectory.txt")
         assert (answer.status_code, answer.json()) == (409, {"detail": "a.mcap: no poses in it"})

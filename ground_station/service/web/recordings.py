@@ -129,13 +129,13 @@ class Recordings:
 
         One at a time, and whole before it is sent: who takes it slowly holds up nobody.
         """
-        from ground_station.recording.export import tum_lines
+        from ground_station.recording.export import read_poses, tum
 
         path = self.path(name)
         if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
-            return "".join(tum_lines(path))
+            return "".join(tum(read_poses(path)))
         except OSError as error:
             raise NotFound(f"{name}: {error.strerror or error}") from None
         finally:
