@@ -445,7 +445,7 @@ def test_nothing_is_built_that_nobody_wants() -> None:
     topic.say(lambda: pytest.fail("built for nobody"), 1)
 
 
-def test_a_full_inbox_loses_the_oldest_and_counts_them() -> None:
+def test_a_full_inbox_loses_the_oldest() -> None:
     inbox, seen = Inbox(), []
     for number in range(2003):
         inbox.put(lambda number=number: seen.append(number))
@@ -454,8 +454,8 @@ def test_a_full_inbox_loses_the_oldest_and_counts_them() -> None:
     tasks, frames = inbox.take(0.0)
     for task in tasks:
         task()
-    assert seen == list(range(3, 2003)) and inbox.dropped == 3
-    assert frames["a"].sequence == 2 and inbox.skipped == 2
+    assert seen == list(range(3, 2003))
+    assert frames["a"].sequence == 2
     assert inbox.take(0.0) == ([], {})
 
 

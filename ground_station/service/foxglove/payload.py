@@ -45,7 +45,7 @@ class Payload:
         context: Context,
         folder: Path,
         tf: Topic,
-        camera: Callable[[], Camera | None],
+        camera: Camera | None,
         http: HttpSettings,
     ) -> None:
         self._id, self._tf, self._camera = payload_id, tf, camera
@@ -169,7 +169,7 @@ class Payload:
 
     def _calibrated(self) -> Iterator[tuple[Make, int]]:
         """Where the camera is known and of the size that the pictures have."""
-        camera = self._camera()
+        camera = self._camera
         if camera is not None and (camera.width_px, camera.height_px) == self._size:
             now_ns = time.time_ns()
             yield lambda: drawing.calibration(self._id, camera, now_ns), now_ns

@@ -70,29 +70,23 @@ _MOST = 2000
 class Inbox:
     """Tasks in their order, at most 2000, and the newest frame of each payload.
 
-    Never blocks who puts; `dropped` counts the tasks that a full inbox lost, the oldest first, and
-    `skipped` the frames that a newer one replaced. Safe from any thread.
+    Never blocks who puts: a full inbox loses its oldest task. Safe from any thread.
     """
 
     def __init__(self) -> None:
-        self.dropped = self.skipped = 0
-        self._tasks: deque[Task] = deque()
+        self._tasks: deque[Task] = deque(maxlen=_MOST)
         self._frames: dict[str, FrameMessage] = {}
         self._there = threading.Condition()
 
     def put(self, task: Task) -> None:
         """Leaves a task."""
         with self._there:
-            if len(self._tasks) >= _MOST:
-                self._tasks.popleft()
-                self.dropped += 1
             self._tasks.append(task)
             self._there.notify()
 
     def frame(self, payload_id: str, note: FrameMessage) -> None:
         """Leaves a payload's newest frame."""
         with self._there:
-            self.skipped += payload_id in self._frames
             self._frames[payload_id] = note
             self._there.notify()
 
@@ -134,6 +128,11 @@ class Publishing:
         self._events: deque[tuple[str, EventMessage, int]] = deque(maxlen=EVENTS)
         self._recording: tuple[RecordingMessage, int] | None = None
         self._reader = world.Reader(settings.map, self._take_world)
+        self._camera: Camera | None = None
+        try:
+            self._camera = camera_of(settings.map, settings.map.folder)
+        except BlimpError as error:
+            self._complain("camera", f"no calibration: {error}")
 
         context = self._context
         self._tf = Topic(FrameTransformsChannel("/tf", context=context))
@@ -247,17 +246,6 @@ class Publishing:
         payload.close()
         self._flown.pop(gone, None)
         return True
-
-    @functools.cached_property
-    def _calibrated(self) -> Camera | None:
-        try:
-            return camera_of(self._settings.map, self._settings.map.folder)
-        except BlimpError as error:
-            self._complain("camera", f"no calibration: {error}")
-            return None
-
-    def _camera(self) -> Camera | None:
-        return self._calibrated
 
     # What a new subscriber is told
 

@@ -8,6 +8,7 @@ import queue
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from foxglove.messages import (
@@ -25,6 +26,9 @@ from ground_station.service.foxglove import conversion
 from ground_station.service.foxglove.drawing import stamp
 from ground_station.service.settings import MapSettings
 from pi_firmware.wire.errors import BlimpError
+
+if TYPE_CHECKING:
+    from ground_station.service.web.maps import Maps
 
 _CELLS = 1_000_000
 _WAITING = 64
@@ -130,12 +134,9 @@ class Reader:
             self._take(_read(maps, name), whom)
 
 
-def _read(maps: object, name: str) -> World:
+def _read(maps: Maps, name: str) -> World:
     import cv2
 
-    from ground_station.service.web.maps import Maps
-
-    assert isinstance(maps, Maps)
     try:
         landmarks, about = maps.landmarks(name), maps.details(name)["floorplan"]
         if about is None:

@@ -22,32 +22,25 @@ SLOTS = 40
 
 
 class Outbox:
-    """One viewer's; for the event loop's thread only. `lost` counts what it was not told."""
+    """One viewer's; for the event loop's thread only."""
 
     def __init__(self) -> None:
-        self.lost = 0
         self.pictures_lost = 0
-        self._texts: deque[str] = deque()
+        self._texts: deque[str] = deque(maxlen=TEXTS)
         self._newest: dict[str, str] = {}
         self._picture: bytes | None = None
         self._there = asyncio.Event()
 
     def tell(self, text: str) -> None:
         """Queues a message; the oldest goes when there are too many."""
-        if len(self._texts) >= TEXTS:
-            self._texts.popleft()
-            self.lost += 1
         self._texts.append(text)
         self._there.set()
 
     def replace(self, slot: str, text: str) -> None:
         """Puts a message in place of the one that waits in its slot."""
-        if slot not in self._newest and len(self._newest) >= SLOTS:
-            self.lost += 1
-            return
-        self.lost += slot in self._newest
-        self._newest[slot] = text
-        self._there.set()
+        if slot in self._newest or len(self._newest) < SLOTS:
+            self._newest[slot] = text
+            self._there.set()
 
     def show(self, picture: bytes) -> None:
         """Puts a picture in place of the one that waits."""
