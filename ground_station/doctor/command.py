@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,17 +83,9 @@ def of_settings(settings: StationSettings) -> list[Check]:
     from ground_station.doctor import machine, network, running, world
     from ground_station.doctor.findings import Check
 
-    looked = threading.Event()
-
-    def ports() -> list[Finding]:
-        try:
-            return list(network.ports(settings))
-        finally:
-            looked.set()
-
-    def payloads() -> Finding:
-        looked.wait()  # it takes a port that would be found in use
-        return running.payloads(settings)
+    def ports() -> Iterator[Finding]:
+        yield from network.ports(settings)
+        yield running.payloads(settings)  # after them: it takes one that would be found in use
 
     return [
         Check("reach", lambda: network.reach(settings)),
@@ -106,5 +98,4 @@ def of_settings(settings: StationSettings) -> list[Check]:
         Check("map", lambda: list(world.maps(settings.map, settings.localizer.preset))),
         Check("memory", lambda: machine.memory(settings.payloads.most)),
         Check("disk", lambda: machine.disk(settings.recording)),
-        Check("payloads", payloads),
     ]
