@@ -95,8 +95,7 @@ def certificate(settings: StationSettings) -> Finding:
 
     Without one only loopback may be spoken to.
     """
-    from ground_station.keys import certificates
-    from ground_station.keys.certificates import Pair
+    from ground_station.keys.authority import inspect
 
     text, name = settings.telemetry.certificates, "certificate"
     if not text:
@@ -108,12 +107,7 @@ def certificate(settings: StationSettings) -> Finding:
     anew = f"copy the folder of 'blimp keys ground {settings.name}' here again"
     try:
         held = credentials.load(text)
-        read = (held.folder / credentials.CERTIFICATE).read_bytes()
-        private = (held.folder / credentials.KEY).read_bytes()
-        common, until = certificates.inspect(
-            read, (held.folder / credentials.AUTHORITIES).read_bytes()
-        )
-        certificates.check_key(Pair(read, private))
+        common, until = inspect(held.folder)
     except PermissionError as error:
         found = f"{error.filename}: not this user's to read"
         return warning(name, found, "run the doctor as the service's user: sudo -u blimp")

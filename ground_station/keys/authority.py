@@ -189,12 +189,7 @@ class Authority:
         for name in self.live():
             try:
                 held = credentials.load(self.of(name))
-                certificate = (held.folder / credentials.CERTIFICATE).read_bytes()
-                common, until = certificates.inspect(
-                    certificate, (held.folder / credentials.AUTHORITIES).read_bytes()
-                )
-                key = (held.folder / credentials.KEY).read_bytes()
-                certificates.check_key(Pair(certificate, key))
+                common, until = inspect(held.folder)
             except (TelemetryError, KeysError, OSError) as error:
                 problems.append(f"{name}: {error}")
                 continue
@@ -298,6 +293,19 @@ class Authority:
                 old.unlink()
         for file_name, source in kept.items():
             write_private(folder / file_name, source.read_bytes(), replace=True)
+
+
+def inspect(folder: Path) -> tuple[str, datetime.datetime]:
+    """Common name and end of the certificate in a machine's folder.
+
+    Raises `KeysError` when no authority in it signed that, or its private key is another's.
+    """
+    pair = Pair(
+        (folder / credentials.CERTIFICATE).read_bytes(), (folder / credentials.KEY).read_bytes()
+    )
+    found = certificates.inspect(pair.certificate, (folder / credentials.AUTHORITIES).read_bytes())
+    certificates.check_key(pair)
+    return found
 
 
 @contextmanager

@@ -104,20 +104,14 @@ def _act(arguments: argparse.Namespace, folder: Path) -> int:
 
 
 def _list(authority: Authority) -> None:
-    from ground_station.keys import certificates
-    from ground_station.keys.authority import STEPS
-    from pi_firmware.wire import credentials
+    from ground_station.keys.authority import STEPS, inspect
 
     print(f"authority {authority.signing}: {STEPS[authority.step]}")
     for name, entry in sorted(authority.members.items()):
         state = "revoked"
         if not entry["revoked"]:
-            folder = authority.of(name)
             try:
-                _, until = certificates.inspect(
-                    (folder / credentials.CERTIFICATE).read_bytes(),
-                    (folder / credentials.AUTHORITIES).read_bytes(),
-                )
+                _, until = inspect(authority.of(name))
                 state = f"until {until:%Y-%m-%d}"
             except (KeysError, OSError) as error:
                 state = str(error)
