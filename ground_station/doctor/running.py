@@ -1,22 +1,30 @@
-"""Checks of what runs: the installed service, and the payloads that are heard."""
+"""Checks of what runs: the installed service, and the payloads that are heard, by version."""
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import time
 from pathlib import Path
 
-from ground_station.doctor import ROOT, network, versions
+from ground_station.doctor import ROOT, network
 from ground_station.doctor.findings import Finding, ok, problem, warning
 from ground_station.service.settings import StationSettings
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
+from pi_firmware import __version__
 from pi_firmware.wire.errors import TelemetryError
+from pi_firmware.wire.messages import Health
 
 UNIT = "blimp-station.service"
 _SYSTEMD = Path("/run/systemd/system")
 _COMMAND_S = 3.0
 _LISTEN_S = 2.0
+_RELEASE = re.compile(r"\+git([0-9a-f]{7,40})(\.dirty)?", re.ASCII)
+_GIT_S = 10.0
+_FELL_BACK = "fell back"
+_SILENT = Health(0, 0.0)
+"""Of a payload that said nothing of its health yet."""
 
 
 def unit(systemd: Path = _SYSTEMD) -> Finding:
@@ -85,14 +93,49 @@ def judge_payloads(heard: dict[str, PayloadState | None], root: Path) -> Finding
     """The versions of those that are heard, beside the firmware at `root`."""
     found, fix = [], []
     for name, state in heard.items():
-        said = f"{name} runs {versions.told(state)}"
-        version = state.health.version if state is not None and state.health is not None else ""
-        if reason := versions.trouble(state):
-            said += f": {reason}"
+        health = state.health if state is not None and state.health is not None else _SILENT
+        said = f"{name} runs {health.version or 'a version that it does not tell'}"
+        if health.version and health.release:
+            said += f" ({health.release})"
+        if health.release == _FELL_BACK:
+            said += f": {health.release_reason or 'an update did not stay'}"
             fix.append(f"fix that and update {name} again")
-        if differs := versions.difference(version, root) if version else "":
+        if differs := difference(health.version, root) if health.version else "":
             said += f"; {differs}"
             fix.append(f"make update PAYLOAD={name}, or leave it: both speak the same messages")
         found.append(said)
     told = "; ".join(found)
     return warning("payloads", told, "; ".join(fix)) if fix else ok("payloads", told)
+
+
+def difference(version: str, root: Path) -> str:
+    """How a payload's version differs from the firmware at `root`; '' when it does not, as far as
+    can be known.
+
+    Commits that change no file of the firmware make no difference. Without git at `root`, as in an
+    installed service, only the version's number is compared.
+    """
+    number = re.split(r"[ +]", version, maxsplit=1)[0]
+    if number != __version__:
+        return f"here it is {__version__}"
+    found = _RELEASE.search(version)
+    git = shutil.which("git")
+    if found is None or git is None or not (root / ".git").exists():
+        return ""
+    if found[2]:
+        return "it has changes that no commit holds"
+    words = [git, "-c", f"safe.directory={root}", "-C", str(root)]
+    try:
+        done = subprocess.run(
+            [*words, "diff", "--quiet", found[1], "--", "pi_firmware"],
+            capture_output=True,
+            timeout=_GIT_S,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    if done.returncode == 0:
+        return ""
+    return (
+        "the firmware here is another" if done.returncode == 1 else "its commit is not known here"
+    )

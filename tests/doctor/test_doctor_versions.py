@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ground_station.doctor import running, versions
+from ground_station.doctor import running
 from ground_station.doctor.findings import OK, WARNING
 from ground_station.stream.telemetry import PayloadState
 from pi_firmware import __version__
@@ -42,31 +42,31 @@ def commit(checkout: Path) -> str:
 
 def test_the_same_firmware_is_no_difference_whatever_else_was_committed(checkout: Path) -> None:
     version = commit(checkout)
-    assert versions.difference(version, checkout) == ""
+    assert running.difference(version, checkout) == ""
     (checkout / "README").write_text("2\n")
     git(checkout, "add", ".")
     git(checkout, "commit", "-qm", "two")
-    assert commit(checkout) != version and versions.difference(version, checkout) == ""
+    assert commit(checkout) != version and running.difference(version, checkout) == ""
     (checkout / "pi_firmware/a.py").write_text("3\n")
-    assert versions.difference(version, checkout) == "the firmware here is another"
+    assert running.difference(version, checkout) == "the firmware here is another"
     git(checkout, "commit", "-qam", "three")
-    assert versions.difference(version, checkout) == "the firmware here is another"
-    assert versions.difference(commit(checkout), checkout) == ""
+    assert running.difference(version, checkout) == "the firmware here is another"
+    assert running.difference(commit(checkout), checkout) == ""
 
 
 def test_what_git_cannot_tell(checkout: Path, tmp_path: Path) -> None:
     unknown = f"{__version__}+git{'0123456789ab'}"
-    assert versions.difference(unknown, checkout) == "its commit is not known here"
+    assert running.difference(unknown, checkout) == "its commit is not known here"
     dirty = f"{commit(checkout)}.dirty.01234567"
-    assert versions.difference(dirty, checkout) == "it has changes that no commit holds"
-    assert versions.difference(f"{__version__} in 9.0", checkout) == ""
-    assert versions.difference("0.0.9+gitabcdef0", checkout) == f"here it is {__version__}"
+    assert running.difference(dirty, checkout) == "it has changes that no commit holds"
+    assert running.difference(f"{__version__} in 9.0", checkout) == ""
+    assert running.difference("0.0.9+gitabcdef0", checkout) == f"here it is {__version__}"
     # An installed service has no git beside it; a hostile version is no argument of git's.
     bare = tmp_path / "bare"
     bare.mkdir()
-    assert versions.difference(unknown, bare) == ""
+    assert running.difference(unknown, bare) == ""
     for hostile in ("", "+git", "--output=x", f"{__version__}+git--output=x", "\x1b[2J"):
-        assert "\x1b" not in versions.difference(hostile, checkout)
+        assert "\x1b" not in running.difference(hostile, checkout)
     assert not (checkout / "x").exists()
 
 
