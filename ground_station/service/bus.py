@@ -35,7 +35,8 @@ class BusError(GroundStationError):
     """A bus that cannot be opened."""
 
 
-def _config(mode: str, folder: Path) -> Any:
+def _open(mode: str, folder: Path) -> Any:
+    """A session of Zenoh; raises `BusError` with one line."""
     import zenoh
 
     endpoint = f"unixsock-stream/{folder / _SOCKET}"
@@ -51,19 +52,17 @@ def _config(mode: str, folder: Path) -> Any:
         "transport/link/tx/lease": int(_LEASE_S * 1000),
     }.items():
         config.insert_json5(name, json.dumps(value))
-    return config
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
 
 
 class Router:
     """The bus itself, in the parent; raises `BusError` when the folder has no room for it."""
 
     def __init__(self, folder: Path) -> None:
-        import zenoh
-
-        try:
-            self._session = zenoh.open(_config("router", folder))
-        except zenoh.ZError as error:
-            raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
+        self._session = _open("router", folder)
 
     def close(self) -> None:
         """Ends it; clients wait for the next one."""
@@ -87,10 +86,7 @@ class Bus:
         self.dropped = 0
         self._started_s = time.monotonic()
         self._beat_s, self._cpu_s = self._started_s, _cpu_s()
-        try:
-            self._session = zenoh.open(_config("client", folder))
-        except zenoh.ZError as error:
-            raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
+        self._session = _open("client", folder)
         self._declared: list[Any] = []
         # Kept open: a process that has no descriptor left lives, and says so.
         self._statm = FileIO("/proc/self/statm")
