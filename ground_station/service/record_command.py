@@ -52,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.errors import InputError
     from ground_station.geometry.camera import load_camera
     from ground_station.service import lan, settings
+    from ground_station.service.bus_messages import STATION, EventMessage, PayloadMessage
     from ground_station.service.intake.process import Intake
 
     if args.seconds is not None and not (math.isfinite(args.seconds) and args.seconds > 0):
@@ -70,33 +71,25 @@ def run(args: argparse.Namespace) -> int:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    report = _Report()
-    with Intake(loaded, report.take, camera=camera) as intake:
+    accounts: dict[str, dict[str, int]] = {}
+
+    def take(_: str, payload_id: str, note: Message) -> None:
+        """Prints events, and keeps each payload's newest account."""
+        if isinstance(note, EventMessage):
+            who = "" if payload_id == STATION else f"{payload_id}: "
+            print(f"{who}{note.name}: {printable(note.text, 300, ' ')}", flush=True)
+        elif isinstance(note, PayloadMessage) and note.stream.get("packets"):
+            accounts[payload_id] = note.frames
+
+    with Intake(loaded, take, camera=camera) as intake:
         first = intake.recorder.start()
         until_s = math.inf if args.seconds is None else time.monotonic() + args.seconds
         while not stop.wait(_STEP_S) and time.monotonic() < until_s and intake.recorder.file:
             intake.step()
     state = intake.recorder.state()
-    if report.frames:
+    if accounts:
         made = shlex.quote(str(Path(loaded.recording.folder) / first))
         args.next = f"blimp map build {made} --out maps/NAME"
-    for payload_id, frames in sorted(report.frames.items()):
+    for payload_id, frames in sorted(accounts.items()):
         print(f"{payload_id}: " + ", ".join(f"{n} {name}" for name, n in sorted(frames.items())))
-    return 1 if state.problem or not report.frames else 0
-
-
-class _Report:
-    """What is worth a line, as it happens."""
-
-    def __init__(self) -> None:
-        self.frames: dict[str, dict[str, int]] = {}
-
-    def take(self, kind: str, payload_id: str, note: Message) -> None:
-        """Prints events, and keeps each payload's newest account."""
-        from ground_station.service.bus_messages import STATION, EventMessage, PayloadMessage
-
-        if isinstance(note, EventMessage):
-            who = "" if payload_id == STATION else f"{payload_id}: "
-            print(f"{who}{note.name}: {printable(note.text, 300, ' ')}", flush=True)
-        elif isinstance(note, PayloadMessage) and note.stream.get("packets"):
-            self.frames[payload_id] = note.frames
+    return 1 if state.problem or not accounts else 0
