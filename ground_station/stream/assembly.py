@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,9 @@ _TOO_MANY_LOST = 0.05
 """Of a stream's packets: where more are lost that is why, and not how it is encoded."""
 
 
-@dataclass(frozen=True)
-class ReceivedFrame:
-    """One frame as captured.
+@dataclass(frozen=True, kw_only=True)
+class ReceivedFrame(sei.FrameInfo):
+    """One frame as captured, with its numbers.
 
     `time_ns` is the camera's capture time, `clock_ns` the payload's clock then, `arrival_ns` this
     machine's wall clock (`time.time_ns`) when the frame's last packet arrived. `image` is gray
@@ -39,18 +39,16 @@ class ReceivedFrame:
     """
 
     image: NDArray[np.uint8]
-    sequence: int
-    time_ns: int
-    clock_ns: int
     arrival_ns: int
-    entropy_bits: float
-    sharpness: float
-    exposure_s: float | None
-    gain: float | None
-    heartbeat: bool
     ssrc: int
     access_unit: bytes = b""
     damaged: Bools | None = None
+
+    @property
+    def info(self) -> sei.FrameInfo:
+        """Its numbers alone: who keeps them keeps no picture."""
+        names = (one.name for one in fields(sei.FrameInfo))
+        return sei.FrameInfo(**{name: getattr(self, name) for name in names})
 
 
 class Assembly:
@@ -149,17 +147,11 @@ class Assembly:
             else:
                 self._counters.damaged += 1
             since_ns = time.monotonic_ns() - unit.arrival_ns
+            info = replace(info, exposure_s=plausible_exposure_s(info.exposure_s))
             yield ReceivedFrame(
+                **vars(info),
                 image=picture.image,
-                sequence=info.sequence,
-                time_ns=info.time_ns,
-                clock_ns=info.clock_ns,
                 arrival_ns=time.time_ns() - since_ns,
-                entropy_bits=info.entropy_bits,
-                sharpness=info.sharpness,
-                exposure_s=plausible_exposure_s(info.exposure_s),
-                gain=info.gain,
-                heartbeat=info.heartbeat,
                 ssrc=self.ssrc,
                 access_unit=data,
                 damaged=picture.damaged,

@@ -111,21 +111,14 @@ class Payload:
         note = FrameMessage(
             slot=slot,
             stamp=stamp,
-            sequence=frame.sequence,
-            time_ns=frame.time_ns,
-            clock_ns=frame.clock_ns,
             arrival_ns=frame.arrival_ns,
             width_px=width,
             height_px=height,
             ssrc=frame.ssrc,
             capture_ns=capture_ns,
-            exposure_s=frame.exposure_s,
-            gain=frame.gain,
-            entropy_bits=frame.entropy_bits,
-            sharpness=frame.sharpness,
-            heartbeat=frame.heartbeat,
             shown=self._shown,
             damaged=packed(frame.damaged),
+            **vars(frame.info),
         )
         self._say(bus_messages.FRAME, self.id, note)
 

@@ -22,7 +22,7 @@ from ground_station.service.bus_messages import (
 from ground_station.service.intake.files import STATION_TOPIC, Estimated, GroundRun, Said
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
-from pi_firmware.wire import keys, messages, sei
+from pi_firmware.wire import keys, messages
 from pi_firmware.wire.recorder.recorder import Recorder
 
 _FREE_PERIOD_S = 2.0
@@ -90,17 +90,7 @@ class GroundRecorder(Recorder):
             return
         height, width = frame.image.shape[:2]
         self._sizes[payload_id] = (width, height)
-        info = sei.FrameInfo(
-            sequence=frame.sequence,
-            time_ns=frame.time_ns,
-            clock_ns=frame.clock_ns,
-            entropy_bits=frame.entropy_bits,
-            sharpness=frame.sharpness,
-            exposure_s=frame.exposure_s,
-            gain=frame.gain,
-            heartbeat=frame.heartbeat,
-        )
-        active.queue.unit(info, frame.access_unit, payload_id, log_ns)
+        active.queue.unit(frame.info, frame.access_unit, payload_id, log_ns)
 
     def message(self, payload_id: str, kind: str, message: messages.Message) -> None:
         """Records a telemetry message as it was said."""
