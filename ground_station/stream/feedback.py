@@ -100,12 +100,11 @@ class Tally:
 
 
 class StreamAccount:
-    """Turns a receiver's counters, which go on from stream to stream, into those of one stream."""
+    """What became of a payload's packets, by the counters of the stream that it has."""
 
     def __init__(self) -> None:
         self._ssrc: int | None = None
-        self._before = Counters()
-        self._last = Counters()
+        self._packets = 0
         self._window: deque[tuple[float, Tally]] = deque()
         self.late = Tally()
         """Of the last 2 s, or what is known of them."""
@@ -115,15 +114,10 @@ class StreamAccount:
 
         `now_s` is of a clock that never steps.
         """
-        if counters.packets < self._last.packets:  # another receiver
-            self._before, self._last = Counters(), Counters()
+        if ssrc != self._ssrc or counters.packets < self._packets:  # another, or counted again
             self._window.clear()
-        if ssrc != self._ssrc:
-            # What came before this stream is none of its own.
-            self._before, self._ssrc = self._last, ssrc
-            self._window.clear()
-        self._last = counters
-        tally = _tally(counters, frames) - _tally(self._before, 0)
+        self._ssrc, self._packets = ssrc, counters.packets
+        tally = _tally(counters, frames)
         while len(self._window) > 1 and now_s - self._window[1][0] >= WINDOW_S:
             self._window.popleft()
         since = self._window[0][1] if self._window else Tally(frames=frames)
