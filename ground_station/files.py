@@ -9,7 +9,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError, InputError
+from ground_station.errors import GroundStationError, InputError, os_errors_as
 from pi_firmware.wire import files
 
 
@@ -34,10 +34,8 @@ def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
     path = Path(path)
-    try:
+    with os_errors_as(GroundStationError, path):
         files.write(path, data)
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -29,7 +29,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import KeysError
+from ground_station.errors import KeysError, os_errors_as
 from ground_station.keys import certificates
 from ground_station.keys.certificates import Pair
 from pi_firmware.wire import credentials, files, keys
@@ -336,29 +336,23 @@ def write_private(path: Path, data: bytes, *, replace: bool = False) -> None:
 
     Raises `KeysError` with one line when it exists and `replace` is not set.
     """
-    try:
+    with os_errors_as(KeysError, path):
         if path.exists() and not replace:
             raise KeysError(f"{path}: exists already, and keys are never overwritten")
         files.write(path, data, 0o600)
-    except OSError as error:
-        raise KeysError(f"{path}: {error.strerror or error}") from None
 
 
 def _folder(path: Path) -> Path:
-    try:
+    with os_errors_as(KeysError, path):
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise KeysError(f"{path}: {error.strerror or error}") from None
     return path
 
 
 def _move(part: Path, path: Path) -> None:
     _folder(path.parent)
-    try:
+    with os_errors_as(KeysError, path):
         files.replace(part, path)
         files.sync(part.parent)
-    except OSError as error:
-        raise KeysError(f"{path}: {error.strerror or error}") from None
 
 
 def _member(member: str) -> str:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ground_station.arrays import U8
-from ground_station.errors import InputError
+from ground_station.errors import InputError, os_errors_as
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 
@@ -27,10 +27,8 @@ class ImageFolder:
         self.notes: list[str] = []
         self._rate_hz = rate_hz
         self._range = frame_range
-        try:
+        with os_errors_as(InputError, path):
             names = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}") from None
         if not names:
             raise InputError(f"{path}: no images in this folder (jpg, png, bmp, tif, webp, pgm)")
         self._paths = [(k, p) for k, p in enumerate(names) if k in frame_range]
@@ -62,13 +60,11 @@ class ImageFolder:
 
 def read_grey(path: Path) -> U8:
     """An image file as (H, W) grey, as stored (no turning by EXIF); raises `InputError`."""
-    try:
+    with os_errors_as(InputError, path):
         if path.exists() and not path.is_file():  # a device may have no end
             raise InputError(f"{path}: not a file")
         with path.open("rb") as file:
             data = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
     if len(data) > _MOST_BYTES:
         raise InputError(f"{path}: more than {_MOST_BYTES >> 20} MiB")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

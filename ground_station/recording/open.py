@@ -6,7 +6,7 @@ import math
 import re
 from pathlib import Path
 
-from ground_station.errors import InputError
+from ground_station.errors import InputError, os_errors_as
 from ground_station.recording.flight import FlightRecording
 from ground_station.recording.folder import ImageFolder
 from ground_station.recording.frames import ALL_FRAMES, FrameRange, FrameSource
@@ -31,11 +31,8 @@ def open_input(
         raise InputError(f"the frame rate is {rate_hz} Hz; allowed: 0.001 to 10000 Hz")
     if path.is_dir():
         return ImageFolder(path, rate_hz, wanted)
-    try:
-        with path.open("rb") as file:
-            head = file.read(8)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
+    with os_errors_as(InputError, path), path.open("rb") as file:
+        head = file.read(8)
     if not head:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")
     if head == MAGIC or path.suffix.lower() == ".mcap":

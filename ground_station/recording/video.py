@@ -10,7 +10,7 @@ from typing import Any
 
 import av
 
-from ground_station.errors import InputError
+from ground_station.errors import InputError, os_errors_as
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey, parameter_sets_in
@@ -215,12 +215,9 @@ class AnnexBFile:
             yield bytes(packet)
 
     def _blocks(self) -> Iterator[bytes]:
-        try:
-            with self.path.open("rb") as file:
-                while block := file.read(_BLOCK_BYTES):
-                    yield block
-        except OSError as error:
-            raise InputError(f"{self.path}: {error.strerror or error}") from None
+        with os_errors_as(InputError, self.path), self.path.open("rb") as file:
+            while block := file.read(_BLOCK_BYTES):
+                yield block
 
 
 def frame_name(k: int) -> str:

@@ -17,6 +17,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+from ground_station.errors import os_errors_as
 from ground_station.stream.counters import Counters
 from ground_station.stream.rtp import MAX_JUMP
 from pi_firmware.wire import keys as names
@@ -49,10 +50,8 @@ def load_keys(folder: str | Path) -> dict[str, bytes]:
     It reads `FOLDER/srtp/ID.key` as `blimp keys` wrote them; raises `StreamError` with one line.
     """
     folder = Path(folder) / FOLDER
-    try:
+    with os_errors_as(StreamError, folder):
         paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
-    except OSError as error:
-        raise StreamError(f"{folder}: {error.strerror or error}") from None
     loaded = {}
     for path in paths:
         try:

@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 
+from ground_station.errors import os_errors_as
 from pi_firmware.wire.errors import StreamError
 
 BUFFER_BYTES = 4 << 20
@@ -25,21 +26,19 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
 
     Raises `StreamError` with one line.
     """
-    try:
+    with os_errors_as(StreamError, f"video on {host} port {port}"):
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         receiver = socket.socket(family, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
-    try:
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-        with contextlib.suppress(OSError):  # beyond the system's limit, where we may
-            receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, BUFFER_BYTES)
-        with contextlib.suppress(OSError):
-            receiver.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        receiver.bind(address)
-    except OSError as error:
-        receiver.close()
-        raise StreamError(f"video on {host} port {port}: {error.strerror or error}") from None
+        try:
+            receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            with contextlib.suppress(OSError):  # beyond the system's limit, where we may
+                receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, BUFFER_BYTES)
+            with contextlib.suppress(OSError):
+                receiver.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            receiver.bind(address)
+        except OSError:
+            receiver.close()
+            raise
     receiver.settimeout(poll_s)
     return receiver
 

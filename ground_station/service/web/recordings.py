@@ -18,7 +18,7 @@ from fastapi.responses import StreamingResponse
 from mcap.records import MetadataIndex
 from starlette.exceptions import HTTPException
 
-from ground_station.errors import GroundStationError
+from ground_station.errors import GroundStationError, os_errors_as
 from ground_station.service.fleet.shelf import Shelf
 from ground_station.service.intake.files import AFTER_TABLE, LACKS, MAP_TABLE
 from ground_station.service.web.models import (
@@ -135,9 +135,8 @@ class Recordings:
         if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
-            return "".join(tum(read_poses(path)))
-        except OSError as error:
-            raise NotFound(f"{name}: {error.strerror or error}") from None
+            with os_errors_as(NotFound, name):
+                return "".join(tum(read_poses(path)))
         finally:
             self._exporting.release()
 
@@ -146,10 +145,8 @@ class Recordings:
         self.size(name)
         if name == self._active():
             raise GroundStationError(f"{name} is being written; stop the recording first")
-        try:
+        with os_errors_as(NotFound, name):
             (self._folder / name).unlink()
-        except OSError as error:
-            raise NotFound(f"{name}: {error.strerror or error}") from None
 
     def _summary(self, name: str, status: os.stat_result) -> _Told:
         identity = (status.st_size, status.st_mtime_ns)
