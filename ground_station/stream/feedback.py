@@ -291,17 +291,12 @@ class Feedback:
             packets_lost=tally.lost,
             lost=lost,
             round_trip_s=round_trip_s,
-            received_kbps=flow.received_kbps if flow is not None else None,
-            queue_s=flow.queue_s if flow is not None else None,
-            dropped=flow.dropped if flow is not None else None,
             packets_mended=tally.mended,
             missed=missed,
-            retransmitted_kbps=flow.retransmitted_kbps if flow is not None else None,
             corrects=True,
             packets_corrected=tally.corrected,
             answered=tally.again,
-            burst=flow.burst if flow is not None else None,
-            largest_bytes=flow.largest_bytes if flow is not None else None,
+            **(vars(flow) if flow is not None else {}),
         )
 
     def _publish(self, payload_id: str, report: messages.LinkReport) -> None:

@@ -270,7 +270,8 @@ class MultiStreamReceiver:
         self._accounts: dict[_Source, Counters] = {}
         self._changed = threading.Lock()
         self._closing = threading.Event()
-        self._failure = ""
+        self.failure = ""
+        """Why nothing is received any more; "" while it is."""
         self._socket = bind(host, port, _POLL_S)
         self.host, self.port = self._socket.getsockname()[:2]
         self._thread = threading.Thread(target=self._run, name="video-receiver", daemon=True)
@@ -304,11 +305,6 @@ class MultiStreamReceiver:
         """Whether only SRTP is taken."""
         return self._unprotector is not None
 
-    @property
-    def failure(self) -> str:
-        """Why nothing is received any more; "" while it is."""
-        return self._failure
-
     def streams(self) -> list[Stream]:
         """Those being received."""
         with self._changed:
@@ -328,7 +324,7 @@ class MultiStreamReceiver:
         try:
             self._receive()
         except Exception as error:
-            self._failure = f"the receiver failed: {error!r}"
+            self.failure = f"the receiver failed: {error!r}"
             raise
 
     def _receive(self) -> None:
