@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import re
 import threading
 import time
 from collections import deque
@@ -10,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError
+from ground_station.errors import GroundStationError, InputError
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
 from ground_station.service.alarms import UNLISTED
@@ -21,7 +23,7 @@ from ground_station.service.bus_messages import (
     Level,
     Message,
 )
-from ground_station.service.intake import poses, questions
+from ground_station.service.intake import poses
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
@@ -34,6 +36,8 @@ from ground_station.stream.multi_stream import MultiStreamReceiver
 from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import messages
+from pi_firmware.wire.keys import check_payload_id
+from pi_firmware.wire.telemetry import Session
 
 _PAYLOADS_S, _RECORDING_S = 0.5, 1.0
 _STOP_S = 3.5
@@ -45,6 +49,9 @@ _NAME_LENGTH, _TEXT_LENGTH = 64, 500
 _TOLD = 256
 _EARLY, _EARLY_S = 64, 3.0
 _LEFT_S = 2.0
+_ANSWER_S = 2.0
+"""For the payload to be found, and again for its answer: who asks waits for 5 s."""
+_AFTER = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}/[A-Za-z0-9][A-Za-z0-9_.:+-]{0,127}\.mcap")
 
 _LEVELS: dict[str, Level] = {
     messages.EVENT_FAILED: bus_messages.ALARM,
@@ -166,9 +173,21 @@ class Intake:
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Answers a question of the bus; raises a `BlimpError` for what cannot be done."""
-        if request.get("do") == "endpoints":
+        what = request.get("do")
+        if what == "endpoints":
             return {"video_port": self.video.port, "telemetry": list(self.endpoints)}
-        return questions.answer(request, self.recorder, self._listener.session)
+        if what == "record-start":
+            after = request.get("after", "")
+            if not isinstance(after, str) or (after and not _AFTER.fullmatch(after)):
+                raise InputError(f"'after' is {str(after)[:40]!r}; allowed: STATION/FILE.mcap")
+            return {"file": self.recorder.start(after)}
+        if what == "record-stop":
+            return {"file": self.recorder.stop()}
+        if what == "payload-command":
+            return _command(request, self._listener.session)
+        raise InputError(
+            f"'do' is {str(what)[:40]!r}; allowed: record-start, record-stop, payload-command"
+        )
 
     def estimated(self, payload_id: str, note: EstimateMessage) -> None:
         """Takes a pose: it goes to its payload, and into the recording."""
@@ -338,3 +357,19 @@ class Intake:
         for payload_id in self._listener.living():
             if self._roster.get(payload_id) is not None:
                 threading.Thread(target=ask, args=(payload_id,), name="idr", daemon=True).start()
+
+
+def _command(request: Mapping[str, Any], session: Session) -> dict[str, Any]:
+    payload_id, name = request.get("payload"), request.get("name")
+    arguments = request.get("arguments") or {}
+    if not isinstance(payload_id, str) or name not in commands.NAMES:
+        raise InputError(f"command {str(name)[:40]!r}; allowed: {', '.join(commands.NAMES)}")
+    check_payload_id(payload_id)
+    if not isinstance(arguments, dict) or not all(
+        isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        for value in arguments.values()
+    ):
+        raise InputError(f"command {name!r}: its arguments must be finite numbers by name")
+    numbers = {str(key): float(value) for key, value in arguments.items()}
+    answered = commands.ask(session, payload_id, name, numbers, _ANSWER_S)
+    return {"done": answered.done, "reason": answered.reason, "values": dict(answered.values)}
