@@ -24,11 +24,7 @@ _COMMANDS = (
     ("record", "ground_station.service.record_command", "record payloads without the service"),
     ("command", "ground_station.stream.command", "ask a payload to do something"),
     ("serve", "ground_station.service.serve_command", "run the ground station and its dashboard"),
-    (
-        "doctor",
-        "ground_station.doctor.command",
-        "check this machine, and say how to fix it",
-    ),
+    ("doctor", "ground_station.doctor.command", "check this machine, and say how to fix it"),
     ("import", "ground_station.recording.import_command", "make a recording of a plain video"),
     ("export", "ground_station.recording.export_command", "a recording's poses for other programs"),
     ("evaluate", "ground_station.evaluation.command", "compare a trajectory with the truth"),

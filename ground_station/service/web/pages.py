@@ -40,19 +40,7 @@ def _page(title: str, body: str) -> str:
     )
 
 
-def _login_page(station: str, problem: str = "") -> str:
-    said = f'<p class="problem" role="alert">{html.escape(problem)}</p>' if problem else ""
-    return _page(
-        f"{station}: log in",
-        '<form method="post" action="/login">'
-        f"<h1>{html.escape(station)}</h1>{said}"
-        '<label for="token">Token of this ground station</label>'
-        '<input id="token" name="token" type="password" autocomplete="current-password"'
-        " required autofocus><button>Log in</button></form>",
-    )
-
-
-def _login_answer(
+def _login_page(
     station: str, problem: str = "", status: int = 200, retry_s: int | None = None
 ) -> Response:
     """The form. Under the policy of all other pages, no-referrer, it would be sent as of nobody.
@@ -62,7 +50,16 @@ def _login_answer(
     headers = {"referrer-policy": "same-origin"}
     if retry_s is not None:
         headers["retry-after"] = str(retry_s)
-    return HTMLResponse(_login_page(station, problem), status, headers)
+    said = f'<p class="problem" role="alert">{html.escape(problem)}</p>' if problem else ""
+    page = _page(
+        f"{station}: log in",
+        '<form method="post" action="/login">'
+        f"<h1>{html.escape(station)}</h1>{said}"
+        '<label for="token">Token of this ground station</label>'
+        '<input id="token" name="token" type="password" autocomplete="current-password"'
+        " required autofocus><button>Log in</button></form>",
+    )
+    return HTMLResponse(page, status, headers)
 
 
 def router(access: Access, station: str) -> APIRouter:
@@ -77,7 +74,7 @@ def router(access: Access, station: str) -> APIRouter:
     def form() -> Response:
         if not access.needs_token:
             return RedirectResponse("/", 303)
-        return _login_answer(station)
+        return _login_page(station)
 
     @result.post("/login")
     async def log_in(request: Request) -> Response:
@@ -88,9 +85,9 @@ def router(access: Access, station: str) -> APIRouter:
             token = fields.get("token", [""])[0]
             access.check_token(request.client.host if request.client else "", token)
         except Refused as refused:
-            return _login_answer(station, refused.detail, refused.status, refused.retry_s)
+            return _login_page(station, refused.detail, refused.status, refused.retry_s)
         except ValueError:
-            return _login_answer(station, "not a form", 422)
+            return _login_page(station, "not a form", 422)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(
             COOKIE,

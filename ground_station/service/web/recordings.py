@@ -223,11 +223,23 @@ def _portion(header: str | None, size: int) -> tuple[int, int] | None:
     return begin, end
 
 
-def _disposed(file: str, size: int) -> dict[str, str]:
-    return {
-        "content-length": str(size),
+def _sent(
+    shelf: Shelf, file: str, size: int, part: tuple[int, int] | None = None
+) -> StreamingResponse:
+    """A file of that size as a download, or a part of it."""
+    begin, end = part or (0, size)
+    headers = {
+        "content-length": str(end - begin),
         "content-disposition": f'attachment; filename="{file}"',
     }
+    if part:
+        headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
+    return StreamingResponse(
+        shelf.pieces(file, begin, end),
+        206 if part else 200,
+        headers,
+        media_type="application/octet-stream",
+    )
 
 
 _BYTES: dict[str, Any] = {"content": {"application/octet-stream": {}}}
@@ -252,12 +264,7 @@ def elsewhere(shelf: Callable[[str], Shelf]) -> APIRouter:
     def download(station: StationName, file: FileName) -> Response:
         """A recording of another station's, as it is now."""
         theirs = shelf(station)
-        size = theirs.size(file)
-        return StreamingResponse(
-            theirs.pieces(file, 0, size),
-            headers=_disposed(file, size),
-            media_type="application/octet-stream",
-        )
+        return _sent(theirs, file, theirs.size(file))
 
     return result
 
@@ -283,17 +290,9 @@ def router(recordings: Recordings) -> APIRouter:
     def download(file: FileName, request: Request) -> Response:
         """A recording's bytes as they are now, or a range of them."""
         size = recordings.size(file)
-        part = _portion(request.headers.get("range"), size)
-        begin, end = part or (0, size)
-        headers = {**_disposed(file, end - begin), "accept-ranges": "bytes"}
-        if part:
-            headers["content-range"] = f"bytes {begin}-{end - 1}/{size}"
-        return StreamingResponse(
-            recordings.pieces(file, begin, end),
-            206 if part else 200,
-            headers,
-            media_type="application/octet-stream",
-        )
+        answer = _sent(recordings, file, size, _portion(request.headers.get("range"), size))
+        answer.headers["accept-ranges"] = "bytes"
+        return answer
 
     @result.delete("/{file}", response_model=AnswerModel, responses=problems(404, 409))
     def delete(file: FileName) -> Any:
