@@ -10,11 +10,6 @@ import numpy as np
 from av.video.frame import PictureType
 
 from ground_station.arrays import U8
-from ground_station.errors import GroundStationError
-
-
-class EncodingError(GroundStationError):
-    """Pictures that cannot be encoded here."""
 
 
 class H264Encoder:
@@ -34,8 +29,7 @@ class H264Encoder:
         bitrate_kbps: int | None = None,
     ) -> None:
         context = av.CodecContext.create("libx264", "w")
-        if not isinstance(context, av.VideoCodecContext):
-            raise EncodingError("libx264 is not a video encoder in this build of FFmpeg")
+        assert isinstance(context, av.VideoCodecContext)
         context.width, context.height, context.pix_fmt = width_px, height_px, "yuv420p"
         rate = Fraction(rate_hz).limit_denominator(1000)
         context.framerate, context.time_base = rate, 1 / rate
@@ -83,6 +77,5 @@ class H264Encoder:
 
     def _packets(self, frame: av.VideoFrame | None) -> Iterator[tuple[int, bytes]]:
         for packet in self._context.encode(frame):
-            if packet.pts is None:
-                raise EncodingError("the encoder lost the order of its pictures")
+            assert packet.pts is not None
             yield int(packet.pts), bytes(packet)

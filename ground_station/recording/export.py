@@ -19,10 +19,6 @@ AGAIN = "# the camera's time begins again\n"
 """Before the first pose of another stream: a payload that was restarted, a replay's next round."""
 
 
-class ExportError(GroundStationError):
-    """An export that cannot be written as asked."""
-
-
 @dataclass(frozen=True)
 class Poses:
     """A recording's poses on a topic in the file's order, `wTc` at the camera's times.
@@ -86,7 +82,7 @@ def write_mcap(path: str | Path, poses: Poses, source: str) -> None:
                     sample.time_ns, sample.position_m, sample.quaternion_xyzw, topic=poses.topic
                 )
     except OSError as error:
-        raise ExportError(f"{path}: {error.strerror or error}") from None
+        raise GroundStationError(f"{path}: {error.strerror or error}") from None
 
 
 def _only_topic(path: str | Path, topics: Iterable[str]) -> str:

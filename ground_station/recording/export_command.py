@@ -34,12 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the file; raises `BlimpError` with one line."""
+    from ground_station.errors import InputError
     from ground_station.files import check_outputs, write_text
-    from ground_station.recording.export import ExportError, read_poses, tum, write_mcap
+    from ground_station.recording.export import read_poses, tum, write_mcap
 
     check_outputs(args.out)
     if args.out.exists() and args.recording.exists() and args.out.samefile(args.recording):
-        raise ExportError(f"{args.out}: that is the recording itself")
+        raise InputError(f"{args.out}: that is the recording itself")
     poses = read_poses(args.recording, args.topic)
     if args.format == "tum":
         write_text(args.out, "".join(tum(poses)))

@@ -31,12 +31,8 @@ stopped, as by a computer that slept, is to hear at once what comes when it wake
 Do = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
-class BusError(GroundStationError):
-    """A bus that cannot be opened."""
-
-
 def _open(mode: str, folder: Path) -> Any:
-    """A session of Zenoh; raises `BusError` with one line."""
+    """A session of Zenoh; raises `GroundStationError` with one line."""
     import zenoh
 
     endpoint = f"unixsock-stream/{folder / _SOCKET}"
@@ -55,11 +51,11 @@ def _open(mode: str, folder: Path) -> Any:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise BusError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
+        raise GroundStationError(f"{folder}: {str(error).splitlines()[0][:160]}") from None
 
 
 class Router:
-    """The bus itself, in the parent; raises `BusError` when the folder has no room for it."""
+    """The bus itself, in the parent; raises `GroundStationError` where the folder has no room."""
 
     def __init__(self, folder: Path) -> None:
         self._session = _open("router", folder)
@@ -74,7 +70,7 @@ class Bus:
 
     Handlers run on a thread of the session and must return soon. `dropped` counts what was no
     message. A process that is too slow to hear a message loses it, or with `lossless` is waited
-    for. Raises `BusError` when there is no bus in the folder.
+    for. Raises `GroundStationError` when there is no bus in the folder.
     """
 
     def __init__(self, folder: Path, process: str, *, lossless: bool = False) -> None:

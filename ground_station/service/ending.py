@@ -8,9 +8,16 @@ import sys
 import threading
 from collections.abc import Callable
 
+from ground_station.errors import GroundStationError
 from pi_firmware.wire.errors import BlimpError
 
 LIMIT_S = 1.5
+
+
+class CannotGoOn(GroundStationError):
+    """A process that cannot go on; a new one may."""
+
+    restart = True
 
 
 def ending(limit_s: float | None = LIMIT_S) -> threading.Event:

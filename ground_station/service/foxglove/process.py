@@ -106,16 +106,12 @@ _BACKLOG = 256
 """Messages that may wait for one client; beyond it the oldest are dropped."""
 
 
-class FoxgloveError(GroundStationError):
-    """A server that cannot start."""
-
-
 class _Named(Protocol):
     id: int
 
 
 class Publishing:
-    """The server and its topics. Raises `FoxgloveError` where it cannot listen."""
+    """The server and its topics. Raises `GroundStationError` where it cannot listen."""
 
     def __init__(self, bus: Bus, folder: Path, settings: StationSettings) -> None:
         self._bus, self._folder, self._settings = bus, folder, settings
@@ -322,7 +318,7 @@ def _listen(settings: StationSettings, context: Context, listener: Publishing) -
     except Exception as error:
         reason = str(error).removeprefix("FoxgloveError: ").splitlines()[0][:160]
         where = f"foxglove.host {chosen.host}, foxglove.port {chosen.port}"
-        raise FoxgloveError(f"{where}: {reason}") from None
+        raise GroundStationError(f"{where}: {reason}") from None
 
 
 def _print(_: str, text: str) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError, InputError
+from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.service import bus_messages
 from ground_station.service.alarms import UNLISTED
@@ -23,6 +23,7 @@ from ground_station.service.bus_messages import (
     Level,
     Message,
 )
+from ground_station.service.ending import CannotGoOn
 from ground_station.service.intake import poses
 from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
@@ -64,12 +65,6 @@ _LEVELS: dict[str, Level] = {
     messages.EVENT_RADIO_FAILED: bus_messages.WARNING,
     messages.EVENT_SOURCE_CUT: bus_messages.WARNING,
 }
-
-
-class IntakeError(GroundStationError):
-    """The intake cannot go on; a new process may."""
-
-    restart = True
 
 
 class Intake:
@@ -155,10 +150,10 @@ class Intake:
     def step(self) -> None:
         """Says how payloads and recording are, when it is time to.
 
-        Raises `IntakeError` when nothing can be received any more.
+        Raises `CannotGoOn` when nothing can be received any more.
         """
         if self.video.failure:
-            raise IntakeError(self.video.failure)
+            raise CannotGoOn(self.video.failure)
         now_s = time.monotonic()
         if self._stepped:
             self._feed.again()

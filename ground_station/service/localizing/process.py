@@ -130,10 +130,6 @@ _FORGET_AFTER, _END_AFTER = 3, 10
 """Frames in a row that failed: what is known of the flight may be the cause; the process is."""
 
 
-class LocalizingError(GroundStationError):
-    """Something the localizer process cannot do."""
-
-
 class Localizing:
     """One payload's frames to poses, on the bus."""
 
@@ -280,13 +276,13 @@ class Localizing:
         what = request.get("do")
         if what == "relocalize":
             if self._localizer is None:
-                raise LocalizingError(f"nothing to search: {self._waiting}")
+                raise GroundStationError(f"nothing to search: {self._waiting}")
             self._forget.set()
             self._event(bus_messages.INFO, "relocalize", "asked to forget the pose and to search")
             return {}
         if what == "map":
             return self._choose_map(request.get("name"))
-        raise LocalizingError(f"do: {what!r:.40} is not known (known: relocalize, map)")
+        raise GroundStationError(f"do: {what!r:.40} is not known (known: relocalize, map)")
 
     def _choose_map(self, name: object) -> Mapping[str, Any]:
         settings = self._run.station.map

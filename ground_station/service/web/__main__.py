@@ -9,20 +9,13 @@ import signal
 import sys
 from pathlib import Path
 
-from ground_station.service.ending import status_of
-from pi_firmware.wire.errors import BlimpError
+from ground_station.service.ending import CannotGoOn, status_of
 
 _BEAT_S = 0.5
 _EXPOSED = (
     "{host} is reached by others, who need the token; plain HTTP does not hide it from who listens"
     " on that network (a tunnel does: ssh -L)"
 )
-
-
-class ServerEnded(BlimpError):
-    """The server stopped although nobody asked it to."""
-
-    restart = True
 
 
 def serve(run_folder: str) -> int:
@@ -75,7 +68,7 @@ async def _serve(folder: Path) -> None:
         serving.should_exit = True
         await task
         if not stop.is_set():
-            raise ServerEnded("the server ended by itself")
+            raise CannotGoOn("the server ended by itself")
 
 
 if __name__ == "__main__":

@@ -24,10 +24,6 @@ _BACKLOG = 128
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
-class ListenError(GroundStationError):
-    """An address that cannot be listened on."""
-
-
 class _Http(H11Protocol):
     """Closes a connection whose next request does not come whole in time, and one too many."""
 
@@ -109,11 +105,11 @@ def server(app: ASGIApp) -> Server:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; raises `ListenError` with one line, as when the port is in use."""
+    """A listening socket; raises `GroundStationError` with one line, as when the port is in use."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]
         return socket.create_server(address[:2], family=family, backlog=_BACKLOG)
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error)
-        raise ListenError(f"http {host}:{port}: {reason}") from None
+        raise GroundStationError(f"http {host}:{port}: {reason}") from None
