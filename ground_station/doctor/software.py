@@ -25,7 +25,8 @@ for name in sys.argv[1:]:
     try:
         importlib.import_module(name)
     except BaseException as error:
-        print("bad", name, type(error).__name__ + ": " + " ".join(str(error).split()), flush=True)
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        print(f"bad {name} ({why})", flush=True)
 print("done", flush=True)
 """
 _ELEMENTS = {
@@ -73,16 +74,13 @@ def packages(root: Path) -> Finding:
     )
     if missing:
         return problem("packages", f"missing: {_some(missing)}", _SETUP)
-    names = locked.modules(canonicalize_name(need.name) for need in direct)
-    if broken := imports(_in_order(set(names))):
+    names = set(locked.modules(canonicalize_name(need.name) for need in direct))
+    # pylab looks for a display.
+    if broken := imports([*_FIRST, *sorted(names - {*_FIRST, "pylab"})]):
         return problem("packages", f"cannot be imported: {_some(broken)}", _SETUP)
     if other:
         return warning("packages", f"other than locked: {_some(other)}", _SETUP)
     return ok("packages", f"{len(installed)} as locked, and importable")
-
-
-def _in_order(names: set[str]) -> list[str]:
-    return [*_FIRST, *sorted(names - {*_FIRST, "pylab"})]  # pylab looks for a display
 
 
 def imports(names: Sequence[str]) -> list[str]:
@@ -105,7 +103,7 @@ def imports(names: Sequence[str]) -> list[str]:
             said = error.stdout.decode() if isinstance(error.stdout, bytes) else ""
             died = f"takes longer than {_IMPORT_S:g} s"
         lines = said.splitlines()
-        bad += [f"{name} ({why})" for _, name, why in _fields(lines, "bad")]
+        bad += [line.removeprefix("bad ") for line in lines if line.startswith("bad ")]
         if lines[-1:] == ["done"]:
             break
         tried = [line.split()[1] for line in lines if line.startswith("try ")]
@@ -114,10 +112,6 @@ def imports(names: Sequence[str]) -> list[str]:
         bad.append(f"{tried[-1]} ({died})")
         left = left[len(tried) :]
     return bad
-
-
-def _fields(lines: Sequence[str], word: str) -> Iterator[list[str]]:
-    return (line.split(" ", 2) for line in lines if line.startswith(f"{word} "))
 
 
 def video() -> Iterator[Finding]:

@@ -62,7 +62,7 @@ def test_a_payload_that_falls_silent_is_not_alive_whatever_it_last_said(snapshot
 
 def test_payloads_are_bounded_and_the_living_stay(snapshot, clock):
     forgotten: list[str] = []
-    snapshot.on_evicted(forgotten.append)
+    snapshot.evicted = forgotten.append
     snapshot.payload("first", station.payload())
     for number in range(5 * PAYLOADS):
         snapshot.frame(f"p-{number}", station.frame())

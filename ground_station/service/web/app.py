@@ -115,7 +115,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     loops: list[asyncio.AbstractEventLoop] = []
     video = Video(folder, settings.http.video_rate_hz, settings.http.jpeg_quality, picture)
     viewers = live.Live(snapshot, metrics, settings.http, video)
-    snapshot.on_evicted(metrics.forget)
+    snapshot.evicted = metrics.forget
     metrics.viewers = lambda: viewers.viewers
     metrics.bus_dropped = lambda: bus.dropped
     metrics.video = lambda: {

@@ -99,7 +99,8 @@ class Snapshot:
         self._alarms: list[dict[str, Any]] = []
         self.job: Callable[[], dict[str, Any] | None] = lambda: None
         self.fleet: Callable[[], dict[str, Any] | None] = lambda: None
-        self._evicted: Callable[[str], None] = lambda _: None
+        self.evicted: Callable[[str], None] = lambda _: None
+        """Gets the id of each payload that is forgotten."""
 
     def listen(self, bus: Bus | Fleet) -> None:
         """Hears everything on the bus."""
@@ -134,10 +135,6 @@ class Snapshot:
         ):
             file.write(text)
         self._lines = 0 if anew else self._lines
-
-    def on_evicted(self, call: Callable[[str], None]) -> None:
-        """`call` gets the id of each payload that is forgotten."""
-        self._evicted = call
 
     # What comes
 
@@ -351,7 +348,7 @@ class Snapshot:
                 return None
             oldest = min(gone, key=lambda name: max(self._payloads[name].came_ns.values()))
             del self._payloads[oldest]
-            self._evicted(oldest)
+            self.evicted(oldest)
         item = self._payloads[payload_id] = _Payload(came_ns={"first": self._clock_ns()})
         return item
 
