@@ -72,16 +72,13 @@ def judge(state: Mapping[str, Any], now_ns: int, before: Alarms) -> dict[str, St
     """
     result: dict[str, Standing] = {}
     for alarm in _found(state, now_ns, frozenset(before)):
-        old = before.get(alarm.id)
-        if old is None:
-            result[alarm.id] = Standing(dataclasses.replace(alarm, since_ns=now_ns), now_ns)
-            continue
-        falls = _RANK[alarm.level] < _RANK[old.alarm.level]
-        if falls and _held(old, now_ns):
-            result[alarm.id] = _kept(old, now_ns)
-        else:
+        old, since_ns = before.get(alarm.id), now_ns
+        if old is not None:
             since_ns = min(old.alarm.since_ns, now_ns)
-            result[alarm.id] = Standing(dataclasses.replace(alarm, since_ns=since_ns), now_ns)
+            if _RANK[alarm.level] < _RANK[old.alarm.level] and _held(old, now_ns):
+                result[alarm.id] = _kept(old, now_ns)
+                continue
+        result[alarm.id] = Standing(dataclasses.replace(alarm, since_ns=since_ns), now_ns)
     for name, old in before.items():
         if name not in result and _held(old, now_ns):
             result[name] = _kept(old, now_ns)
