@@ -198,10 +198,10 @@ def gone(time_ns: int) -> SceneUpdate:
     return SceneUpdate(deletions=[_deletion(name, time_ns) for name in (MARKER, ELLIPSOID)])
 
 
-def log(payload_id: str, note: EventMessage, time_ns: int) -> Log:
+def log(payload_id: str, note: EventMessage) -> Log:
     """An event for the Log panel."""
     return Log(
-        timestamp=stamp(time_ns),
+        timestamp=stamp(note.time_ns),
         level=_LEVELS.get(note.level, LogLevel.Unknown),
         message=f"{note.name}: {note.text}",
         name=note.source if payload_id == bus_messages.STATION else f"{payload_id} {note.source}",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +60,6 @@ class Payload:
         self._was_solved = self.alive = False
         self._told: dict[str, Message] = {}
         root = f"/{payload_id}"
-
-        def recall(name: str) -> Callable[[], Iterator[tuple[Make, int]]]:
-            return lambda: self._recall(name)
-
         self._image = Topic(CompressedImageChannel(f"{root}/camera/image", context=context))
         self._points = Topic(ImageAnnotationsChannel(f"{root}/camera/points", context=context))
         self._calibration = Topic(
@@ -74,7 +71,7 @@ class Payload:
         self._estimate = json_topic(f"{root}/estimate", documents.ESTIMATE, context)
         self._neighbours = json_topic(f"{root}/neighbours", documents.NEIGHBOURS, context)
         self._messages = {
-            name: json_topic(f"{root}/{name}", schema, context, recall(name))
+            name: json_topic(f"{root}/{name}", schema, context, partial(self._recall, name))
             for name, schema in {
                 "battery": documents.BATTERY,
                 "health": documents.HEALTH,

@@ -121,7 +121,7 @@ class Publishing:
         self._payloads: dict[str, Payload] = {}
         self._newest: dict[str, EstimateMessage] = {}  # of payloads elsewhere, too
         self._flown: dict[str, str] = {}  # the map that each payload flies in
-        self._events: deque[tuple[str, EventMessage, int]] = deque(maxlen=EVENTS)
+        self._events: deque[tuple[str, EventMessage]] = deque(maxlen=EVENTS)
         self._recording: tuple[RecordingMessage, int] | None = None
         self._reader = world.Reader(settings.map, self._take_world)
         self._camera: Camera | None = None
@@ -134,8 +134,10 @@ class Publishing:
         self._tf = Topic(FrameTransformsChannel("/tf", context=context))
         self._plan = Topic(GridChannel("/map/floorplan", context=context))
         self._landmarks = Topic(PointCloudChannel("/map/landmarks", context=context))
-        self._event = json_topic("/events", documents.EVENT, context, self._happened)
-        self._log = Topic(LogChannel("/log", context=context), self._logged)
+        happened = functools.partial(self._happened, documents.event)
+        self._event = json_topic("/events", documents.EVENT, context, happened)
+        logged = functools.partial(self._happened, drawing.log)
+        self._log = Topic(LogChannel("/log", context=context), logged)
         self._recorded = json_topic("/recording", documents.RECORDING, context, self._recalled)
         topics = (self._tf, self._event, self._log, self._recorded)
         self._topics = {topic.id: topic for topic in topics}
@@ -204,10 +206,9 @@ class Publishing:
             payload.status(note)
 
     def _take_event(self, payload_id: str, note: EventMessage) -> None:
-        time_ns = note.time_ns
-        self._events.append((payload_id, note, time_ns))
-        self._event.say(lambda: documents.event(payload_id, note), time_ns)
-        self._log.say(lambda: drawing.log(payload_id, note, time_ns), time_ns)
+        self._events.append((payload_id, note))
+        self._event.say(lambda: documents.event(payload_id, note), note.time_ns)
+        self._log.say(lambda: drawing.log(payload_id, note), note.time_ns)
 
     def _take_recording(self, _: str, note: RecordingMessage) -> None:
         self._recording = (note, time.time_ns())
@@ -258,13 +259,9 @@ class Publishing:
         elif topic := self._topics.get(channel):
             topic.greet(client)
 
-    def _happened(self) -> Iterator[tuple[Make, int]]:
-        for payload_id, note, time_ns in self._events:
-            yield functools.partial(documents.event, payload_id, note), time_ns
-
-    def _logged(self) -> Iterator[tuple[Make, int]]:
-        for payload_id, note, time_ns in self._events:
-            yield functools.partial(drawing.log, payload_id, note, time_ns), time_ns
+    def _happened(self, make: Callable[[str, EventMessage], object]) -> Iterator[tuple[Make, int]]:
+        for payload_id, note in self._events:
+            yield functools.partial(make, payload_id, note), note.time_ns
 
     def _recalled(self) -> Iterator[tuple[Make, int]]:
         if self._recording is not None:

@@ -36,9 +36,8 @@ _WAITING = 64
 
 @dataclass(frozen=True)
 class World:
-    """A map by name: `plan` is None where it has none, `problem` says what could not be read."""
+    """A map: `plan` is None where it has none, `problem` says what could not be read."""
 
-    name: str
     plan: Plan | None = None
     landmarks: bytes = b""
     """x, y, z by turns, metres, float32, little-endian."""
@@ -140,15 +139,15 @@ def _read(maps: Maps, name: str) -> World:
     try:
         landmarks, about = maps.landmarks(name), maps.details(name)["floorplan"]
         if about is None:
-            return World(name, landmarks=landmarks)
+            return World(landmarks=landmarks)
         picture = np.frombuffer(maps.floorplan(name), np.uint8)
         image = cv2.imdecode(picture, cv2.IMREAD_GRAYSCALE)
         if image is None:
-            return World(name, landmarks=landmarks)
+            return World(landmarks=landmarks)
         grey, cell_m = coarse(np.asarray(image, np.uint8), about["resolution_m"])
         x, y, yaw = about["origin"]
-        return World(name, Plan(np.ascontiguousarray(grey[::-1]), cell_m, (x, y, yaw)), landmarks)
+        return World(Plan(np.ascontiguousarray(grey[::-1]), cell_m, (x, y, yaw)), landmarks)
     except BlimpError as error:
-        return World(name, problem=str(error))
+        return World(problem=str(error))
     except Exception as error:  # a map that is being replaced, or too little memory
-        return World(name, problem=f"{name}: {type(error).__name__}: {error}")
+        return World(problem=f"{name}: {type(error).__name__}: {error}")
