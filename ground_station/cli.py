@@ -6,11 +6,13 @@ import argparse
 import errno
 import importlib
 import os
+import re
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ground_station import __version__, next_command
+from ground_station import __version__
 from pi_firmware.wire.errors import BlimpError
 
 _COMMANDS = (
@@ -42,6 +44,9 @@ _ADVICE = {
     errno.EACCES: "ls -ld says whose it is",
 }
 """What to do next where the system's own reason ends an error."""
+
+
+_PLACE = re.compile(r"\{([a-z_|]+)\}")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -76,6 +81,25 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
+def next_of(args: argparse.Namespace) -> str:
+    """The command to give next, as `COMMAND    (why)`: a command line's `next` with its own values.
+
+    Each command has `next` among its parser's defaults, and its `run` may put another in place.
+    `{out|map}` stands for the first of these arguments that was given; "" where none was.
+    """
+    lacks = False
+
+    def value(place: re.Match[str]) -> str:
+        nonlocal lacks
+        given = [getattr(args, name) for name in place[1].split("|")]
+        found = next((one for one in given if one not in (None, [])), None)
+        lacks |= found is None
+        return shlex.join(map(str, found)) if isinstance(found, list) else shlex.quote(str(found))
+
+    filled = _PLACE.sub(value, args.next)
+    return "" if lacks else filled
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; the exit status is 0, 1 (a bound was missed) or 2 (bad input)."""
     args = parser().parse_args(arguments)
@@ -83,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # this once, when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        args.next = next_command.of(args)
+        args.next = next_of(args)
         status = int(importlib.import_module(args.module).run(args))
         if args.next:
             print(f"next: {args.next}")

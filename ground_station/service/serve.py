@@ -46,17 +46,13 @@ def serve(settings: StationSettings, stop: threading.Event, *, demo: Path | None
     with run_folder() as folder:
         write_run(folder, Run(settings, demo=demo is not None, started_ns=time.time_ns()))
         payload = _demo_config(folder, settings, demo) if demo else None
-        router = Router(folder)
-        try:
-            with Bus(folder, "station") as bus:
-                parent = _Parent(folder, settings, bus, payload)
-                try:
-                    parent.run(stop, notifier)
-                finally:
-                    notifier.stopping()
-                    parent.children.close()
-        finally:
-            router.close()
+        with contextlib.closing(Router(folder)), Bus(folder, "station") as bus:
+            parent = _Parent(folder, settings, bus, payload)
+            try:
+                parent.run(stop, notifier)
+            finally:
+                notifier.stopping()
+                parent.children.close()
 
 
 class _Parent:

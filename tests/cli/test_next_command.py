@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ground_station import cli, next_command
+from ground_station import cli
 from ground_station.cli import parser as blimp
 
 MAKEFILE = (Path(__file__).parents[2] / "Makefile").read_text()
@@ -42,7 +42,7 @@ def test_every_command_ends_with_the_next_which_is_one(words: tuple[str, ...]) -
         assert template == ""
         return
     values = {action.dest: "X" for action in command._actions}
-    said = next_command.of(argparse.Namespace(**values, next=template))
+    said = cli.next_of(argparse.Namespace(**values, next=template))
     program, *rest = shlex.split(said.split("    ")[0])
     if program == "make":
         assert f"\n{rest[0]}:" in MAKEFILE
@@ -53,11 +53,11 @@ def test_every_command_ends_with_the_next_which_is_one(words: tuple[str, ...]) -
 
 def test_values_are_quoted_and_those_that_were_not_given_leave_it_out() -> None:
     given = argparse.Namespace(next="blimp map view {out|map}", out=None, map="maps/a b")
-    assert next_command.of(given) == "blimp map view 'maps/a b'"
+    assert cli.next_of(given) == "blimp map view 'maps/a b'"
     given.out = Path("maps/{map}")
-    assert next_command.of(given) == "blimp map view 'maps/{map}'"
-    assert next_command.of(argparse.Namespace(next="blimp map view {out}", out=None)) == ""
-    assert next_command.of(argparse.Namespace(next="blimp x {names}", names=["a", "b c"])) == (
+    assert cli.next_of(given) == "blimp map view 'maps/{map}'"
+    assert cli.next_of(argparse.Namespace(next="blimp map view {out}", out=None)) == ""
+    assert cli.next_of(argparse.Namespace(next="blimp x {names}", names=["a", "b c"])) == (
         "blimp x a 'b c'"
     )
 

@@ -64,7 +64,7 @@ def first_line(built: Mapping[str, Any]) -> str:
 
 
 def next_step(found: Verdict, map_: Map, folder: str | Path) -> str:
-    """The command to give next, and why, as `next_command` has it."""
+    """The command to give next, and why, as `cli.next_of` has it."""
     where = shlex.quote(str(folder))
     if found.word in ("doubtful", "in parts"):
         page = shlex.quote(f"{Path(folder).name}.html")
