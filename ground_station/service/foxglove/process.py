@@ -11,11 +11,12 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import foxglove
 from foxglove import Context
 from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, PointCloudChannel
+from foxglove.websocket import ChannelView, Client, ServerListener
 
 from ground_station.errors import GroundStationError
 from ground_station.geometry.camera import Camera
@@ -106,11 +107,7 @@ _BACKLOG = 256
 """Messages that may wait for one client; beyond it the oldest are dropped."""
 
 
-class _Named(Protocol):
-    id: int
-
-
-class Publishing:
+class Publishing(ServerListener):
     """The server and its topics. Raises `GroundStationError` where it cannot listen."""
 
     def __init__(self, bus: Bus, folder: Path, settings: StationSettings) -> None:
@@ -246,12 +243,9 @@ class Publishing:
 
     # What a new subscriber is told
 
-    def on_subscribe(self, client: _Named, channel: _Named) -> None:
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """On a thread of the server. A client's id is the number of its sink, too."""
         self._inbox.put(functools.partial(self._greet, client.id, channel.id))
-
-    def on_unsubscribe(self, client: _Named, channel: _Named) -> None:
-        """Nothing to do: `Topic.wanted` asks the server."""
 
     def _greet(self, client: int, channel: int) -> None:
         if channel in self._of_map:
@@ -309,7 +303,7 @@ def _listen(settings: StationSettings, context: Context, listener: Publishing) -
             host=chosen.host,
             port=chosen.port,
             context=context,
-            server_listener=listener,  # type: ignore[arg-type]
+            server_listener=listener,
             message_backlog_size=_BACKLOG,
         )
     except Exception as error:

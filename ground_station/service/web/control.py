@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from fastapi import APIRouter
 
+from ground_station.service.bus import Bus
 from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.web.maps import Maps
 from ground_station.service.web.models import (
@@ -28,18 +29,10 @@ _TIMEOUT_S = 7.0
 INTAKE = "intake"
 
 
-class Queries(Protocol):
-    """The bus, as far as it is needed here."""
-
-    def query(
-        self, name: str, request: Mapping[str, Any], timeout_s: float = ...
-    ) -> Mapping[str, Any]: ...
-
-
 class Control:
     """Asks the service's processes, a few at a time."""
 
-    def __init__(self, bus: Queries, snapshot: Snapshot) -> None:
+    def __init__(self, bus: Bus | Fleet, snapshot: Snapshot) -> None:
         self._bus, self._snapshot = bus, snapshot
         self._free = threading.BoundedSemaphore(_AT_ONCE)
 
