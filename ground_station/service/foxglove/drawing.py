@@ -155,10 +155,7 @@ def scene(payload_id: str, state: str, pose: Solved, time_ns: int, *, fresh: boo
         ],
         texts=[
             TextPrimitive(
-                pose=Pose(
-                    position=_vector([*pose.position_m[:2], pose.position_m[2] + 2 * _TEXT_M]),
-                    orientation=_quaternion((0.0, 0.0, 0.0, 1.0)),
-                ),
+                pose=placed([*pose.position_m[:2], pose.position_m[2] + 2 * _TEXT_M]),
                 billboard=True,
                 font_size=_TEXT_M,
                 color=colour,
@@ -170,7 +167,7 @@ def scene(payload_id: str, state: str, pose: Solved, time_ns: int, *, fresh: boo
         return SceneUpdate(deletions=[_deletion(ELLIPSOID, time_ns)], entities=[marker])
     diameters, axes = conversion.ellipsoid(pose.covariance[:3, :3])
     ellipsoid = SpherePrimitive(
-        pose=Pose(position=_vector(pose.position_m), orientation=_quaternion(axes)),
+        pose=placed(pose.position_m, axes),
         size=_vector(diameters),
         color=_colour(_COLOURS.get(state, _UNKNOWN), 0.35),
     )
@@ -221,8 +218,15 @@ def _deletion(name: str, time_ns: int) -> SceneEntityDeletion:
     return SceneEntityDeletion(timestamp=stamp(time_ns), id=name)
 
 
+def placed(
+    position_m: Sequence[float], quaternion_xyzw: Sequence[float] | F64 = (0.0, 0.0, 0.0, 1.0)
+) -> Pose:
+    """A pose as Foxglove has it."""
+    return Pose(position=_vector(position_m), orientation=_quaternion(quaternion_xyzw))
+
+
 def _pose(pose: Solved) -> Pose:
-    return Pose(position=_vector(pose.position_m), orientation=_quaternion(pose.quaternion_xyzw))
+    return placed(pose.position_m, pose.quaternion_xyzw)
 
 
 def _vector(values: Sequence[float] | F64) -> Vector3:

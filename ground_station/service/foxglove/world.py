@@ -16,14 +16,11 @@ from foxglove.messages import (
     PackedElementField,
     PackedElementFieldNumericType,
     PointCloud,
-    Pose,
-    Quaternion,
     Vector2,
-    Vector3,
 )
 
 from ground_station.service.foxglove import conversion
-from ground_station.service.foxglove.drawing import stamp
+from ground_station.service.foxglove.drawing import placed, stamp
 from ground_station.service.settings import MapSettings
 from pi_firmware.wire.errors import BlimpError
 
@@ -76,10 +73,7 @@ def grid(plan: Plan, time_ns: int) -> Grid:
     return Grid(
         timestamp=stamp(time_ns),
         frame_id=conversion.MAP,
-        pose=Pose(
-            position=Vector3(x=x, y=y, z=0.0),
-            orientation=Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)),
-        ),
+        pose=placed((x, y, 0.0), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))),
         column_count=width,
         cell_size=Vector2(x=plan.cell_m, y=plan.cell_m),
         row_stride=4 * width,
@@ -97,10 +91,7 @@ def cloud(landmarks: bytes, time_ns: int) -> PointCloud:
     return PointCloud(
         timestamp=stamp(time_ns),
         frame_id=conversion.MAP,
-        pose=Pose(
-            position=Vector3(x=0.0, y=0.0, z=0.0),
-            orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
-        ),
+        pose=placed((0.0, 0.0, 0.0)),
         point_stride=12,
         fields=[
             PackedElementField(name=name, offset=at, type=PackedElementFieldNumericType.Float32)
