@@ -58,8 +58,6 @@ class Child:
     def __init__(self, spec: Spec, clock: Callable[[], float] = time.monotonic) -> None:
         self.spec = spec
         self.restarts = 0
-        self.reason = ""
-        """Why it was restarted last."""
         self._clock = clock
         self._process: subprocess.Popen[bytes] | None = None
         self._started_s = 0.0
@@ -168,7 +166,6 @@ class Child:
         self._due_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
         self.restarts += 1
-        self.reason = reason
         return f"{self.spec.name} {reason}; it is restarted"
 
     def _kill(self) -> None:
@@ -244,10 +241,6 @@ class Children:
         """The process ids of those that run."""
         running = {name: child.pid for name, child in list(self._children.items())}
         return {name: pid for name, pid in running.items() if pid is not None}
-
-    def restarts(self) -> dict[str, int]:
-        """How often each was restarted."""
-        return {name: child.restarts for name, child in list(self._children.items())}
 
     def living(self) -> bool:
         """Whether every needed process runs and was heard of late."""

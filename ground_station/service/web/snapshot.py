@@ -222,14 +222,12 @@ class Snapshot:
             before = self._processes.get(note.name)
             if before is None:
                 if len(self._processes) < PROCESSES:
-                    self._processes[note.name] = _Process(note, now_ns, note.restarts)
+                    self._processes[note.name] = _Process(note, now_ns)
                 return
-            restarts = max(before.restarts, note.restarts)
             if note.pid != before.note.pid:
-                restarts = max(before.restarts + 1, restarts)
-            if restarts > before.restarts:
+                before.restarts += 1
                 before.restarted_ns = now_ns
-            before.note, before.came_ns, before.restarts = note, now_ns, restarts
+            before.note, before.came_ns = note, now_ns
 
     def set_alarms(self, alarms: list[dict[str, Any]]) -> None:
         """Puts the alarms that stand now."""
