@@ -182,10 +182,6 @@ class Live:
 
     # Viewers
 
-    def known(self) -> list[str]:
-        """The payloads that can be chosen."""
-        return self._snapshot.payload_ids()
-
     @property
     def viewers(self) -> int:
         """How many there are."""
@@ -200,9 +196,9 @@ class Live:
             reason = f"{self._settings.viewers} viewers are here already (http.viewers)"
             await socket.close(TRY_LATER, reason)
             return
-        living = self._snapshot.living()
-        chosen = payload_id or (min(living) if living else None)
-        viewer = Viewer(chosen, self._metrics.pictures_sent.inc)
+        if payload_id not in self._snapshot.payload_ids():
+            payload_id = min(self._snapshot.living(), default=None)
+        viewer = Viewer(payload_id, self._metrics.pictures_sent.inc)
         viewer.outbox.tell(self._hello(viewer))
         self._viewers.add(viewer)
         self._want()
@@ -253,9 +249,8 @@ class Live:
             viewer.outbox.tell(said("pong", sent_ms=sent_ms, now_ns=time.time_ns()))
 
     def _select(self, viewer: Viewer, payload_id: str) -> None:
-        if payload_id not in self._snapshot.payload_ids():
-            payload_id = viewer.payload_id or ""
-        viewer.payload_id = payload_id or None
+        if payload_id in self._snapshot.payload_ids():
+            viewer.payload_id = payload_id
         viewer.outbox.forget_picture()
         viewer.outbox.tell(said("selected", payload=viewer.payload_id))
         self._want()
@@ -275,7 +270,6 @@ def router(live: Live, holds: Callable[[str], bool]) -> APIRouter:
 
     @result.websocket("/api/live")
     async def serve(socket: WebSocket, payload: str | None = None) -> None:
-        chosen = payload if payload in live.known() else None
-        await live.serve(socket, chosen, may_stay(socket, holds))
+        await live.serve(socket, payload, may_stay(socket, holds))
 
     return result
