@@ -1,8 +1,6 @@
 """The ground station's exception family, a branch of the one that both sides share."""
 
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from pi_firmware.wire.errors import BlimpError
 
@@ -39,12 +37,3 @@ def check_options(args: Namespace, **allowed: tuple[float, float]) -> None:
             if value is not None and not low <= value <= high:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option} is {value}; allowed: {low} to {high}")
-
-
-@contextmanager
-def os_errors_as(kind: type[BlimpError], what: object) -> Iterator[None]:
-    """Raises the system's refusals inside as that error: one line, `what` and the reason."""
-    try:
-        yield
-    except OSError as error:
-        raise kind(f"{what}: {error.strerror or error}") from None

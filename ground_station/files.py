@@ -9,8 +9,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from ground_station.errors import GroundStationError, InputError, os_errors_as
+from ground_station.errors import GroundStationError, InputError
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import told
 
 
 def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
@@ -34,7 +35,7 @@ def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
     path = Path(path)
-    with os_errors_as(GroundStationError, path):
+    with told(path, GroundStationError):
         files.write(path, data)
 
 

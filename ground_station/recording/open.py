@@ -6,11 +6,12 @@ import math
 import re
 from pathlib import Path
 
-from ground_station.errors import InputError, os_errors_as
+from ground_station.errors import InputError
 from ground_station.recording.flight import FlightRecording
 from ground_station.recording.folder import ImageFolder
 from ground_station.recording.frames import ALL_FRAMES, FrameRange, FrameSource
 from ground_station.recording.video import AnnexBFile, VideoFile
+from pi_firmware.wire.errors import told
 from pi_firmware.wire.mcap_records import MAGIC
 
 _ANNEX_B_SUFFIXES = {".h264", ".264", ".avc"}
@@ -31,7 +32,7 @@ def open_input(
         raise InputError(f"the frame rate is {rate_hz} Hz; allowed: 0.001 to 10000 Hz")
     if path.is_dir():
         return ImageFolder(path, rate_hz, wanted)
-    with os_errors_as(InputError, path), path.open("rb") as file:
+    with told(path, InputError), path.open("rb") as file:
         head = file.read(8)
     if not head:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")

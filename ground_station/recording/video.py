@@ -10,10 +10,11 @@ from typing import Any
 
 import av
 
-from ground_station.errors import InputError, os_errors_as
+from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey, parameter_sets_in
+from pi_firmware.wire.errors import told
 
 _BLOCK_BYTES = 1 << 18
 _REORDERED = 16
@@ -215,7 +216,7 @@ class AnnexBFile:
             yield bytes(packet)
 
     def _blocks(self) -> Iterator[bytes]:
-        with os_errors_as(InputError, self.path), self.path.open("rb") as file:
+        with told(self.path, InputError), self.path.open("rb") as file:
             while block := file.read(_BLOCK_BYTES):
                 yield block
 

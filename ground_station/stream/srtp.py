@@ -17,12 +17,11 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from ground_station.errors import os_errors_as
 from ground_station.stream.counters import Counters
 from ground_station.stream.rtp import MAX_JUMP
 from pi_firmware.wire import keys as names
 from pi_firmware.wire import video
-from pi_firmware.wire.errors import StreamError, TelemetryError
+from pi_firmware.wire.errors import StreamError, TelemetryError, told
 from pi_firmware.wire.srtcp import SRTP_LABEL, SessionKeys
 from pi_firmware.wire.srtp import TAG_BYTES, read_key
 
@@ -50,7 +49,7 @@ def load_keys(folder: str | Path) -> dict[str, bytes]:
     It reads `FOLDER/srtp/ID.key` as `blimp keys` wrote them; raises `StreamError` with one line.
     """
     folder = Path(folder) / FOLDER
-    with os_errors_as(StreamError, folder):
+    with told(folder, StreamError):
         paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
     loaded = {}
     for path in paths:

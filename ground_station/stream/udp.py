@@ -7,8 +7,7 @@ import socket
 import struct
 import time
 
-from ground_station.errors import os_errors_as
-from pi_firmware.wire.errors import StreamError
+from pi_firmware.wire.errors import StreamError, told
 
 BUFFER_BYTES = 4 << 20
 """What the receiver asks for: a second of video that a busy machine leaves waiting."""
@@ -26,7 +25,7 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
 
     Raises `StreamError` with one line.
     """
-    with os_errors_as(StreamError, f"video on {host} port {port}"):
+    with told(f"video on {host} port {port}", StreamError):
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         receiver = socket.socket(family, socket.SOCK_DGRAM)
         try:
