@@ -4,6 +4,8 @@
 and those marked `alone`, which measure or need the machine, one by one.
 """
 
+import contextlib
+import ctypes
 import os
 import sys
 from collections import Counter
@@ -21,6 +23,12 @@ sys.path.append(str(Path(__file__).with_name("i2c")))  # for `simulated_gauges`
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")
+
+# GStreamer brings libunwind into the process, by which a C++ exception of matplotlib's ends it
+# with a segmentation fault, unless libgcc's own functions of these names were there before. No
+# program of ours loads both; tests of both may come into one process.
+with contextlib.suppress(OSError):
+    ctypes.CDLL("libgcc_s.so.1", mode=ctypes.RTLD_GLOBAL)
 
 _ROOMS = {
     "bench", "calibration", "cli", "commands", "deploy", "evaluation", "experiments",
@@ -50,11 +58,12 @@ def _cache_of_their_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Whether a phase of `make test` would leave a folder or file out whole: reading is slow."""
     phase = config.getoption("markexpr")
-    room, *within = (*collection_path.relative_to(Path(__file__).parent).parts, "")
     if phase == "alone" and collection_path.suffix == ".py":
         return "mark.alone" not in collection_path.read_text() or None
-    if phase in ("beside", "not beside and not alone") and any(within):
-        return (room in _ROOMS) != (phase == "beside") or None
+    if phase in ("beside", "not beside and not alone"):
+        room, *within = (*collection_path.relative_to(Path(__file__).parent).parts, "")
+        if any(within):
+            return (room in _ROOMS) != (phase == "beside") or None
     return None
 
 
