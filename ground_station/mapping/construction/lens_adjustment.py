@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.arrays import F64, I64
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens_models import BrownConrady
+from ground_station.map.landmarks import in_cameras
 from ground_station.map.model import Model
 from ground_station.mapping.sfm.models import among, without_points
 
@@ -340,8 +341,7 @@ def _once(model: Model) -> Model:
 
 def _apart(model: Model) -> Model:
     """The model without points at a camera's centre; its observations are in order of image."""
-    to_camera = np.linalg.inv(model.wTc)[model.image, 2]
-    depth = np.einsum("oi,oi->o", to_camera[:, :3], model.position[model.point]) + to_camera[:, 3]
+    depth = in_cameras(model)[:, 2]
     parts = np.split(depth, np.searchsorted(model.image, np.arange(1, len(model.names))))
     typical = np.array([np.median(part) if len(part) else 0.0 for part in parts])
     near = model.point[depth < _NEAREST * typical[model.image]]
