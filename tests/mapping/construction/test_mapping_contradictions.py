@@ -132,9 +132,9 @@ def test_an_image_alone_hangs_by_its_pose():
 
 def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale(monkeypatch):
     """As where a walk comes back: two of its images see what those of before have."""
-    wTc, world, _ = scene(count=10, points=200)
 
-    def sets(guests: int, hosts: int = 0) -> list[int]:
+    def sets(guests: int, hosts: int = 0, seed: int = 0) -> list[int]:
+        wTc, world, _ = scene(seed, count=10, points=200)
         landmark = []
         for k in range(10):
             of = np.full(len(world), -1)
@@ -151,7 +151,8 @@ def test_two_images_that_stand_among_the_others_landmarks_carry_their_scale(monk
         model = Placed(landmark, dict(enumerate(wTc)), world, PINHOLE)
         return [len(each) for each in bridges.separated(model)]
 
-    assert sets(1) == [5, 5]
+    # About one image the others' scale is open, whatever rounding makes of an eigenvalue of 0.
+    assert [sets(1, seed=seed) for seed in range(8)] == [[5, 5]] * 8
     assert sets(2) == [10]
     assert sets(1, 1) == [10]  # one each way: the step between these two has both lengths
     monkeypatch.setattr(bridges, "_NOISE_PX", 50.0)  # which it has too loosely then

@@ -155,12 +155,11 @@ def _deviation(model: Placed, one: I64, other: I64) -> float:
             of_both[seen] += np.swapaxes(by_set, 1, 2) @ by_point
             of_set[seen] += np.swapaxes(by_set, 1, 2) @ by_set
     left = of_set - of_both @ np.linalg.pinv(of_point, hermitian=True) @ np.swapaxes(of_both, 1, 2)
-    try:
-        covariance = np.linalg.inv(left.sum(axis=0))
+    try:  # an open scale's eigenvalue is 0 but for rounding, of either sign
+        root = np.linalg.inv(np.linalg.cholesky(left.sum(axis=0)))
     except np.linalg.LinAlgError:
         return float("inf")
-    by_set = jacobian(centres - middle)
-    variance = np.einsum("kij,jl,kil->k", by_set, covariance, by_set)
+    variance = np.square(jacobian(centres - middle) @ root.T).sum(axis=(1, 2))
     return float(np.sqrt(variance.max())) / model.depth
 
 
