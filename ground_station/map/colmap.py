@@ -11,6 +11,8 @@ from __future__ import annotations
 import zlib  # noqa: F401  # isort: skip
 import cv2  # noqa: F401  # isort: skip
 
+import signal
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,6 +27,10 @@ from ground_station.map.colmap_cameras import HALF_PIXEL, camera_of, described
 from ground_station.map.colmap_files import check
 from ground_station.map.model import Model
 from pi_firmware.wire.errors import ConfigError
+
+if threading.current_thread() is threading.main_thread():
+    # pycolmap takes a build that is told to end for a crash of its own, with a trace of the stack.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 CAMERA_ID = 1
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,3 +97,9 @@ def test_a_map_made_before_has_a_pinhole_and_undistorted_pixels() -> None:
     theirs = colmap.from_arrays(model, camera)
     assert theirs.cameras[colmap.CAMERA_ID].model.name == "PINHOLE"
     np.testing.assert_allclose(colmap.to_arrays(theirs).pixel_px, model.pixel_px, atol=1e-9)
+
+
+def test_a_build_that_is_told_to_end_does_so_without_a_trace() -> None:
+    told = "import os, signal; from ground_station.map import colmap; os.kill(os.getpid(), 15)"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")
