@@ -10,6 +10,7 @@ from typing import Any
 from ground_station.errors import InputError
 from ground_station.experiments import tables
 from ground_station.experiments.report import PRINTED
+from ground_station.experiments.summary import reasons
 from ground_station.files import finite, write_text
 from ground_station.presentation.readme import Block
 from ground_station.presentation.text import markdown
@@ -20,7 +21,7 @@ BLOCK = Block(
 )
 NAME = "accepted.json"
 """Of the file beside `experiments.toml` that holds what README shows of the accepted run."""
-_OF_EXPERIMENT = ("name", "title", "level")
+_OF_EXPERIMENT = ("name", "title", "level", "date")
 _OF_CASE = ("name", "title", "thesis", "worse")
 _OF_PRESET = {
     "failed": None,
@@ -49,14 +50,15 @@ def render(document: dict[str, Any]) -> str:
             shown = [tables.figures(case, preset) for preset in presets]
             rows.append([title, printed, *shown, tables.inside(case)])
     parts = [markdown(table).rstrip() for table in (rows, series) if len(table) > 1]
-    said = f"{document['conditions']} {PRINTED}"
+    said = f"{document['conditions']} {_measured(document['experiments'])} {PRINTED}"
     return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 
 
 def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
     """Makes a run the one that README shows, and keeps the figures that stand there.
 
-    A map that could not be built is a result. Raises `InputError` for a quick run, for one in which
+    Experiments that are not of this run stay as they were accepted, with their date. A map that
+    could not be built is a result. Raises `InputError` for a quick run, for one in which
     something was not measured or its process ended, and for a README without the markers.
     """
     if document["quick"]:
@@ -70,6 +72,8 @@ def accept(document: dict[str, Any], readme: Path, accepted: Path) -> None:
                         "such a run is not accepted"
                     )
     kept = shown(document)
+    if accepted.is_file():
+        kept = _with_others(kept, json.loads(accepted.read_text(encoding="utf-8")))
     BLOCK.write(readme, render(kept))
     # A line for each row: what changed from one run to the next can be read.
     lines = json.dumps(finite(kept), allow_nan=False).replace('{"name"', '\n{"name"')
@@ -89,6 +93,34 @@ def shown(document: dict[str, Any]) -> dict[str, Any]:
             for case in e["cases"]
         ]
     return kept
+
+
+def _with_others(kept: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """A run's figures with those experiments' that only an earlier one of the same seeds had."""
+    measured = {e["name"]: e for e in kept["experiments"]}
+    names = {e["name"] for e in before["experiments"]}
+    if names <= measured.keys() or before["seeds"] != kept["seeds"]:
+        return kept
+    experiments = [measured.get(e["name"], e) for e in before["experiments"]]
+    experiments += [e for name, e in measured.items() if name not in names]
+    claims = {claim["text"]: claim for claim in before["claims"] + kept["claims"]}
+    return kept | {
+        "worse": reasons(experiments),
+        "claims": list(claims.values()),
+        "experiments": experiments,
+    }
+
+
+def _measured(experiments: Iterable[dict[str, Any]]) -> str:
+    """On which day which experiments were, the latest first."""
+    by_date: dict[str, list[str]] = {}
+    for e in experiments:
+        by_date.setdefault(e["date"], []).append(e["title"])
+    *later, (first, _) = sorted(by_date.items(), reverse=True)
+    if not later:
+        return f"Measured on {first}."
+    told = "; ".join(f"on {date}: {', '.join(titles)}" for date, titles in later)
+    return f"Measured {told}; all else on {first}."
 
 
 def _figures(row: dict[str, Any]) -> dict[str, Any]:

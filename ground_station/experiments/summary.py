@@ -31,7 +31,7 @@ AS_GOOD = 0.02
 def summarise(
     declaration: Declaration, plan: Plan, store: Store, about: dict[str, Any]
 ) -> dict[str, Any]:
-    """The document of `results.json`, `series` and all; `about` is taken over as it is."""
+    """The document of `results.json`, `series` and all; `about`, with its `machine`, as it is."""
     experiments: list[dict[str, Any]] = []
     for experiment in declaration.experiments:
         cases = [_case(case, plan, store) for case in experiment.cases]
@@ -43,22 +43,27 @@ def summarise(
                 "thesis_source": experiment.thesis_source,
                 "thesis_times": asdict(experiment.thesis_times),
                 "level": experiment.level,
+                "date": about["machine"]["date"],
                 "cases": cases,
             }
         )
-    worse = [
+    return about | {
+        "seeds": list(declaration.seeds),
+        "conditions": CONDITIONS.format(", ".join(map(str, declaration.seeds))),
+        "worse": reasons(experiments),
+        "claims": claims.judge(declaration.claims, experiments),
+        "experiments": experiments,
+    }
+
+
+def reasons(experiments: Sequence[dict[str, Any]]) -> list[str]:
+    """In which rows the default is the worse one, and by what."""
+    return [
         f"{e['title']}, {c['title']}: {reason}"
         for e in experiments
         for c in e["cases"]
         for reason in c["worse"]
     ]
-    return about | {
-        "seeds": list(declaration.seeds),
-        "conditions": CONDITIONS.format(", ".join(map(str, declaration.seeds))),
-        "worse": worse,
-        "claims": claims.judge(declaration.claims, experiments),
-        "experiments": experiments,
-    }
 
 
 def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:

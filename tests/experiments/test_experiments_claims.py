@@ -37,7 +37,7 @@ def document(tmp_path, claim, sunset, noon=None):
             runs["light", case][preset] = keys
             for key, row in zip(keys, rows, strict=True):
                 store.write(key, row)
-    about = {"machine": {"cores": 2}, "jobs": 2, "quick": False}
+    about = {"machine": {"cores": 2, "date": "2026-11-27"}, "jobs": 2, "quick": False}
     return summary.summarise(declared, Plan({}, {}, runs), store, about)
 
 

@@ -33,7 +33,7 @@ def document(tmp_path):
             last = None if (experiment, preset) == ("blur", "thesis") else error  # lost at the end
             store.write(f"{experiment}{preset}", kept_runs.run([error, error, last]))
         runs[experiment, case] = {p: [f"{experiment}{p}"] for p in ("thesis", "default")}
-    about = {"machine": {"cores": 2}, "jobs": 2, "quick": False}
+    about = {"machine": {"date": "2026-11-27"}, "jobs": 2, "quick": False}
     return summary.summarise(declared, Plan({}, {}, runs), store, about)
 
 
@@ -51,6 +51,34 @@ def test_an_accepted_run_stands_in_readme_and_only_its_figures_there_are_kept(tm
     assert "landmarks" not in (tmp_path / "accepted.json").read_text()
     readme.accept(document, page, tmp_path / "accepted.json")
     assert page.read_text() == text
+
+
+def test_experiments_that_a_run_has_not_stay_as_they_were_accepted(tmp_path, document):
+    page, accepted = tmp_path / "README.md", tmp_path / "accepted.json"
+    page.write_text(f"{readme.BLOCK.begin}\n{readme.BLOCK.end}\n")
+    claim = {"value": 1.0, "most": 2.0, "least": None, "kept": True, "unit": " m"}
+    told = [claim | {"text": "of the light"}, claim | {"text": "of blur"}]
+    document["experiments"][0]["cases"][0]["worse"] = ["it is dark"]
+    document["experiments"][1]["cases"][0]["worse"] = ["it is blurred"]
+    readme.accept(document | {"claims": told}, page, accepted)
+    assert "Measured on 2026-11-27." in page.read_text()
+    part = json.loads(json.dumps(document)) | {"claims": [told[0] | {"kept": False}]}
+    del part["experiments"][1]
+    light = part["experiments"][0]
+    light["date"], light["cases"][0]["worse"] = "2026-11-28", ["it is darker"]
+    readme.accept(part, page, accepted)
+    kept = json.loads(accepted.read_text())
+    assert [e["name"] for e in kept["experiments"]] == ["light", "blur"]
+    assert kept["worse"] == ["Light, noon: it is darker", "blur, 2: it is blurred"]
+    assert [(c["text"], c["kept"]) for c in kept["claims"]] == [
+        ("of the light", False), ("of blur", True),
+    ]  # fmt: skip
+    assert "Measured on 2026-11-28: Light; all else on 2026-11-27." in page.read_text()
+    # Of other seeds, or whole, a run stands alone.
+    readme.accept(part | {"seeds": [7]}, page, accepted)
+    assert [e["name"] for e in json.loads(accepted.read_text())["experiments"]] == ["light"]
+    readme.accept(document, page, accepted)
+    assert "Measured on 2026-11-27." in page.read_text()
 
 
 def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_path, document):
