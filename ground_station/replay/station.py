@@ -64,9 +64,12 @@ class Station:
             if time.monotonic() > until_s:
                 raise StationError(f"the ground station was not ready within {_READY_S:g} s")
             time.sleep(_POLL_S)
-        answer = self.bus.query("intake", {"do": "endpoints"})
-        if not answer["done"]:
-            raise StationError(str(answer["reason"]))
+        # The other process may be the later one.
+        while not (answer := self.bus.query("intake", {"do": "endpoints"}))["done"]:
+            if time.monotonic() > until_s:
+                raise StationError(str(answer["reason"]))
+            self.step()
+            time.sleep(_POLL_S)
         self.video_port, self.endpoints = answer["video_port"], tuple(answer["telemetry"])
         self._watches = [Watch(pid) for pid in self.children.pids().values()]
         for watch in self._watches:

@@ -14,6 +14,7 @@ import pytest
 from flight import FRESH_S, ROUND, SMALL_FRAMES, Account, Flight
 from ground import Ground, GroundProcess
 from payload_process import PayloadProcess, free_port
+from waiting import eventually
 
 GONE_S = 10.0
 TELEMETRY_S = 20.0  # it is tried again ever more seldom
@@ -111,7 +112,8 @@ def test_two_payloads_on_one_port(recording: Path, tmp_path: Path) -> None:
         first.link.retarget(two.port)
         second.link.retarget(two.port)
         second.wait_streaming(30)
-        time.sleep(1)
+        both = [(flight.link, flight.link.counts.passed) for flight in (first, second)]
+        eventually(lambda: min(link.counts.passed - before for link, before in both) > 40)
         for ground, name, ssrc in ((one, "one", 1001), (two, "two", 1002)):
             state = ground.listener.wait(name, lambda s: s.ssrc is not None, TELEMETRY_S)
             assert state is not None and state.ssrc == ssrc
