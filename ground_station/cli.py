@@ -112,8 +112,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.next:
             print(f"next: {args.next}")
         return status
-    except BlimpError as error:
-        told = str(error)
+    except (BlimpError, OSError) as error:
+        if isinstance(error, BrokenPipeError):  # `blimp … | head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        if isinstance(error, OSError) and error.filename is None:
+            raise
+        told = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
         for number, advice in _ADVICE.items():
             if told.endswith(os.strerror(number)):
                 told += f"; {advice.format(prog=args.prog)}"
@@ -122,9 +127,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"blimp {args.command}: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # `blimp … | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
 
 
 if __name__ == "__main__":

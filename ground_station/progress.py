@@ -62,12 +62,14 @@ class Progress:
         self._bar = tqdm(total=total, desc=label, leave=False) if terminal else None
 
     def step(self, total: int | None = None) -> None:
-        """One more is done; `total` where it is known only now."""
-        self._done += 1
+        """One more is done, of no more than `total`, which may be known only now."""
         if total is not None and self._total is None:
             self._total = total
             if self._bar is not None:
                 self._bar.total = total
+        if self._done == self._total:
+            return
+        self._done += 1
         if self._bar is not None:
             self._bar.update()
         elif time.monotonic() - self._said_s >= _LINE_EVERY_S:

@@ -132,6 +132,8 @@ def load(path: str | Path, cls: type[T]) -> T:
 
 def from_mapping(document: Mapping[str, Any], cls: type[T], *, where: str = "config") -> T:
     """Builds the dataclass `cls` from nested mappings, checking every key and value."""
+    if not isinstance(document, Mapping):
+        raise ConfigError(f"{where} must be a table")
     return _build(document, cls, where, "")
 
 

@@ -164,6 +164,8 @@ blimp replay --compare nosuch atrium
     blimp replay RECORDING --map MAP --out
 blimp replay {ATRIUM}/flight.mcap --map empty
     blimp map build INPUT --out empty
+blimp replay {ATRIUM}/flight.mcap --map atrium --out poses.txt/out
+    poses.txt/out: Not a directory
 blimp serve --config nosuch.toml --check
     blimp serve --help has an example
 blimp serve --set video.prot=5 --check

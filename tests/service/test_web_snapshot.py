@@ -10,6 +10,7 @@ import web_station as station
 
 from ground_station.service import settings
 from ground_station.service.web import trail
+from ground_station.service.web.models import PayloadModel
 from ground_station.service.web.snapshot import EVENTS, EVENTS_SHOWN, PAYLOADS, PROCESSES, Snapshot
 
 S = 1_000_000_000
@@ -51,6 +52,7 @@ def test_values_carry_their_age_and_go_stale(snapshot, clock):
     assert view["age_s"]["estimate"] == view["age_s"]["battery"] == 4
     assert view["age_s"]["frame"] is None
     assert view["stale"] == ["estimate"]
+    assert view.keys() == PayloadModel.model_fields.keys()  # the API's description has them all
 
 
 def test_a_payload_that_falls_silent_is_not_alive_whatever_it_last_said(snapshot, clock):

@@ -106,6 +106,11 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, text: str, says: str
     assert "\n" not in message and len(message) < 400
 
 
+def test_what_is_no_table_at_all_is_named() -> None:
+    with pytest.raises(ConfigError, match="^builds.toml: conditions 'day' must be a table$"):
+        config.from_mapping(5, Strict, where="builds.toml: conditions 'day'")  # type: ignore[arg-type]
+
+
 def test_a_key_without_default_must_be_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="the key 'name' is missing"):
         load(tmp_path, "count = 2", Strict)

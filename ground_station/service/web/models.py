@@ -171,6 +171,7 @@ class PayloadModel(BaseModel):
     age_s: dict[str, float | None]
     stale: list[str]
     state_s: float | None
+    nothing_known_s: float | None
     clock_unknown_s: float | None
     trail: list[list[float]] = []
     trail_breaks: list[int] = []

@@ -21,3 +21,10 @@ def test_what_runs_within_is_silent_in_its_own_thread_only(capsys):
     _job("after")
     said = capsys.readouterr().err
     assert "within" not in said and "beside: 1 in" in said and "after: 1 in" in said
+
+
+def test_what_is_done_again_is_not_counted_beyond_the_total(capsys):
+    with Progress("images of all tries", 2) as progress:
+        for _ in range(5):
+            progress.step()
+    assert "images of all tries: 2 in" in capsys.readouterr().err
