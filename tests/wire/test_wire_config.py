@@ -107,7 +107,7 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, text: str, says: str
 
 
 def test_what_is_no_table_at_all_is_named() -> None:
-    with pytest.raises(ConfigError, match="^builds.toml: conditions 'day' must be a table$"):
+    with pytest.raises(ConfigError, match=r"^builds\.toml: conditions 'day' must be a table$"):
         config.from_mapping(5, Strict, where="builds.toml: conditions 'day'")  # type: ignore[arg-type]
 
 
