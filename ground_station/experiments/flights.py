@@ -12,9 +12,10 @@ def stem(flight: FlightDeclaration, seed: int) -> str:
     """How a simulated flight's recording is called: all that it depends on but the program."""
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
+    crowd = f"-{flight.people}people" if flight.people else ""
     return (
         f"{flight.scene}-{flight.plan}-{flight.light}-{seed}"
-        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}"
+        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}{crowd}"
     )
 
 
@@ -36,6 +37,7 @@ def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
         bitrate_kbps=flight.bitrate_kbps or None,
         draught_m_s=flight.draught_m_s,
         lens_error=flight.lens_error,
+        people=flight.people,
         points=points_of(path) if flight.clicked else None,
     )
     if simulate(settings).interrupted:

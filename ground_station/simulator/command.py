@@ -67,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V",
         help="deviation of the air's speed (default: 0.05)",
     )
+    add("--people", type=int, default=0, metavar="N", help="so many walk to and fro (default: 0)")
     add("--build", metavar="NAME", help="the blimp, of hw/builds.toml (default: atrium)")
     add(
         "--exposure-steps",

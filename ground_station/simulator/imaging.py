@@ -135,7 +135,8 @@ class FrameMaker:
         shots = time_s + ((np.arange(k) + 0.5) / k - 0.5) * span
         wTk = motion.wTc(shots)
         pictures = []
-        for T in wTk:
+        for T, shot_s in zip(wTk, shots.tolist(), strict=True):
+            self._renderer.at(shot_s)
             codes, depth = self._renderer.image_and_depth(T, self.pinhole)
             pictures.append((cv2.LUT(codes, self._decoder), depth))
         near = float(np.percentile(pictures[0][1][::8, ::8], 5))

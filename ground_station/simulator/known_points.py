@@ -99,6 +99,7 @@ def choose_observations(
     half_flow_s = 0.005
     for frame in range(0, len(times_s), stride):
         t = float(times_s[frame])
+        renderer.at(t)
         wTc = motion.wTc([t])[0]
         pixels = project_rolling(camera, motion, t, position)
         later = project_rolling(camera, motion, t + half_flow_s, position)

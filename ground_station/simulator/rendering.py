@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from ground_station.arrays import F32, F64, U8
+from ground_station.simulator.people import Walker
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.surfaces import Surface
 
@@ -65,8 +66,34 @@ def _pack(sizes: Sequence[tuple[int, int]]) -> tuple[list[_Slot], int]:
     return [slots[i] for i in range(len(sizes))], atlas + 1
 
 
+def _add_walker(spec: Any, number: int, walker: Walker) -> None:
+    """A body that is moved from outside, of boxes and a ball, metres above the floor."""
+    body = spec.worldbody.add_body(name=f"walker{number}", mocap=True)
+    ball, box = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
+    for part, colours, shape, size, height_m in (
+        ("legs", walker.legs[None, None], box, [0.13, 0.16, 0.43], 0.43),
+        ("coat", walker.coat, box, [0.15, 0.24, 0.34], 1.18),
+        ("head", walker.skin[None, None], ball, [0.12, 0, 0], 1.64),
+    ):
+        name = f"walker{number}-{part}"
+        side = np.ascontiguousarray(np.broadcast_to(colours, (64, 64, 3)))
+        texture = spec.add_texture(
+            name=name, type=mujoco.mjtTexture.mjTEXTURE_CUBE, nchannel=3, width=64, height=6 * 64
+        )
+        texture.data = 6 * side.tobytes()
+        material = spec.add_material(name=name, emission=1.0, specular=0.0)
+        material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
+        body.add_geom(
+            type=shape, size=size, pos=[0, 0, height_m], material=name, contype=0, conaffinity=0
+        )
+
+
 def _model(
-    surfaces: Sequence[Surface], textures: Sequence[U8], buffer_px: tuple[int, int], samples: int
+    surfaces: Sequence[Surface],
+    textures: Sequence[U8],
+    buffer_px: tuple[int, int],
+    samples: int,
+    walkers: Sequence[Walker],
 ) -> Any:
     """The compiled MuJoCo model: one mesh and one texture atlas for each group of surfaces."""
     slots, count = _pack([(t.shape[1], t.shape[0]) for t in textures])
@@ -113,6 +140,8 @@ def _model(
             type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"atlas{atlas}", material=f"atlas{atlas}",
             contype=0, conaffinity=0,
         )  # fmt: skip
+    for number, walker in enumerate(walkers):
+        _add_walker(spec, number, walker)
     try:
         return spec.compile()
     except ValueError as error:
@@ -120,7 +149,10 @@ def _model(
 
 
 class SceneRenderer:
-    """Surfaces on the graphics side; a context manager. `textures` are 8-bit RGB, one a surface."""
+    """Surfaces on the graphics side; a context manager. `textures` are 8-bit RGB, one a surface.
+
+    The `walkers` stand where they are at 0 s, or wherever `at` was told last.
+    """
 
     def __init__(
         self,
@@ -130,17 +162,17 @@ class SceneRenderer:
         *,
         samples: int = 4,
         cull_backs: bool = True,
+        walkers: Sequence[Walker] = (),
     ) -> None:
         self._width, self._height = buffer_px
-        self._model = _model(surfaces, textures, buffer_px, samples)
-        data = mujoco.MjData(self._model)
-        mujoco.mj_forward(self._model, data)
+        self._model = _model(surfaces, textures, buffer_px, samples, walkers)
+        self._walkers, self._data = walkers, mujoco.MjData(self._model)
         try:
             self._renderer = mujoco.Renderer(self._model, self._height, self._width)
         except Exception as error:  # the bindings raise whatever the EGL loader does
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise SimulatorError(f"no headless rendering (EGL, Mesa): {line}") from None
-        self._renderer.update_scene(data)
+        self._place(0.0)
         scene = self._renderer.scene
         scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = int(cull_backs)
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
@@ -156,6 +188,19 @@ class SceneRenderer:
     def close(self) -> None:
         """Frees the graphics memory."""
         self._renderer.close()
+
+    def at(self, time_s: float) -> None:
+        """Whoever walks is where they are at that time from now on."""
+        if self._walkers:
+            self._place(time_s)
+
+    def _place(self, time_s: float) -> None:
+        for number, walker in enumerate(self._walkers):
+            x, y, heading = walker.place(time_s)
+            self._data.mocap_pos[number] = x, y, 0.0
+            self._data.mocap_quat[number] = np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data)
 
     def _aim(self, wTc: F64, half_height: float, half_width: float, ortho_depth_m: float) -> None:
         for camera in self._renderer.scene.camera:  # left and right eye: the same

@@ -20,7 +20,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.progress import stop_noted
 from ground_station.recording.encoding import H264Encoder
-from ground_station.simulator import dynamics, handheld, scenes
+from ground_station.simulator import dynamics, handheld, people, scenes
 from ground_station.simulator.imaging import (
     AutoExposure,
     FrameMaker,
@@ -59,7 +59,8 @@ class SimulationSettings:
     the deviation of the air's speed along each axis; None: that of a quiet hall.
 
     `exposure_steps`, `light_steps` and `flicker` are as `unsteady` reads them; with a
-    `longest_exposure_s` gain does what time may not, as against motion blur.
+    `longest_exposure_s` gain does what time may not, as against motion blur. So many `people` walk
+    to and fro.
     """
 
     out: Path
@@ -84,6 +85,7 @@ class SimulationSettings:
     light_steps: str = ""
     flicker: float = 0.0
     longest_exposure_s: float | None = None
+    people: int = 0
 
     def __post_init__(self) -> None:
         limits = {
@@ -96,6 +98,7 @@ class SimulationSettings:
             "longest_exposure_s": (2e-4, 1 / 60),
             "draught_m_s": (0.0, 2.0),
             "bitrate_kbps": (10, 100_000),
+            "people": (0, people.MOST),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)
@@ -146,13 +149,14 @@ class SimulatedFlight:
     times_s: F64
     noise: np.random.Generator
     clicks: np.random.Generator
+    crowd: np.random.Generator
 
 
 def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
     """Scene, plan and motion from the settings and their seed; raises `SimulatorError`."""
     scene = scenes.build(settings.scene, settings.texels_per_m)
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(4)]
-    path, air, noise, clicks = streams
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(5)]
+    path, air, noise, clicks, crowd = streams
     plan = plan_named(settings.plan, scene, path)
     duration = settings.duration_s or plan.default_duration_s
     rate_hz = settings.rate_hz or plan.rate_hz
@@ -179,7 +183,9 @@ def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
     camera = settings.camera or plan.camera
     wrong = 1 + settings.lens_error
     carried = replace(camera, fx_px=camera.fx_px * wrong, fy_px=camera.fy_px * wrong)
-    return SimulatedFlight(scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks)
+    return SimulatedFlight(
+        scene, plan, motion, rate_hz, camera, carried, times_s, noise, clicks, crowd
+    )
 
 
 def time_ns_of(times_s: npt.ArrayLike) -> I64:
@@ -213,7 +219,10 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     _, lit = lit_scene(settings.scene, settings.texels_per_m, settings.light)
     pinhole = covering_pinhole(camera, settings.supersampling)
     buffer = (pinhole.width_px, pinhole.height_px)
-    with SceneRenderer(flight.scene.surfaces, lit.textures, buffer) as renderer:
+    level = float(np.median([np.median(texture) for texture in lit.textures]))
+    walkers = people.walkers(flight.scene, settings.people, level, flight.crowd)
+    surfaces = flight.scene.surfaces
+    with SceneRenderer(surfaces, lit.textures, buffer, walkers=walkers) as renderer:
         maker = FrameMaker(
             renderer, lit.decoder(), camera, pinhole, sensor=sensor, renders=settings.renders
         )
@@ -320,6 +329,7 @@ def _write_head(
                 if settings.draught_m_s is not None
                 else {}
             ),
+            **({"people": str(settings.people)} if settings.people else {}),
             **({"lens_error": f"{settings.lens_error:g}"} if settings.lens_error else {}),
             **{name: str(value) for name in _UNSTEADY if (value := getattr(settings, name))},
         },

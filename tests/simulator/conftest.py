@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_flight import quick_settings
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
 from ground_station.simulator.rendering import SceneRenderer
-from ground_station.simulator.simulate import SimulationSettings, simulate
+from ground_station.simulator.simulate import simulate
 from ground_station.simulator.surfaces import Surface
 
 TEXELS_PER_M = 100
@@ -77,15 +78,6 @@ def open_room(camera: Camera) -> Iterator[Room]:
         yield Room(
             renderer, np.concatenate(centres), np.concatenate(halves), decoder, supersampling
         )
-
-
-def quick_settings(out: Path, **changes: object) -> SimulationSettings:
-    """A flight that takes seconds: coarse textures, small renders, few frames."""
-    values: dict[str, object] = {
-        "out": out, "plan": "loop", "light": "noon", "seed": 5, "duration_s": 0.8, "rate_hz": 5.0,
-        "texels_per_m": 12.0, "supersampling": 0.5, "renders": 1,
-    }  # fmt: skip
-    return SimulationSettings(**(values | changes))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,62 @@
+"""People who walk in a simulated flight: where they may, to and fro, and nothing else changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quick_flight import quick_settings
+
+from ground_station.recording.open import open_input
+from ground_station.simulator import scenes
+from ground_station.simulator.people import Walker, walkers
+from ground_station.simulator.scene import SimulatorError
+from ground_station.simulator.simulate import simulate
+
+GREY = np.full(3, 90, np.uint8)
+
+
+def test_one_goes_to_and_fro_and_turns_round() -> None:
+    ends = np.array([[1.0, 2.0], [1.0, 6.0]])
+    one = Walker(ends, 1.0, 3.0, np.zeros((64, 64, 3), np.uint8), GREY, GREY)
+    assert one.place(0.0) == pytest.approx([1, 5, np.pi / 2])
+    assert one.place(2.0) == pytest.approx([1, 5, 3 * np.pi / 2])  # 1 m on, and 1 m back
+    assert one.place(4.9) == pytest.approx([1, 2.1, 3 * np.pi / 2])
+    assert one.place(7.0)[:2] == pytest.approx([1, 4])
+
+
+def test_their_ways_are_free_of_what_stands_there() -> None:
+    scene = scenes.build("atrium", 12.0)
+    crowd = walkers(scene, 30, 100.0, np.random.default_rng(2))
+    assert len(crowd) == 30
+    places = np.array([one.place(t)[:2] for one in crowd for t in np.linspace(0, 40, 300)])
+    assert (places > 0.3).all() and (places < np.array(scene.size_m[:2]) - 0.3).all()
+    for thing in scene.footprints:
+        if thing.kind != "balcony":
+            low, high = np.array(thing.bounds_m[:2]), np.array(thing.bounds_m[2:])
+            assert not ((places > low) & (places < high)).all(axis=1).any(), thing
+
+
+def test_where_there_is_no_room_for_them_it_is_said() -> None:
+    narrow = replace(scenes.build("corridor", 12.0), size_m=(2.0, 2.0, 3.0))
+    with pytest.raises(SimulatorError, match="'corridor' has no room for 5 people"):
+        walkers(narrow, 5, 100.0, np.random.default_rng(1))
+
+
+def _frames(out: Path, **changes: object) -> list[np.ndarray]:
+    simulate(quick_settings(out, **changes))
+    return [frame.image.astype(int) for frame in open_input(out)]
+
+
+def test_they_are_seen_move_and_come_again_with_their_seed(tmp_path: Path) -> None:
+    empty = _frames(tmp_path / "empty.mcap")
+    crowded = _frames(tmp_path / "crowded.mcap", people=30)
+    again = _frames(tmp_path / "again.mcap", people=30)
+    assert all((a == b).all() for a, b in zip(crowded, again, strict=True))
+    changed = [np.abs(a - b) > 40 for a, b in zip(empty, crowded, strict=True)]
+    # They hide some of the picture, and of what lies above their heads nothing.
+    assert all(0.002 < one.mean() < 0.4 for one in changed)
+    assert not any(one[:100].any() for one in changed)
+    assert (changed[0] != changed[-1]).mean() > 0.002
