@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 from ground_station import __version__
 from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.text import printable
 
 _COMMANDS = (
     # name, room's command module, help
@@ -112,21 +113,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.next:
             print(f"next: {args.next}")
         return status
-    except (BlimpError, OSError) as error:
-        if isinstance(error, BrokenPipeError):  # `blimp … | head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-        if isinstance(error, OSError) and error.filename is None:
-            raise
-        told = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
-        for number, advice in _ADVICE.items():
-            if told.endswith(os.strerror(number)):
-                told += f"; {advice.format(prog=args.prog)}"
-        print(f"blimp {args.command}: {told}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print(f"blimp {args.command}: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # `blimp … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _refused(args, f"{printable(str(error.filename), 200)}: {error.strerror}")
+    except BlimpError as error:
+        return _refused(args, str(error))
+
+
+def _refused(args: argparse.Namespace, told: str) -> int:
+    """Says why, and what to do where the system's own reason ends it."""
+    for number, advice in _ADVICE.items():
+        if told.endswith(os.strerror(number)):
+            told += f"; {advice.format(prog=args.prog)}"
+    print(f"blimp {args.command}: {told}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

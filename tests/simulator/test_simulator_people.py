@@ -11,9 +11,12 @@ from quick_flight import quick_settings
 
 from ground_station.recording.open import open_input
 from ground_station.simulator import scenes
+from ground_station.simulator.imaging import covering_pinhole
+from ground_station.simulator.known_points import choose_observations
 from ground_station.simulator.people import Walker, walkers
+from ground_station.simulator.rendering import Pinhole
 from ground_station.simulator.scene import SimulatorError
-from ground_station.simulator.simulate import simulate
+from ground_station.simulator.simulate import prepare_flight, simulate
 
 GREY = np.full(3, 90, np.uint8)
 
@@ -60,3 +63,24 @@ def test_they_are_seen_move_and_come_again_with_their_seed(tmp_path: Path) -> No
     assert all(0.002 < one.mean() < 0.4 for one in changed)
     assert not any(one[:100].any() for one in changed)
     assert (changed[0] != changed[-1]).mean() > 0.002
+
+
+def test_points_are_clicked_where_those_who_walk_stand_at_that_time(tmp_path: Path) -> None:
+    flight = prepare_flight(quick_settings(tmp_path / "f.mcap"))
+    stood: list[float] = []
+
+    class Hidden:
+        """Everything is behind somebody."""
+
+        def at(self, time_s: float) -> None:
+            stood.append(time_s)
+
+        def depth(self, _wTc: np.ndarray, pinhole: Pinhole) -> np.ndarray:
+            return np.zeros((pinhole.height_px, pinhole.width_px))
+
+    with pytest.raises(SimulatorError):
+        choose_observations(
+            Hidden(), covering_pinhole(flight.camera, 0.5), flight.camera, flight.motion,
+            flight.times_s, flight.scene.known_points, flight.clicks,
+        )  # type: ignore[arg-type]  # fmt: skip
+    assert stood == flight.times_s.tolist()
