@@ -100,8 +100,8 @@ def drain(
     cell = Cell(capacity_ah, temperature_c=wear.temperature_C)
     reserve = wear.reserve_percent / 100
     charge = np.linspace(1.0, reserve, _STEPS + 1)
-    rest = np.asarray(cell.rest_v(charge), float)
-    ohms = np.asarray(cell.total_ohm(charge), float) + series_ohm
+    rest = np.array([cell.rest_v(one) for one in charge.tolist()])
+    ohms = np.array([cell.total_ohm(one) for one in charge.tolist()]) + series_ohm
     volts = rest.copy()
     alive = np.ones_like(rest, dtype=bool)
     for _ in range(50):

@@ -108,8 +108,6 @@ class Payload:
         try:
             self._link.start()
             self._capture.start()
-            if self.settings.recording.at_start:
-                threading.Thread(target=self._record_at_start, name="record", daemon=True).start()
             self._supervision.start(
                 self._capture, self._ground, self._recorder, self._telemetry, self._autopilot
             )
@@ -163,7 +161,11 @@ class Payload:
 
     def _fly(self, stop: threading.Event) -> None:
         flush_until: float | None = None
+        record = self.settings.recording.at_start
         while self._capture.step():
+            if record and self._capture.encoded:  # what a recorder needs is not loaded before
+                record = False
+                threading.Thread(target=self._record_at_start, name="record", daemon=True).start()
             self._supervision.tend(self._fresh_frames())
             self._look_for_ground()
             if failure := self._link.failure():

@@ -1,13 +1,15 @@
 """Starts the firmware: `python3 -m deploy.board.start`, for systemd.
 
-Chooses the release, counts the start of one that is under trial, and becomes `python3 -m
-pi_firmware` with the same process id. Whatever is wrong with an update, something is started.
+Chooses the release, counts the start of one that is under trial, and runs its `pi_firmware` in this
+process, as starting Python once more would cost. Whatever is wrong with an update, something is
+started.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import runpy
 import sys
 from pathlib import Path
 
@@ -55,7 +57,7 @@ def environment(at: Places, chosen: choose.Choice, given: dict[str, str]) -> dic
 
 
 def main(arguments: list[str]) -> int:
-    """Becomes the firmware; `--root DIR` in tests, all else goes to the firmware."""
+    """Runs the firmware; `--root DIR` in tests, all else goes to the firmware."""
     root = "/"
     if arguments[:1] == ["--root"] and len(arguments) > 1:
         root, arguments = arguments[1], arguments[2:]
@@ -72,9 +74,12 @@ def main(arguments: list[str]) -> int:
         print(f"start: {at.running}: {error.strerror}", file=sys.stderr)
     said = f"start: release {told['version'] or '?'} ({chosen.how})"
     print(f"{said}: {chosen.reason}" if chosen.reason else said, flush=True)
-    python = sys.executable or "/usr/bin/python3"
-    program = [python, "-m", "pi_firmware", "--config", str(at.config), *arguments]
-    os.execve(python, program, variables)
+    os.environ.update(variables)
+    sys.path[:0] = variables["PYTHONPATH"].split(os.pathsep)
+    sys.dont_write_bytecode = True
+    sys.argv = ["pi_firmware", "--config", str(at.config), *arguments]
+    runpy.run_module("pi_firmware", run_name="__main__", alter_sys=True)
+    return 0
 
 
 if __name__ == "__main__":

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from pi_firmware.battery.cell import Array, Cell, Polarization
+from pi_firmware.battery.cell import Cell, Polarization
 
 _REST_SIGMA_V = 0.025  # of the curve, from cell to cell
 _CORRELATION_S = 300.0
@@ -35,7 +33,7 @@ class ChargeFilter:
         self.cell = cell
         self.charge: float | None = None
         self.resistance = 1.0
-        self._covariance: Array = np.zeros((2, 2))
+        self._variance, self._covariance, self._of_resistance = 0.0, 0.0, 0.0
         self._polarization = Polarization(cell)
         self._last_s = 0.0
         self._last_a = 0.0
@@ -44,7 +42,7 @@ class ChargeFilter:
     @property
     def sigma(self) -> float | None:
         """The charge's standard deviation."""
-        return None if self.charge is None else math.sqrt(self._covariance[0, 0])
+        return None if self.charge is None else math.sqrt(self._variance)
 
     def update(self, now_s: float, voltage: float, discharge_a: float) -> float:
         """The state of charge after a reading; `now_s` is of a clock that never steps.
@@ -60,21 +58,24 @@ class ChargeFilter:
         mean_a = (self._last_a + discharge_a) / 2
         counted = mean_a * dt_s / 3600 / self.cell.capacity_ah
         charge = _inside(self.charge - counted)
-        covariance = self._covariance.copy()
-        covariance[0, 0] += _COUNT_SIGMA**2 * abs(counted)
+        variance = self._variance + _COUNT_SIGMA**2 * abs(counted)
         self._polarization.step(charge, mean_a, dt_s)
-        across_v = float(self.cell.series_ohm(charge)) * discharge_a + self._polarization.total_v
-        innovation = voltage - (float(self.cell.rest_v(charge)) - self.resistance * across_v)
+        across_v = self.cell.series_ohm(charge) * discharge_a + self._polarization.total_v
+        innovation = voltage - (self.cell.rest_v(charge) - self.resistance * across_v)
         # Next to empty the resistances rise, too: the load's part falls with the charge.
-        steep = float(self.cell.total_ohm(charge + 1e-3) - self.cell.total_ohm(charge)) / 1e-3
+        steep = (self.cell.total_ohm(charge + 1e-3) - self.cell.total_ohm(charge)) / 1e-3
         slope = self.cell.slope_v(charge) - self.resistance * steep * discharge_a
-        row = np.array([slope, -across_v])
         noise = _REST_SIGMA_V**2 * max(_CORRELATION_S / dt_s, 1.0)
-        gain = covariance @ row / (row @ covariance @ row + noise)
-        self.charge = _inside(charge + float(gain[0]) * innovation)
-        self.resistance = min(max(self.resistance + float(gain[1]) * innovation, 0.3), 3.0)
-        covariance = covariance - np.outer(gain, row @ covariance)
-        self._covariance = (covariance + covariance.T) / 2
+        # The voltage's covariance with either state, and what share of the surprise each takes.
+        with_charge = slope * variance - across_v * self._covariance
+        with_resistance = slope * self._covariance - across_v * self._of_resistance
+        seen = slope * with_charge - across_v * with_resistance + noise
+        of_charge, of_resistance = with_charge / seen, with_resistance / seen
+        self.charge = _inside(charge + of_charge * innovation)
+        self.resistance = min(max(self.resistance + of_resistance * innovation, 0.3), 3.0)
+        self._variance = variance - of_charge * with_charge
+        self._covariance -= of_charge * with_resistance
+        self._of_resistance -= of_resistance * with_resistance
         share = 1 - math.exp(-dt_s / _POWER_S)
         self._power_w += share * (voltage * discharge_a - self._power_w)
         self._last_s, self._last_a = now_s, discharge_a
@@ -97,14 +98,14 @@ class ChargeFilter:
         charge, across_v = self.cell.charge_at(voltage), 0.0
         for _ in range(8):
             self._polarization.settle(charge, discharge_a if loaded else 0.0)
-            across_v = float(self.cell.series_ohm(charge)) * discharge_a
+            across_v = self.cell.series_ohm(charge) * discharge_a
             across_v += self._polarization.total_v
             charge = self.cell.charge_at(voltage + across_v)
         slope = self.cell.slope_v(charge)
         with_resistance = across_v / slope  # the same resistance is behind both errors
-        variance = (_REST_SIGMA_V / slope) ** 2 + (with_resistance * _RESISTANCE_SIGMA) ** 2
-        both = with_resistance * _RESISTANCE_SIGMA**2
-        self._covariance = np.array([[variance, both], [both, _RESISTANCE_SIGMA**2]])
+        self._of_resistance = _RESISTANCE_SIGMA**2
+        self._covariance = with_resistance * self._of_resistance
+        self._variance = (_REST_SIGMA_V / slope) ** 2 + with_resistance * self._covariance
         self.charge, self._power_w = charge, voltage * discharge_a
         self._last_s, self._last_a = now_s, discharge_a
         return charge

@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
+from bisect import bisect
 from collections.abc import Callable
-
-import numpy as np
 
 from pi_firmware import uri
 from pi_firmware.battery import chips
@@ -42,9 +41,11 @@ class FakeGauge:
         if self._start_ns is None:
             self._start_ns = time_ns
         elapsed_s = (time_ns - self._start_ns) / 1e9
-        left = float(np.clip(self._start - elapsed_s / self._full_s, 0.0, 1.0))
+        left = min(max(self._start - elapsed_s / self._full_s, 0.0), 1.0)
         current_a = -self._capacity_ah * 3600 / self._full_s if left > 0 else 0.0
-        rest_v = float(np.interp(left, _CHARGE, _VOLTAGE_V))
+        at = min(bisect(_CHARGE, left), len(_CHARGE) - 1)
+        beyond = (left - _CHARGE[at - 1]) / (_CHARGE[at] - _CHARGE[at - 1])
+        rest_v = _VOLTAGE_V[at - 1] + beyond * (_VOLTAGE_V[at] - _VOLTAGE_V[at - 1])
         return Battery(
             time_ns=time_ns,
             voltage=round(rest_v + current_a * _RESISTANCE_OHM, 4),

@@ -30,10 +30,8 @@ class SimulatedCell:
     @property
     def voltage(self) -> float:
         """At the terminals, under the load."""
-        series_v = float(self.cell.series_ohm(self.charge)) * self.discharge_a
-        return max(
-            float(self.cell.rest_v(self.charge)) - series_v - self._polarization.total_v, 0.0
-        )
+        series_v = self.cell.series_ohm(self.charge) * self.discharge_a
+        return max(self.cell.rest_v(self.charge) - series_v - self._polarization.total_v, 0.0)
 
     def draw(self, discharge_a: float, dt_s: float) -> None:
         """Lets a constant current flow for `dt_s`; an empty cell gives none."""

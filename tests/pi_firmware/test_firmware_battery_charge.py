@@ -5,7 +5,6 @@ capacity, resistance, curve, temperature and gauge, and not how well the model f
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,13 +26,13 @@ class OtherCell(Cell):
     offset_v: float = 0.0
     factor: float = 1.0
 
-    def rest_v(self, charge: Any) -> Any:
+    def rest_v(self, charge: float) -> float:
         return super().rest_v(charge) + self.offset_v
 
-    def series_ohm(self, charge: Any) -> Any:
+    def series_ohm(self, charge: float) -> float:
         return super().series_ohm(charge) * self.factor
 
-    def polarization_ohm(self, charge: Any) -> tuple[Any, Any]:
+    def polarization_ohm(self, charge: float) -> tuple[float, float]:
         fast, slow = super().polarization_ohm(charge)
         return fast * self.factor, slow * self.factor
 
@@ -110,24 +109,24 @@ def test_a_start_half_empty_is_right_within_five_percent_when_warm() -> None:
 def test_the_curve_is_the_papers_and_reaches_the_charging_voltage() -> None:
     paper = Cell(0.85, full_v=3.685 + 0.2156 - 0.1178 + 0.3201)  # equation 2 at 1
     assert paper.stretch == pytest.approx(1.0, abs=1e-3)
-    assert float(paper.rest_v(0.5)) == pytest.approx(3.80336, abs=1e-3)
-    assert float(Cell(0.6).rest_v(1.0)) == pytest.approx(4.2, abs=1e-3)
-    grid = np.linspace(0, 1, 1001)
-    assert np.all(np.diff(Cell(0.6).rest_v(grid)) > 0)
+    assert paper.rest_v(0.5) == pytest.approx(3.80336, abs=1e-3)
+    assert Cell(0.6).rest_v(1.0) == pytest.approx(4.2, abs=1e-3)
+    risen = [Cell(0.6).rest_v(charge) for charge in np.linspace(0, 1, 1001)]
+    assert np.all(np.diff(risen) > 0)
     for share in (0.02, 0.3, 0.7, 0.99):
         cell = Cell(0.6)
-        assert cell.charge_at(float(cell.rest_v(share))) == pytest.approx(share, abs=1e-3)
-        numeric = float(cell.rest_v(share + 1e-5) - cell.rest_v(share - 1e-5)) / 2e-5
+        assert cell.charge_at(cell.rest_v(share)) == pytest.approx(share, abs=1e-3)
+        numeric = (cell.rest_v(share + 1e-5) - cell.rest_v(share - 1e-5)) / 2e-5
         assert cell.slope_v(share) == pytest.approx(numeric, rel=1e-4)
 
 
 def test_cold_cells_have_more_resistance_and_large_ones_less() -> None:
-    room = float(Cell(0.85, temperature_c=25.0).series_ohm(0.8))
+    room = Cell(0.85, temperature_c=25.0).series_ohm(0.8)
     assert room == pytest.approx(0.07446, rel=1e-3)
-    assert float(Cell(0.85, temperature_c=5.0).series_ohm(0.8)) > 1.5 * room
-    assert float(Cell(1.7, temperature_c=25.0).series_ohm(0.8)) == pytest.approx(room / 2)
+    assert Cell(0.85, temperature_c=5.0).series_ohm(0.8) > 1.5 * room
+    assert Cell(1.7, temperature_c=25.0).series_ohm(0.8) == pytest.approx(room / 2)
     measured = Cell(1.7, resistance_ohm=0.2, temperature_c=25.0)
-    assert float(measured.series_ohm(0.8)) == pytest.approx(0.2, rel=1e-3)
+    assert measured.series_ohm(0.8) == pytest.approx(0.2, rel=1e-3)
 
 
 def test_polarization_steps_of_any_length_end_alike() -> None:
@@ -144,7 +143,7 @@ def test_polarization_steps_of_any_length_end_alike() -> None:
 
 def test_time_left_at_a_light_load_is_the_charge_over_the_current() -> None:
     cell = Cell(0.6)
-    mean_v = float(np.mean(cell.rest_v(np.linspace(0, 0.5, 1001))))
+    mean_v = float(np.mean([cell.rest_v(charge) for charge in np.linspace(0, 0.5, 1001)]))
     power_w = 0.01 * mean_v
     assert cell.time_left_s(0.5, power_w, 2.5) == pytest.approx(0.5 * 0.6 / 0.01 * 3600, rel=0.02)
     assert cell.time_left_s(0.5, 1000.0, 3.0) == 0.0

@@ -139,6 +139,15 @@ def test_recordings_are_made_from_the_start_in_their_folder(tmp_path: Path) -> N
     assert len(kept & {frame.data for frame in flown.frames}) > 10
 
 
+def test_a_recording_from_the_start_waits_for_the_first_frame(tmp_path: Path) -> None:
+    """What it is written with takes a Pi Zero seconds to load, which the picture would wait for."""
+    folder = tmp_path / "card"
+    gated = {"gate.min_entropy_bits": 8.0, "gate.heartbeat_s": 0.0}
+    recording = {"recording.folder": str(folder), "recording.at_start": True}
+    flown = fly({"camera.uri": "test:?duration_s=1", **gated, **recording})
+    assert flown.frames == [] and not folder.exists()
+
+
 def test_telemetry_that_is_off_listens_nowhere(recordings: dict[str, str]) -> None:
     settings = {"camera.uri": recordings["dusk"], "telemetry.connect": []}
     settings |= {"telemetry.listen": ["tcp/127.0.0.1:0"]}

@@ -41,6 +41,16 @@ def test_check_reads_the_shipped_file_and_opens_nothing() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_check_does_without_what_only_pictures_need() -> None:
+    """A card checks what it is told before its first start: numpy would be a third of that."""
+    code = "import sys, pi_firmware.__main__ as program; sys.argv[1:] = ['--check']\n"
+    code += "assert program.main() == 0; print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "configuration is good\nFalse\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
