@@ -197,7 +197,7 @@ class Motion:
             return None
         shift = np.median(found[ok] - self._start[ok], axis=0)
         self._guess = np.where(ok[:, None], found, self._start + shift).astype(np.float32)
-        parallax, turn = np.degrees(np.percentile(left, _PARALLAX_QUANTILE)), np.degrees(turn)
+        parallax, turn = np.degrees(parallax_of(left)), np.degrees(turn)
         lost = 0.0 if blurred else 1 - count / len(ok)
         return float(max(parallax / s.parallax_deg, turn / s.turn_deg, lost / s.lost))
 
@@ -297,3 +297,8 @@ def best_rotation(before: F64, after: F64) -> tuple[float, F64]:
         weight = 1 / (1 + (left / max(2 * float(np.median(left)), 1e-9)) ** 2)
     turn = np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0))
     return float(turn), 2 * np.arcsin(np.clip(left / 2, 0.0, 1.0))
+
+
+def parallax_of(left: F64) -> float:
+    """The parallax between two pictures, of what `best_rotation` leaves of their bearings."""
+    return float(np.percentile(left, _PARALLAX_QUANTILE))

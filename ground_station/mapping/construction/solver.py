@@ -34,6 +34,11 @@ from ground_station.progress import Progress
 NEARLY_ALL = 0.95
 """Share of the images that a model must have for no other method to be asked."""
 
+_NO_START = (
+    "structure from motion found no pair of images to start from: the camera must move sideways "
+    "between images that see the same things"
+)
+
 Pairs = Mapping[Pair, TwoView]
 Models = list[colmap.Reconstruction]
 
@@ -41,7 +46,8 @@ Models = list[colmap.Reconstruction]
 class Solver:
     """The solved models of one build; each attempt keeps its files in a folder of its own.
 
-    `pairs` are the verified ones, `links` those that are the camera's way.
+    `pairs` are the verified ones, `links` those that are the camera's way. Raises `MapError` where
+    the camera did not move in any of them.
     """
 
     def __init__(
@@ -54,6 +60,8 @@ class Solver:
         work: Path,
     ) -> None:
         self._images, self._camera, self._sfm, self._work = images, camera, settings.sfm, work
+        if not chains.moved(pairs, images.pinhole_px, camera.matrix, settings.match.error_px):
+            raise MapError(_NO_START)
         self.names = images.names
         self._counts = [len(pixels) for pixels in images.pinhole_px]
         self._sequence = sequences(images.names, images.time_ns)
@@ -107,10 +115,7 @@ class Solver:
                 ]
             )
         if not models:
-            raise MapError(
-                "structure from motion found no pair of images to start from: the camera must move "
-                "sideways between images that see the same things"
-            )
+            raise MapError(_NO_START)
         return self._joined(mapping, models, pairs if joining is None else joining)
 
     def trusted(self) -> tuple[Models, Pairs]:

@@ -15,6 +15,7 @@ from ground_station.mapping.construction.placing import contradictions
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import global_mapping
 from ground_station.mapping.sfm.incremental import Incremental
+from ground_station.mapping.sfm.two_view import TwoView
 
 SHIPPED = MappingSettings()
 
@@ -59,6 +60,36 @@ def test_auto_falls_back_where_the_global_method_leaves_images_out(corridor, tmp
             "auto",
             tmp_path / "nothing",
         )
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 3.0])
+def test_a_camera_that_stays_in_its_place_is_refused_before_colmap_tries(
+    corridor, tmp_path, monkeypatch, turn_deg
+):
+    rng = np.random.default_rng(0)
+    matrix = corridor.camera.matrix
+    rays = np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)), np.ones(300)])
+    pictures = []
+    for turn in np.radians(turn_deg) * np.arange(5):
+        c, s = np.cos(turn), np.sin(turn)
+        seen = rays @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ matrix.T
+        pictures.append(seen[:, :2] / seen[:, 2:] + rng.normal(0, 0.4, (300, 2)))
+    same = np.repeat(np.arange(300, dtype=np.int32)[:, None], 2, axis=1)
+    view = TwoView(same, np.eye(3), None, degenerate=True)
+    pairs = {(i, j): view for i in range(5) for j in range(i + 1, 5)}
+    images = dataclasses.replace(
+        corridor.images,
+        names=corridor.images.names[:5],
+        time_ns=corridor.images.time_ns[:5],
+        pinhole_px=pictures,
+    )
+
+    def never(*_, **__):
+        raise AssertionError("COLMAP tried")
+
+    monkeypatch.setattr(Incremental, "run", never)
+    with pytest.raises(structure.MapError, match="the camera must move sideways"):
+        structure.reconstruct(images, pairs, corridor.camera, SHIPPED, 1, tmp_path)
 
 
 def test_a_bent_end_is_taken_from_the_method_that_starts_nowhere(corridor, tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ground_station.arrays import F64, I32, I64, Bools
+from ground_station.mapping.construction.motion import best_rotation, parallax_of
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.sfm.two_view import TwoView
@@ -86,6 +87,25 @@ def in_front(
     near = {(i, j): view for (i, j), view in pairs.items() if j - i <= REACH}
     items = ((view, pixels[i], pixels[j], camera_matrix) for (i, j), view in near.items())
     return dict(zip(near, Threads(threads).map(_in_front, items), strict=True))
+
+
+def moved(
+    pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64, error_px: float
+) -> bool:
+    """Whether the camera moved between the images of any pair: no turn explains what it sees.
+
+    Where it stood still or turned, COLMAP would try each pair at each of its demands.
+    """
+    inverse = np.linalg.inv(camera_matrix).T
+
+    def parallax_px(pair: Pair) -> float:
+        bearings = []
+        for image, matched in zip(pair, pairs[pair].matches.T, strict=True):
+            rays = np.column_stack([pixels[image][matched], np.ones(len(matched))]) @ inverse
+            bearings.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        return parallax_of(best_rotation(*bearings)[1]) * float(camera_matrix[0, 0])
+
+    return any(parallax_px(pair) > error_px for pair in pairs)
 
 
 def _in_front(view: TwoView, first_px: F64, second_px: F64, camera_matrix: F64) -> TwoView:
