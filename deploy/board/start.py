@@ -41,19 +41,11 @@ def _count(path: Path, of: str, before: int) -> bool:
     return True
 
 
-def environment(at: Places, chosen: choose.Choice, given: dict[str, str]) -> dict[str, str]:
-    """The firmware's environment: where its modules are, and which release it is."""
-    folder = at.folder(chosen.name)
-    release = places.read(folder / choose.RELEASE) or {}
+def told(at: Places, chosen: choose.Choice) -> dict[str, str]:
+    """What the firmware is told of its release."""
+    release = places.read(at.folder(chosen.name) / choose.RELEASE) or {}
     version = chosen.name or str(release.get("version", ""))
-    told = {"version": version, "how": chosen.how, "reason": chosen.reason}
-    return {
-        **given,
-        "PYTHONPATH": os.pathsep.join((str(folder), str(folder / "site"))),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTHONSAFEPATH": "1",  # nothing is imported from where it happens to be started
-        ENVIRONMENT: json.dumps(told),
-    }
+    return {"version": version, "how": chosen.how, "reason": chosen.reason}
 
 
 def main(arguments: list[str]) -> int:
@@ -64,18 +56,18 @@ def main(arguments: list[str]) -> int:
     at = Places(root)
     state = choose.read_state(at)
     chosen = choice(at, state)
-    variables = environment(at, chosen, dict(os.environ))
-    told = json.loads(variables[ENVIRONMENT])
+    release = told(at, chosen)
     try:
         trial = state.trial["id"] if state.on_trial and state.trial is not None else ""
-        running = {**told, "name": chosen.name, "trial": trial}
+        running = {**release, "name": chosen.name, "trial": trial}
         places.write(at.running, running, durable=False)
     except OSError as error:  # the watcher knows less, the firmware flies all the same
         print(f"start: {at.running}: {error.strerror}", file=sys.stderr)
-    said = f"start: release {told['version'] or '?'} ({chosen.how})"
+    said = f"start: release {release['version'] or '?'} ({chosen.how})"
     print(f"{said}: {chosen.reason}" if chosen.reason else said, flush=True)
-    os.environ.update(variables)
-    sys.path[:0] = variables["PYTHONPATH"].split(os.pathsep)
+    os.environ[ENVIRONMENT] = json.dumps(release)
+    folder = at.folder(chosen.name)
+    sys.path[:0] = [str(folder), str(folder / "site")]
     sys.dont_write_bytecode = True
     sys.argv = ["pi_firmware", "--config", str(at.config), *arguments]
     runpy.run_module("pi_firmware", run_name="__main__", alter_sys=True)

@@ -162,7 +162,7 @@ def test_start_becomes_the_firmware_of_the_chosen_release(card: Card) -> None:
     program = b"""
 import json, os, sys
 import pi_firmware, library
-told = {name: os.environ.get(name) for name in ("BLIMP_RELEASE", "PYTHONDONTWRITEBYTECODE")}
+told = json.loads(os.environ["BLIMP_RELEASE"]), sys.dont_write_bytecode
 print(json.dumps([pi_firmware.__version__, library.NAME, os.getpid(), sys.argv[1:], told]))
 """
     more = {"pi_firmware/__main__.py": program, "site/library.py": b"NAME = 'of the update'\n"}
@@ -180,18 +180,16 @@ print(json.dumps([pi_firmware.__version__, library.NAME, os.getpid(), sys.argv[1
     assert first == f"start: release {NEW} (update)"
     assert (version, library, pid) == (NEW, "of the update", process.pid)
     assert arguments == ["--config", str(card.at.config), "--set", "a.b=1"]
-    assert json.loads(told["BLIMP_RELEASE"]) == {"version": NEW, "how": "update", "reason": ""}
-    assert told["PYTHONDONTWRITEBYTECODE"] == "1"
+    assert told == [{"version": NEW, "how": "update", "reason": ""}, True]
     running: dict[str, Any] = json.loads(card.at.running.read_text())
     assert (running["name"], running["version"], running["how"]) == (NEW, NEW, "update")
     assert running["trial"] == json.loads(card.at.trial.read_text())["id"]
 
 
 def test_start_tells_the_version_of_the_images_release(card: Card) -> None:
-    variables = start.environment(card.at, card.choice(), {"A": "b"})
-    assert json.loads(variables["BLIMP_RELEASE"])["version"] == NOW and variables["A"] == "b"
+    assert start.told(card.at, card.choice())["version"] == NOW
     (card.at.factory / "release.json").unlink()
-    told = json.loads(start.environment(card.at, card.choice(), {})["BLIMP_RELEASE"])
+    told = start.told(card.at, card.choice())
     assert told == {"version": "", "how": "factory", "reason": ""}
 
 
