@@ -40,7 +40,7 @@ VCELL_BIT_V = 78.125e-6
 OF_FIRMWARE = """
 for process in /proc/[0-9]*; do
   case $(tr '\\0' ' ' 2>/dev/null <$process/cmdline) in
-    "/usr/bin/python3 -m pi_firmware "*) WHAT ;;
+    "/usr/bin/python3 -P -m deploy.board.start "*) WHAT ;;
   esac
 done
 """
