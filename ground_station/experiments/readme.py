@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import InputError
-from ground_station.experiments import tables
+from ground_station.experiments import declaration, tables
 from ground_station.experiments.report import PRINTED
 from ground_station.experiments.summary import reasons
 from ground_station.files import finite, write_text
@@ -103,6 +103,8 @@ def _with_others(kept: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]
         return kept
     experiments = [measured.get(e["name"], e) for e in before["experiments"]]
     experiments += [e for name, e in measured.items() if name not in names]
+    place = {e.name: k for k, e in enumerate(declaration.load().experiments)}
+    experiments.sort(key=lambda e: place.get(e["name"], len(place)))
     claims = {claim["text"]: claim for claim in before["claims"] + kept["claims"]}
     return kept | {
         "worse": reasons(experiments),
