@@ -103,8 +103,9 @@ def _with_others(kept: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]
         return kept
     experiments = [measured.get(e["name"], e) for e in before["experiments"]]
     experiments += [e for name, e in measured.items() if name not in names]
-    place = {e.name: k for k, e in enumerate(declaration.load().experiments)}
-    experiments.sort(key=lambda e: place.get(e["name"], len(place)))
+    declared = [e.name for e in declaration.load().experiments]
+    if all(e["name"] in declared for e in experiments):  # else of a file of one's own
+        experiments.sort(key=lambda e: declared.index(e["name"]))
     claims = {claim["text"]: claim for claim in before["claims"] + kept["claims"]}
     return kept | {
         "worse": reasons(experiments),
