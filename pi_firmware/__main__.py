@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import signal
 import sys
 import threading
@@ -46,7 +47,6 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
         link.load_key(loaded.telemetry.certificates if loaded.link.encrypted else "")
         print("configuration is good")
         return
-    from pi_firmware.health import memory
     from pi_firmware.payload import Payload
 
     payload = Payload(loaded)
@@ -59,7 +59,9 @@ def _run(arguments: argparse.Namespace, stop: threading.Event) -> None:
             sep="\n",
             flush=True,
         )
-        memory.freeze()
+        # What is loaded and open now stays: later collections leave it out, and become short.
+        gc.collect()
+        gc.freeze()
         payload.run(stop)
         if payload.cut_reason:
             notice = (

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pi_firmware import encoder, gstreamer, measuring
-from pi_firmware.gate import Decision, Gate, Measure, Verdict, measure
+from pi_firmware import encoder, gstreamer
+from pi_firmware.gate import Decision, Gate, Measure, Verdict, attach_luma, luma_branch, measure
 from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
 from pi_firmware.wire import annexb, sei
@@ -162,13 +162,13 @@ class Media:
             settings.encoder, settings.camera, source.rate_hz, dmabuf=source.dmabuf
         )
         pipeline = gstreamer.launch(
-            f"{source.elements()} ! {measuring.description(settings.camera)} ! {encoding} "
+            f"{source.elements()} ! {luma_branch(settings.camera)} ! {encoding} "
             "! video/x-h264,stream-format=byte-stream,alignment=au "
             "! appsink name=encoded emit-signals=true sync=false async=false"
         )
         element = pipeline.get_by_name("encoder")
         self.encoder = encoder.Encoder(element, settings.encoder, source.rate_hz)
-        luma = measuring.attach(pipeline, settings.camera, self._on_luma)
+        luma = attach_luma(pipeline, settings.camera, self._on_luma)
         pad, sink = element.get_static_pad("sink"), pipeline.get_by_name("encoded")
         probe = pad.add_probe(self._gst.PadProbeType.BUFFER, self._on_frame)
         handler = sink.connect("new-sample", self._on_encoded)

@@ -8,20 +8,20 @@ import sys
 import threading
 import time
 
-from pi_firmware import encoder, link, orders
+from pi_firmware import encoder, link
 from pi_firmware.autopilot import open_autopilot
 from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.battery.chip import Gauge
 from pi_firmware.capture import Capture, UnrecoverableError
-from pi_firmware.commands import Commands
+from pi_firmware.commands import Commands, actions
+from pi_firmware.gate import Decision, Verdict
 from pi_firmware.ground import Ground
 from pi_firmware.media import Counters, Unit
 from pi_firmware.recording import Recorder
-from pi_firmware.reporting import Reporter
 from pi_firmware.settings import Settings
 from pi_firmware.supervision import AUTOPILOT, BATTERY, Supervision
 from pi_firmware.telemetry import Telemetry
-from pi_firmware.wire import messages
+from pi_firmware.wire import messages, sei
 from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 
 _FLUSH_LIMIT_S = 10.0
@@ -29,6 +29,50 @@ _COMMAND_LIMIT_S = 30.0
 _LOOK_S = 1.0
 _RENEWED_S = 10.0
 """A session that was opened anew hears the ground station within this."""
+
+
+class Reporter:
+    """Turns verdicts and events into messages with the counters of their moment.
+
+    Safe from any thread. `counters` are set once there are some.
+    """
+
+    def __init__(self, settings: Settings, ssrc: int, telemetry: Telemetry) -> None:
+        self.counters = Counters()
+        self._settings = settings
+        self._ssrc = ssrc
+        self._telemetry = telemetry
+
+    def gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
+        """The gate's decision on a frame."""
+        self._telemetry.publish(
+            messages.Gate(
+                time_ns=time.time_ns(),
+                capture_ns=info.time_ns,
+                sequence=info.sequence,
+                passed=verdict.decision is not Decision.GATED,
+                heartbeat=info.heartbeat,
+                entropy_bits=info.entropy_bits,
+                sharpness=info.sharpness,
+                ssrc=self._ssrc,
+                reason=verdict.reason,
+                difference=verdict.difference,
+                **vars(self.counters),
+            ),
+        )
+
+    def announce(self, name: str, text: str) -> None:
+        """An event, with the counters and the stream's properties."""
+        camera = self._settings.camera
+        values = {
+            "ssrc": self._ssrc,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            **vars(self.counters),
+        }
+        self._telemetry.publish(
+            messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values),
+        )
 
 
 class Payload:
@@ -90,7 +134,7 @@ class Payload:
             on_low=self._capture.limit_bitrate,
         )
         self._commands = Commands(
-            orders.table(
+            actions(
                 settings, self._capture, self._recorder, self._end, lambda: self._autopilot.armed
             ),
             lambda text: self._reporter.announce(messages.EVENT_COMMAND, text),

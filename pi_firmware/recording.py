@@ -16,8 +16,8 @@ from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire import annexb, messages, sei
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recorder import recorder, run
-from pi_firmware.wire.recorder.durable import DurableFile, OpenFile
-from pi_firmware.wire.recorder.queue import Unit
+from pi_firmware.wire.recorder.file import DurableFile, OpenFile
+from pi_firmware.wire.recorder.run import Unit
 
 TELEMETRY_ROOT = "/blimp"
 _CLOCK_STEP_S = 5.0

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import sys
+import threading
 import time
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pi_firmware.autopilot import Autopilot
 from pi_firmware.capture import Capture
 from pi_firmware.ground import IDR_GAP_S, Ground
-from pi_firmware.health import memory
 from pi_firmware.health.board import Board
 from pi_firmware.health.restarts import Restarts
-from pi_firmware.health.tasks import PeriodicThread, Table, Task
 from pi_firmware.health.wifi import Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.release import of_environment
@@ -26,13 +27,116 @@ from pi_firmware.wire.systemd import Notifier
 
 VIDEO, BATTERY, AUTOPILOT, HEALTH, CLOCK = "video", "battery", "autopilot", "health", "clock"
 MEMORY = "memory"
+_REPEAT_S = 60.0  # the same fault is told again after this long, with its count
+_JOIN_LIMIT_S = 2.0
 _FEED_S = 1.0
 _CLOCK_S = 10.0
 _MEMORY_S = 60.0
+"""CPython puts freed tuples by for later use, up to 2,000 of each length. One that is made longer
+than needed and then cut, as `tuple(generator)` and many calls into C do, is taken from one list and
+put into another, which fills and is of no use to anybody. Only a full collection empties these
+lists, and by itself none came in five minutes of a flight: it waits until what is new is a quarter
+of all there is, and a payload in flight makes next to no garbage that has cycles."""
 _SILENCE_S = 5.0  # before that a ground station may only be slow
 TELEMETRY_UP, TELEMETRY_DOWN, ARMED = "telemetry up", "telemetry down", "autopilot armed"
 """What systemd's status line says; whoever brings or tries out a new release looks for it."""
 _GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task that beats about every `period_s` and is late after `watchdog_s` without a beat."""
+
+    name: str
+    period_s: float
+    watchdog_s: float
+
+
+class Table:
+    """When each task was last heard of. Safe from any thread.
+
+    A task is watched from its first beat, as it begins: one that this flight does without is never
+    late. An unknown name is a `KeyError`.
+    """
+
+    def __init__(self, tasks: Iterable[Task], clock: Callable[[], float] = time.monotonic) -> None:
+        self.tasks = {task.name: task for task in tasks}
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._heard: dict[str, float] = {}
+
+    def beat(self, name: str) -> None:
+        """The task begins, or has done its work once more."""
+        with self._lock:
+            self._heard[self.tasks[name].name] = self._clock()
+
+    def late(self) -> list[str]:
+        """Tasks that began and missed their watchdog since, in the table's order."""
+        with self._lock:
+            now, heard = self._clock(), self._heard
+            return [
+                name
+                for name, task in self.tasks.items()
+                if name in heard and now - heard[name] > task.watchdog_s
+            ]
+
+
+class PeriodicThread:
+    """Runs `call` each period of a task of the table, on a thread of its own.
+
+    A call that returns is a beat; one that raises is reported as one line and tried again at the
+    next period, so that a task that always fails becomes late. The same line is reported once a
+    minute at most. Periods that a long call has missed are not made up for.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        name: str,
+        call: Callable[[], object],
+        report: Callable[[str], object],
+    ) -> None:
+        self._table, self._task = table, table.tasks[name]
+        self._call, self._report = call, report
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._last_fault = ""
+        self._told_at = 0.0
+        self._unsaid = 0
+
+    def start(self) -> None:
+        """Starts the thread, whose first call is at once."""
+        self._table.beat(self._task.name)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread, waiting no longer than a call that hangs is worth."""
+        self._end.set()
+        self._thread.join(_JOIN_LIMIT_S)
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._end.is_set():
+            try:
+                self._call()
+            except Exception as error:  # whatever it is, a flight does not end for one task
+                self._fault(f"{self._task.name}: {type(error).__name__}: {error}")
+            else:
+                self._table.beat(self._task.name)
+            now = time.monotonic()
+            due = max(due + self._task.period_s, now)
+            self._end.wait(due - now)
+
+    def _fault(self, line: str) -> None:
+        line = " ".join(line.split())
+        now = time.monotonic()
+        if line == self._last_fault and now - self._told_at < _REPEAT_S:
+            self._unsaid += 1
+            return
+        again = f" ({self._unsaid} times more)" if line == self._last_fault and self._unsaid else ""
+        self._last_fault, self._told_at, self._unsaid = line, now, 0
+        with contextlib.suppress(Exception):  # telling of it may fail, too
+            self._report(line + again)
 
 
 def tasks(settings: Settings) -> tuple[Task, ...]:
@@ -121,7 +225,7 @@ class Supervision:
         self._threads = [
             PeriodicThread(self.table, HEALTH, publish, _complain),
             PeriodicThread(self.table, CLOCK, ask, _complain),
-            PeriodicThread(self.table, MEMORY, memory.collect, _complain),
+            PeriodicThread(self.table, MEMORY, gc.collect, _complain),
         ]
         self.table.beat(VIDEO)
         for thread in self._threads:

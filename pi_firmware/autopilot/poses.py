@@ -1,15 +1,169 @@
-"""Which poses the autopilot gets, and when it is told that the estimate was reset."""
+"""Which poses the autopilot gets, in its frames, and when it is told of a reset.
+
+Its frames: world north-east-down, body forward-right-down. Ours: world z up, camera x right, y
+down, z forward. The vehicle's pose is nTb; a covariance is of the right tangent wTc·exp(ξ),
+rotation before translation, and becomes MAVLink's: x, y, z, roll, pitch, yaw.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from pi_firmware.autopilot.frames import Mounting, VehiclePose, vehicle_pose
 from pi_firmware.settings import AutopilotSettings
 from pi_firmware.wire.messages import Pose
+
+Array = npt.NDArray[np.float64]
+
+# A camera that looks ahead: the body's forward is its z, right its x, down its y.
+_AHEAD = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+_UPRIGHT = np.diag([1.0, -1.0, -1.0])  # z up to z down, about the x axis
+_MIN_COSINE = 1e-2  # Euler angles have no covariance straight up or down
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the camera sits in the vehicle, and the map in the world.
+
+    `roll_deg`, `pitch_deg`, `yaw_deg` turn a camera that looks ahead, in the body's axes and in the
+    order yaw, pitch, roll: pitch -90 looks down. `position_m` is the camera's in the body's axes.
+    `heading_deg` is the compass heading of the map's x axis.
+    """
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    heading_deg: float = 0.0
+
+    @cached_property
+    def bRc(self) -> Array:
+        """The camera's axes in the body's, (3, 3)."""
+        angles = (math.radians(a) for a in (self.roll_deg, self.pitch_deg, self.yaw_deg))
+        return np.asarray(rotation(*angles) @ _AHEAD)
+
+    @cached_property
+    def nRw(self) -> Array:
+        """The map's axes in north-east-down, (3, 3)."""
+        return rotation(0.0, 0.0, math.radians(self.heading_deg)) @ _UPRIGHT
+
+
+@dataclass(frozen=True)
+class VehiclePose:
+    """North, east, down (m) and roll, pitch, yaw (rad) of the vehicle.
+
+    `covariance` (6, 6) is in this order; None where it is not known. `velocity_mps` and
+    `turn_radps` are the vehicle's, along and about its own axes; None where they are not known.
+    """
+
+    position_m: Array
+    angles_rad: Array
+    covariance: Array | None
+    velocity_mps: Array | None = None
+    turn_radps: Array | None = None
+
+    def quaternion_wxyz(self) -> list[float]:
+        """Of nTb, from its angles."""
+        c, s = np.cos(self.angles_rad / 2).tolist(), np.sin(self.angles_rad / 2).tolist()
+        return [
+            c[0] * c[1] * c[2] + s[0] * s[1] * s[2],
+            s[0] * c[1] * c[2] - c[0] * s[1] * s[2],
+            c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
+            c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
+        ]
+
+    def upper_triangle(self) -> list[float]:
+        """The 21 numbers of MAVLink, row by row; the first is NaN where it is not known."""
+        if self.covariance is None:
+            return [math.nan] + [0.0] * 20
+        return [float(value) for value in self.covariance[np.triu_indices(6)]]
+
+
+def vehicle_pose(
+    position_m: Sequence[float],
+    quaternion_xyzw: Sequence[float],
+    covariance: Array | None,
+    mounting: Mounting,
+    velocity_mps: Sequence[float] | None = None,
+    turn_radps: Sequence[float] | None = None,
+) -> VehiclePose:
+    """The vehicle's pose from the camera's: position and quaternion of wTc, its covariance (6, 6).
+
+    `velocity_mps` is the camera's in the map's axes, `turn_radps` its turn about its own. Raises
+    `ValueError` for a quaternion that is no rotation.
+    """
+    wRc = _matrix(quaternion_xyzw)
+    bRc, nRw = mounting.bRc, mounting.nRw
+    nRc = nRw @ wRc
+    nRb = nRc @ bRc.T
+    offset = np.array(mounting.position_m)
+    angles = _angles(nRb)
+    if covariance is not None:
+        roll, pitch = angles[0], angles[1]
+        cosine = math.copysign(max(abs(math.cos(pitch)), _MIN_COSINE), math.cos(pitch))
+        tangent = math.sin(pitch) / cosine
+        # What a small turn of the body, in its own axes, does to roll, pitch and yaw.
+        turn = np.array(
+            [
+                [1.0, math.sin(roll) * tangent, math.cos(roll) * tangent],
+                [0.0, math.cos(roll), -math.sin(roll)],
+                [0.0, math.sin(roll) / cosine, math.cos(roll) / cosine],
+            ]
+        )
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = nRb @ _skew(offset) @ bRc
+        jacobian[:3, 3:] = nRc
+        jacobian[3:, :3] = turn @ bRc
+        covariance = jacobian @ covariance @ jacobian.T
+    velocity = turned = None
+    if velocity_mps is not None and turn_radps is not None:
+        turned = bRc @ np.asarray(turn_radps, float)
+        velocity = nRb.T @ nRw @ np.asarray(velocity_mps, float) - np.cross(turned, offset)
+    position = nRw @ np.asarray(position_m, float) - nRb @ offset
+    return VehiclePose(position, angles, covariance, velocity, turned)
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Array:
+    """Rz(yaw)·Ry(pitch)·Rx(roll), (3, 3), angles in rad: the aerospace order."""
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _angles(aRb: Array) -> Array:
+    roll = math.atan2(aRb[2, 1], aRb[2, 2])
+    pitch = math.asin(min(max(-float(aRb[2, 0]), -1.0), 1.0))
+    return np.array([roll, pitch, math.atan2(aRb[1, 0], aRb[0, 0])])
+
+
+def _matrix(quaternion_xyzw: Sequence[float]) -> Array:
+    norm = math.sqrt(sum(q * q for q in quaternion_xyzw))
+    if not 0.99 < norm < 1.01:
+        raise ValueError(f"a quaternion of length {norm:g} is no rotation")
+    x, y, z, w = (q / norm for q in quaternion_xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
 
 _SENT_STATES = ("TRACKING", "DEGRADED")
 _FARTHEST_M = 10_000.0

@@ -10,9 +10,18 @@ from collections.abc import Callable
 
 from pi_firmware import uri
 from pi_firmware.battery import chips
-from pi_firmware.battery.bus import Counts, Smbus, WordBus
 from pi_firmware.battery.cell import Cell
-from pi_firmware.battery.chip import DISCHARGING, GOOD, LIPO, Chip, Gauge, Shunt
+from pi_firmware.battery.chip import (
+    DISCHARGING,
+    GOOD,
+    LIPO,
+    Chip,
+    Counts,
+    Gauge,
+    Shunt,
+    Smbus,
+    WordBus,
+)
 from pi_firmware.settings import BatterySettings
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery

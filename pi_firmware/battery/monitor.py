@@ -9,9 +9,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from pi_firmware.battery.bus import Counts, GaugeError
 from pi_firmware.battery.charge import ChargeFilter
-from pi_firmware.battery.chip import CHARGING, Gauge
+from pi_firmware.battery.chip import CHARGING, Counts, Gauge, GaugeError
 from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages

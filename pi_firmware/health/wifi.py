@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pi_firmware.health import programs, radio
-from pi_firmware.health.programs import ProgramError
+from pi_firmware.health import radio
+from pi_firmware.health.radio import ProgramError
 from pi_firmware.settings import WifiSettings
 from pi_firmware.wire import messages
 
@@ -51,7 +51,7 @@ class Wifi:
         announce: Callable[[str, str], None],
         *,
         root: Path = Path("/"),
-        run: radio.Run = programs.run,
+        run: radio.Run = radio.run,
         clock: Callable[[], float] = time.monotonic,
         off_s: float = _OFF_S,
     ) -> None:

@@ -13,9 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from pi_firmware.battery.bus import swap
 from pi_firmware.battery.cell import Cell, Polarization
-from pi_firmware.battery.chip import Shunt
+from pi_firmware.battery.chip import Shunt, swap
 from pi_firmware.battery.chips import ina, max17048
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire import annexb, sei
-from pi_firmware.wire.recorder.durable import DurableFile
+from pi_firmware.wire.recorder.file import DurableFile
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
 
 GOP = 10

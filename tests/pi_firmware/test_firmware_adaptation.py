@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import pytest
 
-from pi_firmware.adaptation import Adaptation
+from pi_firmware.encoder import Adaptation
 from pi_firmware.settings import EncoderSettings
-from pi_firmware.wire import messages
 from pi_firmware.wire.messages import LinkReport
 
 LIMITS = EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=300, gop_frames=15, min_gop_frames=10)
@@ -52,16 +50,6 @@ def test_an_older_grounds_long_round_trip_lowers_the_rate_without_any_loss() -> 
     # Where the queue is measured, a long way is none.
     far = LinkReport(1, "main", 5600, round_trip_s=0.9, received_kbps=2e3, queue_s=0.0, dropped=0.0)
     assert after(*[far] * 5).bitrate_kbps == 2000
-
-
-def test_an_older_grounds_report_is_read_without_what_it_does_not_measure() -> None:
-    new = json.loads(messages.encode(flows(800.0, 0.1, 0.02)))
-    assert new["schema"] == "blimp.link/1.5"
-    old = {name: value for name, value in new.items() if name not in ("queue_s", "dropped")}
-    del old["received_kbps"]
-    read = messages.decode(LinkReport, json.dumps(old | {"schema": "blimp.link/1.1"}).encode())
-    assert (read.received_kbps, read.queue_s, read.dropped) == (None, None, None)
-    assert messages.decode(LinkReport, json.dumps(new).encode()) == flows(800.0, 0.1, 0.02)
 
 
 @pytest.mark.parametrize(("lost", "frames"), [(0.0, 15), (0.02, 13), (0.05, 10), (0.9, 10)])

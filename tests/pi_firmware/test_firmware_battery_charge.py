@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import simulated_gauges as simulated
 
-from pi_firmware.battery.bus import Counts, WordBus
 from pi_firmware.battery.cell import Cell, Polarization
 from pi_firmware.battery.charge import ChargeFilter
+from pi_firmware.battery.chip import Counts, WordBus
 from pi_firmware.battery.chips import ina
 
 CAPACITY_AH = 0.6

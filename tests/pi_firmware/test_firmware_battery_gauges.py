@@ -7,7 +7,7 @@ import pytest
 import simulated_gauges as simulated
 
 from pi_firmware import battery
-from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed, swap
+from pi_firmware.battery.chip import Counts, GaugeError, WordBus, signed, swap
 from pi_firmware.battery.chips import ina, max17048
 from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings

@@ -1,17 +1,14 @@
 """What the payload says and does about its battery: alarms, silence, an orderly end."""
 
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
 import simulated_gauges as simulated
 
 from pi_firmware import battery
-from pi_firmware.battery.bus import Counts, GaugeError
+from pi_firmware.battery.chip import Counts, GaugeError
 from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings, EncoderSettings, load
 from pi_firmware.wire import messages
@@ -87,8 +84,8 @@ def test_a_sag_of_a_moment_is_no_alarm_and_a_lasting_one_ends_the_flight_above_3
 
 
 def test_shutdown_comes_before_3_2_volts_under_load() -> None:
-    from pi_firmware.battery.bus import WordBus
     from pi_firmware.battery.cell import Cell
+    from pi_firmware.battery.chip import WordBus
     from pi_firmware.battery.chips import ina
 
     for celsius in (5.0, 25.0):
@@ -249,29 +246,6 @@ def test_a_low_battery_holds_the_encoder_down_whatever_the_link_bears() -> None:
     for _ in range(50):
         encoder.link_report(good)  # and a good one asks for more
     assert encoder.bitrate_kbps == element.bitrate == 600
-
-
-def test_a_payload_with_an_empty_battery_ends_in_order_and_then_runs_the_command(
-    tmp_path: Path,
-) -> None:
-    mark = tmp_path / "ran"
-    command = [sys.executable, "-c", f"open({str(mark)!r}, 'w')"]
-    settings = {
-        "telemetry.enabled": "false",
-        "camera.uri": "test:?pattern=ball",
-        "battery.uri": "fake:?percentage=0.03",
-        "battery.period_s": "0.1",
-        "battery.shutdown_command": str(command),
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "pi_firmware"]
-        + [part for name, value in settings.items() for part in ("--set", f"{name}={value}")],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "frames: " in done.stdout and mark.exists()
 
 
 def test_thresholds_must_be_in_order() -> None:

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from pi_firmware.sources.pacing import Stepped
-from pi_firmware.sources.window import Window
+from pi_firmware.sources.base import Window
+from pi_firmware.sources.schemes.replay import Stepped
 from pi_firmware.wire.errors import StreamError
 
 LIMIT_S = 20.0

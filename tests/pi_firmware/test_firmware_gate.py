@@ -7,14 +7,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from skimage.measure import shannon_entropy
 
-from pi_firmware import gstreamer, measuring
+from pi_firmware import gstreamer
 from pi_firmware.gate import (
     Decision,
     Gate,
     Measure,
     Verdict,
+    attach_luma,
     block_means,
     gradient_energy,
+    luma_branch,
     measure,
 )
 from pi_firmware.settings import CameraSettings, GateSettings
@@ -153,10 +155,10 @@ def scaled(luma: np.ndarray, colorimetry: str = "bt601") -> np.ndarray:
         "appsrc name=source format=time "
         f"caps=video/x-raw,format=I420,width={width},height={height},framerate=30/1"
         f",colorimetry=(string){colorimetry} "
-        f"! {measuring.description(camera)} ! fakesink name=whole sync=false async=false"
+        f"! {luma_branch(camera)} ! fakesink name=whole sync=false async=false"
     )
     seen, order = [], []
-    measuring.attach(pipeline, camera, lambda low, ns: (seen.append(low), order.append("low")))
+    attach_luma(pipeline, camera, lambda low, ns: (seen.append(low), order.append("low")))
     whole = pipeline.get_by_name("whole").get_static_pad("sink")
     ok = gst.PadProbeReturn.OK
     whole.add_probe(gst.PadProbeType.BUFFER, lambda *_: (order.append("whole"), ok)[1])

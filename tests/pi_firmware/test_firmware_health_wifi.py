@@ -1,7 +1,6 @@
 """The radio's watch, with trees that stand for the kernel and small scripts for `iw` and `ip`."""
 
 import os
-import random
 import subprocess
 import sys
 import threading
@@ -11,8 +10,8 @@ from pathlib import Path
 import pytest
 from waiting import eventually
 
-from pi_firmware.health import programs, radio
-from pi_firmware.health.programs import ProgramError
+from pi_firmware.health import radio
+from pi_firmware.health.radio import ProgramError
 from pi_firmware.health.wifi import Wifi, WifiState
 from pi_firmware.settings import WifiSettings
 from pi_firmware.wire import messages
@@ -83,13 +82,10 @@ class Rig:
         self.wifi.look()
         return self.calls[before:]
 
-    def restarts(self, seconds: int) -> list[int]:
-        """The seconds, of so many rounds a second apart, at which the radio was restarted."""
-        found = []
-        for second in range(1, seconds + 1):
-            if "ip link set dev wlan0 down" in self.look():
-                found.append(second)
-        return found
+    def restarts(self, seconds: int, apart_s: int = 1) -> list[int]:
+        """The seconds, of rounds so far apart, at which the radio was restarted."""
+        rounds = range(apart_s, seconds + 1, apart_s)
+        return [second for second in rounds if "ip link set dev wlan0 down" in self.look(apart_s)]
 
 
 @pytest.fixture
@@ -156,7 +152,7 @@ def test_power_save_that_stays_on_although_iw_says_nothing_is_told(root: Path) -
 def test_a_silent_ground_restarts_the_radio_ever_more_seldom(root: Path) -> None:
     rig = Rig(root)
     rig.wifi.heard()
-    assert rig.restarts(2000) == [20, 60, 140, 300, 620, 1220, 1820]
+    assert rig.restarts(2000, 10) == [20, 60, 140, 300, 620, 1220, 1820]
     assert rig.wifi.state.restarts == 7
     assert [name for name, _ in rig.events] == [RESTARTED] * 7
     assert "silent for 20 s" in rig.events[0][1]
@@ -178,20 +174,20 @@ def test_a_restart_is_down_up_and_power_save_off_again(root: Path) -> None:
 
 def test_a_ground_that_is_heard_or_was_never_heard_restarts_nothing(root: Path) -> None:
     never = Rig(root)
-    assert never.restarts(2000) == []
+    assert never.restarts(2000, 10) == []
     steady = Rig(root)
-    for _ in range(100):
+    for _ in range(5):
         steady.wifi.heard()
         assert steady.restarts(19) == []
     off = Rig(root, restart_after_s=0.0)
     off.wifi.heard()
-    assert off.restarts(2000) == []
+    assert off.restarts(2000, 10) == []
 
 
 def test_a_silence_of_an_hour_stays_an_hour(root: Path) -> None:
     rig = Rig(root, restart_after_s=3600.0)
     rig.wifi.heard()
-    assert rig.restarts(8000) == [3600, 7200]
+    assert rig.restarts(8000, 100) == [3600, 7200]
 
 
 def test_a_restart_that_is_refused_is_told_once_and_not_counted(root: Path) -> None:
@@ -339,27 +335,6 @@ def test_a_signal_of_long_ago_is_not_told(root: Path) -> None:
     assert rig.wifi.state == WifiState("wlan0", None, None, 0)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_whatever_the_kernels_files_hold_nothing_raises(root: Path, seed: int) -> None:
-    chance = random.Random(seed)
-    rig = Rig(root)
-    rig.wifi.heard()
-    paths = [root / "proc/net/wireless", *(root / "sys/class/net/wlan0").glob("*[sx]")]
-    paths = [path for path in paths if path.is_file()]
-    assert len(paths) == 3
-    for _ in range(200):
-        path = chance.choice(paths)
-        piece = chance.choice([b"-", b"wlan0:", b"9" * 50, b"nan ", chance.randbytes(20)])
-        content = bytearray(path.read_bytes()[:2000])
-        at = chance.randrange(len(content) + 1)
-        content[at : at + chance.randrange(10)] = piece
-        path.write_bytes(content)
-        rig.look()
-        state = rig.wifi.state
-        assert state.signal_dBm is None or -150 <= state.signal_dBm < 0
-        assert state.quality is None or 0 <= state.quality <= 1
-
-
 # The programs themselves, found in PATH and run.
 
 
@@ -416,12 +391,12 @@ def test_the_programs_get_their_words_one_by_one(root: Path, scripts: Programs) 
 def test_a_program_that_refuses_is_one_line_with_its_reason(scripts: Programs) -> None:
     scripts.write("iw", "echo 'command failed: Operation not permitted (-1)' >&2\nexit 255\n")
     with pytest.raises(ProgramError, match=r"^iw dev x link: command failed: .* \(-1\)$"):
-        programs.run(["iw", "dev", "x", "link"])
+        radio.run(["iw", "dev", "x", "link"])
     scripts.write("iw", "exit 7\n")
     with pytest.raises(ProgramError, match=r"^iw: exit status 7$"):
-        programs.run(["iw"])
+        radio.run(["iw"])
     with pytest.raises(ProgramError, match="no-such-program is not installed"):
-        programs.run(["no-such-program", "x"])
+        radio.run(["no-such-program", "x"])
 
 
 def test_a_program_that_hangs_is_ended_with_its_children(scripts: Programs, tmp_path: Path) -> None:
@@ -429,7 +404,7 @@ def test_a_program_that_hangs_is_ended_with_its_children(scripts: Programs, tmp_
     scripts.write("ip", f"trap '' TERM\nsleep 1000 &\necho $! > {tmp_path / 'child'}\nwait\n")
     began = time.monotonic()
     with pytest.raises(ProgramError, match=r"^ip link: no end within 0\.5 s$"):
-        programs.run(["ip", "link"], limit_s=0.5)
+        radio.run(["ip", "link"], limit_s=0.5)
     assert time.monotonic() - began < LIMIT_S
     child = int((tmp_path / "child").read_text())
 
@@ -452,7 +427,7 @@ def test_an_empty_entry_of_path_is_not_the_folder_we_stand_in(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", "::/usr/bin")
     with pytest.raises(ProgramError, match="not installed"):
-        programs.run(["blimp-trap"])
+        radio.run(["blimp-trap"])
 
 
 def test_step_and_heard_never_wait_for_a_program_that_hangs(root: Path) -> None:
@@ -531,7 +506,7 @@ def test_an_announcement_that_fails_does_not_end_the_watch(root: Path) -> None:
 
 IN_A_NAMESPACE = """
 import fcntl, socket, struct
-from pi_firmware.health import programs, radio
+from pi_firmware.health import radio
 
 def up():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -540,11 +515,11 @@ def up():
 
 found = [up()]
 for to in ("up", "down", "up"):
-    radio.switch(programs.run, "lo", to)
+    radio.switch(radio.run, "lo", to)
     found.append(up())
 try:
-    radio.switch(programs.run, "wlan7", "up")
-except programs.ProgramError as error:
+    radio.switch(radio.run, "wlan7", "up")
+except radio.ProgramError as error:
     found.append(str(error))
 print(found)
 """

@@ -40,7 +40,7 @@ from pi_firmware.wire.messages import EVENT_RECORDING_ENDED, EVENT_RECORDING_STA
 from pi_firmware.wire.recorder import folder as folder_module
 from pi_firmware.wire.recorder import recorder as recorder_module
 from pi_firmware.wire.recorder import run
-from pi_firmware.wire.recorder.queue import Queue
+from pi_firmware.wire.recorder.run import Queue
 from pi_firmware.wire.recording import RecordingReader
 
 

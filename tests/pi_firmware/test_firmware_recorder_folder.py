@@ -20,7 +20,7 @@ from recorded import (
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire.errors import RecordingError
-from pi_firmware.wire.recorder.durable import DurableFile
+from pi_firmware.wire.recorder.file import DurableFile
 
 
 class Watched(DurableFile):

@@ -16,8 +16,7 @@ from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 from ground_station.service.intake.poses import PoseFeed, pose_message
 from ground_station.service.localizing.derive import Accounts, estimate_note
 from ground_station.stream.telemetry import TelemetryListener
-from pi_firmware.autopilot.frames import rotation
-from pi_firmware.autopilot.poses import PoseGate
+from pi_firmware.autopilot.poses import PoseGate, rotation
 from pi_firmware.settings import AutopilotSettings, TelemetrySettings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import messages

@@ -17,7 +17,7 @@ from impaired_link import Bottleneck, Impairment
 from ground_station.stream.arrivals import Arrivals
 from ground_station.stream.feedback import PERIOD_S, Urgency
 from ground_station.stream.rtp import Packet
-from pi_firmware.adaptation import Adaptation
+from pi_firmware.encoder import Adaptation
 from pi_firmware.settings import EncoderSettings
 from pi_firmware.wire.messages import LinkReport
 

@@ -23,7 +23,7 @@ from ground_station.service.bus_messages import EstimateMessage
 from pi_firmware.wire import annexb
 from pi_firmware.wire.recorder import run
 from pi_firmware.wire.recorder.file import RecordingFile
-from pi_firmware.wire.recorder.queue import Unit
+from pi_firmware.wire.recorder.run import Unit
 from pi_firmware.wire.recording import CALIBRATION_TOPIC, ESTIMATE_TOPIC
 
 ESTIMATE_STATE_TOPIC = "/estimate/state"

@@ -7,8 +7,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
-from pi_firmware.battery.chip import CHARGING, DISCHARGING, GOOD, LIPO, Chip, Shunt
+from pi_firmware.battery.chip import (
+    CHARGING,
+    DISCHARGING,
+    GOOD,
+    LIPO,
+    Chip,
+    Counts,
+    GaugeError,
+    Shunt,
+    WordBus,
+    signed,
+)
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 

@@ -5,8 +5,17 @@ Registers and units are those of Maxim's datasheet 19-6171, revision 7.
 
 from __future__ import annotations
 
-from pi_firmware.battery.bus import Counts, GaugeError, WordBus, signed
-from pi_firmware.battery.chip import CHARGING, DISCHARGING, GOOD, LIPO, Chip
+from pi_firmware.battery.chip import (
+    CHARGING,
+    DISCHARGING,
+    GOOD,
+    LIPO,
+    Chip,
+    Counts,
+    GaugeError,
+    WordBus,
+    signed,
+)
 from pi_firmware.wire.messages import Battery
 
 VCELL, SOC, VERSION, CONFIG, CRATE, STATUS = 0x02, 0x04, 0x08, 0x0C, 0x16, 0x1A

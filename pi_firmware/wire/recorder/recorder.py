@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import RecordingError
-from pi_firmware.wire.recorder.durable import DurableFile, OpenFile
+from pi_firmware.wire.recorder.file import DurableFile, OpenFile
 from pi_firmware.wire.recorder.folder import Limits
 from pi_firmware.wire.recorder.run import Run
 

@@ -9,7 +9,7 @@ from pieces import Picker, blocks, scratch
 
 from pi_firmware.health import radio
 from pi_firmware.health.board import Board
-from pi_firmware.health.programs import ProgramError
+from pi_firmware.health.radio import ProgramError
 
 _ROOT = scratch("board")
 _FILES = {

@@ -6,7 +6,7 @@ import emulator_gauge as gauge
 import pytest
 
 from deploy.errors import DeployError
-from pi_firmware.battery.bus import Counts, WordBus
+from pi_firmware.battery.chip import Counts, WordBus
 from pi_firmware.battery.chips.max17048 import Max17048
 
 
