@@ -26,7 +26,7 @@ def resized(build: Build, factor: float) -> Build:
     ))  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.sampled_from(BUILDS), st.floats(-20, 60))
 def test_the_smallest_envelope_leaves_what_was_required(name: str, required_g: float) -> None:
     build = shipped_builds().named(name)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import io
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
+from unittest import mock
 
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
+from pi_firmware import __main__ as program
+from pi_firmware.sources.schemes import test as test_cameras
 from pi_firmware.wire import annexb, sei
 
 LIMIT_S = 60.0
@@ -86,13 +94,41 @@ class Tap:
                 self.datagrams.append(datagram)
 
 
-def start(settings: Mapping[str, object]) -> subprocess.Popen[str]:
-    """The program as a process, with `--set` for each of the settings."""
-    command = [sys.executable, "-m", "pi_firmware"]
+def words(settings: Mapping[str, object]) -> list[str]:
+    """`--set` for each of the settings."""
+    given = []
     for key, value in settings.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        command += ["--set", f"{key}={text}"]
+        given += ["--set", f"{key}={text}"]
+    return given
+
+
+def start(settings: Mapping[str, object]) -> subprocess.Popen[str]:
+    """The program as a process."""
+    command = [sys.executable, "-m", "pi_firmware", *words(settings)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    """The program's `main` in this process, ended after a while: its status, and what it wrote."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    overdue = threading.Timer(LIMIT_S, os.kill, (os.getpid(), signal.SIGTERM))
+    test_cameras._first_opened_s.clear()  # their faults count from then, in each program
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with (
+            mock.patch.object(sys, "argv", ["pi_firmware", *arguments]),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            overdue.start()
+            status = program.main()
+    finally:
+        overdue.cancel()
+        gc.unfreeze()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return status, out.getvalue(), err.getvalue()
 
 
 @dataclass(frozen=True)
@@ -133,11 +169,5 @@ def fly(settings: Mapping[str, object]) -> Flown:
 def _flown(settings: Mapping[str, object]) -> Flown:
     with Tap() as tap:
         given = {"link.port": tap.port, "telemetry.enabled": False, **settings}
-        process = start(given)
-        try:
-            out, err = process.communicate(timeout=LIMIT_S)
-        finally:
-            process.kill()
-            process.wait()
-    assert "Traceback" not in err, err
-    return Flown(process.returncode, out, err, tap)
+        status, out, err = run(*words(given))
+    return Flown(status, out, err, tap)

@@ -20,9 +20,8 @@ from waiting import eventually
 
 from pi_firmware import autopilot
 from pi_firmware.settings import AutopilotSettings
-from pi_firmware.wire import keys, messages
+from pi_firmware.wire import messages
 from pi_firmware.wire.errors import SourceError
-from pi_firmware.wire.telemetry import open_session
 
 LEVEL = [-0.5, 0.5, -0.5, 0.5]  # the camera looks along the map's x axis
 LIMIT_S = 20.0
@@ -264,51 +263,6 @@ def test_a_telemetry_that_fails_does_not_stop_the_poses(vehicle: Vehicle) -> Non
 
     eventually(lambda: len(vehicle.estimates()) > 3, step=give)
     pilot.stop()
-
-
-def test_a_pose_from_the_ground_reaches_the_autopilot_through_the_program(
-    vehicle: Vehicle,
-) -> None:
-    settings = {
-        "camera.uri": "test:?pattern=ball",
-        "telemetry.connect": "[]",
-        "telemetry.listen": "['tcp/127.0.0.1:0']",
-        "autopilot.uri": f"serial:{vehicle.link}",
-        "autopilot.period_s": "0.1",
-        "autopilot.max_age_s": "5",
-    }
-    command = [sys.executable, "-m", "pi_firmware"]
-    command += [part for name, value in settings.items() for part in ("--set", f"{name}={value}")]
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert program.stdout is not None and "payload blimp-1" in program.stdout.readline()
-        endpoint = program.stdout.readline().split()[-1]
-        ground = open_session(connect=[endpoint])
-        states: list[messages.Autopilot] = []
-        ground.zenoh.declare_subscriber(
-            keys.key("blimp-1", keys.AUTOPILOT),
-            lambda s: states.append(messages.decode(messages.Autopilot, s.payload.to_bytes())),
-        )
-
-        def give() -> None:
-            made = messages.Pose(
-                time_ns=1, capture_ns=time.time_ns(), sequence=0, state="TRACKING",
-                position_m=[1.0, 2.0, 3.0], quaternion_xyzw=LEVEL,
-            )  # fmt: skip
-            ground.zenoh.put(keys.key("blimp-1", keys.POSE), b"no pose")
-            ground.zenoh.put(keys.key("blimp-1", keys.POSE), messages.encode(made))
-            vehicle.live()
-            vehicle.listen()
-
-        eventually(lambda: vehicle.estimates() and states and states[-1].connected, step=give)
-        assert vehicle.estimates()[-1].z == pytest.approx(-3)
-        ground.close()
-        program.terminate()
-        _, errors = program.communicate(timeout=LIMIT_S)
-        assert (program.returncode, errors) == (0, "")
-    finally:
-        program.kill()
-        program.communicate()
 
 
 @pytest.mark.parametrize(

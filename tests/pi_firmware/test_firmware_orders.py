@@ -33,7 +33,9 @@ def flown(flying: Flying, *settings: str) -> None:
     flying.state(lambda s: s.gate is not None and s.gate.sent > 5)
 
 
-def test_the_bit_rate_follows_within_its_bounds(flying: Flying) -> None:
+def test_the_bit_rate_stays_in_its_bounds_and_what_cannot_be_done_is_refused(
+    flying: Flying,
+) -> None:
     flown(flying, "encoder.min_bitrate_kbps=500", "supervision.period_s=0.2")
     assert ask(flying, "bitrate", kbps=800).values == {"kbps": 800}
     flying.state(lambda s: s.health is not None and s.health.bitrate_kbps == 800)
@@ -43,6 +45,15 @@ def test_the_bit_rate_follows_within_its_bounds(flying: Flying) -> None:
     assert not refused.done and "allowed: 50 to 20000" in refused.reason
     state = flying.has(messages.EVENT_COMMAND)
     assert any(e.text == "bitrate: done" for e in state.events)
+    for name, reason in (
+        ("record-start", "recording.folder is empty: nothing can be recorded"),
+        ("record-stop", "nothing was recorded"),
+        ("fly", "no command 'fly'"),
+        ("shutdown", "'battery.shutdown_command' is empty"),
+        ("reboot", "'supervision.reboot_command' is empty"),
+    ):
+        refused = ask(flying, name)
+        assert not refused.done and reason in refused.reason
     flying.end()
 
 
@@ -92,18 +103,6 @@ def test_a_card_that_takes_no_recording_ends_no_flight(flying: Flying, tmp_path:
     state = flying.has(messages.EVENT_RECORDING_ENDED)
     sent = state.gate.sent if state.gate else 0
     flying.state(lambda s: s.gate is not None and s.gate.sent > sent + 10)
-    flying.end()
-
-
-def test_without_a_folder_recording_is_refused(flying: Flying) -> None:
-    flown(flying)
-    refused = ask(flying, "record-start")
-    assert (refused.done, refused.reason) == (
-        False,
-        "recording.folder is empty: nothing can be recorded",
-    )
-    assert not ask(flying, "record-stop").done
-    assert not ask(flying, "fly").done
     flying.end()
 
 
@@ -160,13 +159,6 @@ def test_an_armed_vehicle_keeps_its_video_unless_forced(flying: Flying, tmp_path
     assert "forced" not in ask(flying, "exposure", gain=1).values
     flying.end()
     vehicle.unplug()
-
-
-def test_a_board_that_knows_no_way_to_end_refuses(flying: Flying) -> None:
-    flown(flying)
-    assert "'battery.shutdown_command' is empty" in ask(flying, "shutdown").reason
-    assert "'supervision.reboot_command' is empty" in ask(flying, "reboot").reason
-    flying.end()
 
 
 def test_a_critical_battery_ends_recording_and_flight_and_then_the_board(

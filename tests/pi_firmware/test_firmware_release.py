@@ -1,6 +1,5 @@
 """The payload says which version it is and how it came to run, to telemetry and to systemd."""
 
-import dataclasses
 import json
 import time
 from typing import Any
@@ -43,19 +42,6 @@ def test_the_environment_tells_the_release_or_nothing(
     environment: dict[str, str], expected: Release
 ) -> None:
     assert release.of_environment(environment) == expected
-
-
-def test_an_older_side_understands_a_newer_and_a_newer_an_older() -> None:
-    told = messages.Health(1, 2.5, version=UPDATE, release="update", release_reason="")
-    new = json.loads(messages.encode(told))
-    old = {name: value for name, value in new.items() if not name.startswith(("version", "rel"))}
-    assert len(old) == len(new) - 3 and new["schema"].startswith("blimp.health/1.")
-    old["schema"] = "blimp.health/1.0"
-    read = messages.decode(messages.Health, json.dumps(old).encode())
-    assert read == dataclasses.replace(told, version="", release="")
-    # An older reader takes another minor version and fields that it does not know.
-    later = json.dumps(new | {"schema": "blimp.health/1.9", "more": [1]}).encode()
-    assert messages.decode(messages.Health, later) == told
 
 
 def test_the_program_tells_its_release_and_why_an_update_did_not_stay(

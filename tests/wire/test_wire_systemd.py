@@ -105,10 +105,6 @@ def test_without_a_socket_that_can_be_nothing_is_said_and_nothing_raises(name: s
     assert not notifier.stopping()
 
 
-def test_outside_a_service_nothing_is_watched() -> None:
-    assert Notifier({"WATCHDOG_USEC": "15000000"}).watchdog_s is None
-
-
 def test_a_manager_that_does_not_read_is_not_waited_for_and_one_that_comes_back_is_heard(
     tmp_path: Path,
 ) -> None:
