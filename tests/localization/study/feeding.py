@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from study.metrics import pose_errors
 
-from ground_station.arrays import F64, I64, Bools
+from ground_station.arrays import F64, Bools
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import PoseEstimate, State
@@ -67,20 +66,12 @@ def load_flight(spec: str, limit: int | None = None) -> Flight:
 
 @dataclass
 class Run:
-    """What a localizer said of each frame it got.
-
-    `took_ms`, from picture to pose; `late_s`, when paced, from capture to pose.
-    """
+    """What a localizer said of each frame it got; `late_s`, when paced, from capture to pose."""
 
     frames: list[Frame] = field(default_factory=list)
     estimates: list[PoseEstimate] = field(default_factory=list)
-    took_ms: list[float] = field(default_factory=list)
     late_s: list[float] = field(default_factory=list)
     dropped: int = 0
-
-    @property
-    def time_ns(self) -> I64:
-        return np.array([f.time_ns for f in self.frames], np.int64)
 
     def says(self, state: State) -> Bools:
         """Which frames (N,) are in a state."""
@@ -104,13 +95,6 @@ class Run:
 
 def make_localizer(map_: Map, camera: Camera, settings: LocalizerSettings) -> Localizer:
     return Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
-
-
-def close(localizer: Localizer) -> None:
-    """Ends its threads, where it has a way to."""
-    end = getattr(localizer, "close", None)
-    if end is not None:
-        end()
 
 
 class Feed(Protocol):
@@ -169,14 +153,10 @@ def feed_paced(
 
 
 def _give(localizer: Localizer, frame: Frame, run: Run) -> None:
-    extra = {}
-    if "exposure_s" in inspect.signature(localizer.process).parameters:
-        extra["exposure_s"] = frame.exposure_s
-    begin = time.perf_counter()
-    estimate = localizer.process(frame.time_ns, frame.image, frame.index, **extra)
-    run.took_ms.append(1e3 * (time.perf_counter() - begin))
     run.frames.append(frame)
-    run.estimates.append(estimate)
+    run.estimates.append(
+        localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
+    )
 
 
 def joined(parts: Sequence[Sequence[Frame]], rate_hz: float = 30.0) -> list[Frame]:

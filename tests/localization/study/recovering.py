@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from study.feeding import Flight, Run, close, dark_frames, joined, make_localizer
+from study.feeding import Flight, Run, dark_frames, joined, make_localizer
 from study.metrics import (
     NEAR_DEG,
     NEAR_M,
@@ -111,7 +111,6 @@ def _jump(study: Study, before: Flight, i: int, after: Flight, j: int) -> dict[s
     localizer.set_initial_pose(before.true_wTc(old[:1])[0], stream[0].time_ns)
     true_wTc = after.true_wTc(new)
     run = study.feed(localizer, stream, Settled(len(old), true_wTc))
-    close(localizer)
     there = np.array([frame.index >= len(old) for frame in run.frames], bool)
     kept = [frame.index - len(old) for frame in run.frames if frame.index >= len(old)]
     m, deg = (values[there] for values in run.errors(_padded(true_wTc[kept], there)))
@@ -147,7 +146,6 @@ def blackout(study: Study) -> Row:
         localizer.set_initial_pose(flights[a].true_wTc(old[:1])[0], stream[0].time_ns)
         true_wTc = flights[b].true_wTc(new)
         run = study.feed(localizer, stream, Settled(len(old) + len(dark), true_wTc))
-        close(localizer)
         index = np.array([frame.index for frame in run.frames])
         late_s = np.array(run.late_s) if run.late_s else np.zeros(len(index))
         night = (index >= len(old)) & (index < len(old) + len(dark))
@@ -190,9 +188,8 @@ def other_buildings(study: Study) -> Row:
     alone = ask_alone(study, flights)
     streams: dict[str, Any] = {}
     for flight in flights:
-        localizer = study.localizer(flight)
+        localizer = make_localizer(study.map_, flight.camera, study.settings)
         run = study.feed(localizer, flight.frames)
-        close(localizer)
         streams[f"{flight.name}: {flight.about}"] = {
             "frames": len(run.frames),
             "localized": int(run.localized.sum()),

@@ -1,12 +1,13 @@
-"""The localizer's promises, measured: run by hand, not by pytest.
+"""What the localizer says when it is lost, measured: run by hand, not by pytest.
 
     python tests/localization/study/run.py all --flights out/study/loop-*.mcap \\
-        --fast out/study/fast-*.mcap --others out/reloc/office-*.mcap --json out/study.json
-    python tests/localization/study/run.py demo fast --fast out/fast5.mcap --limit 200
+        --others out/reloc/office-*.mcap --json out/study.json
+    python tests/localization/study/run.py kidnapping --flights out/fast5.mcap --limit 200
 
 Flights are recordings of `blimp simulate`, which hold their truth and seed; other buildings may
 also be `FOLDER@CAMERA.toml`. Each row prints its bound, its figure and the seeds of its flights.
-What it costs is in `blimp bench localize`, the red kitchen in `blimp experiments redkitchen`.
+What it costs is in `blimp bench localize`; errors, their covariance and the thesis's way beside it
+are in `blimp experiments`.
 """
 
 from __future__ import annotations
@@ -23,9 +24,8 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from study import accuracy, recovering
+from study import recovering
 from study.feeding import feed, feed_paced
-from study.growing import grown
 from study.row import Line, Row, Study
 
 from ground_station.bench.machine import machine
@@ -37,17 +37,13 @@ from pi_firmware.wire import config
 from pi_firmware.wire.errors import BlimpError
 
 ROWS = {
-    "demo": accuracy.demo,
-    "fast": accuracy.fast,
     "kidnapping": recovering.kidnapping,
     "blackout": recovering.blackout,
     "others": recovering.other_buildings,
-    "covariance": accuracy.covariance,
     "single": recovering.single_frames,
 }
-NEEDS = {"fast": "fast", "kidnapping": "flights", "blackout": "flights", "covariance": "flights",
-         "single": "flights", "others": "others"}  # fmt: skip
-"""Rows that cannot be run without flights of the user's."""
+NEEDS = {"kidnapping": "flights", "blackout": "flights", "single": "flights", "others": "others"}
+"""What flights of the user's a row cannot be run without."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -57,10 +53,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("rows", nargs="+", metavar="ROW", choices=["all", *ROWS],
                    help=f"all, or of {', '.join(ROWS)}")  # fmt: skip
     p.add_argument("--map", default="maps/atrium", help="the flights' map (maps/atrium)")
-    p.add_argument("--demo", help="the demo flight (MAP/flight.mcap)")
-    p.add_argument("--fast", nargs="*", default=[], help="fast flights")
-    p.add_argument("--flights", nargs="*", default=[],
-                   help="flights to jump between and to judge the covariance on")  # fmt: skip
+    p.add_argument("--flights", nargs="*", default=[], help="flights to jump between")
     p.add_argument("--others", nargs="*", default=[], help="flights of other buildings")
     p.add_argument("--paced", action="store_true",
                    help="give each frame at its time; else as fast as they are taken")  # fmt: skip
@@ -69,7 +62,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--jumps", type=int, default=200, help="kidnappings (200)")
     p.add_argument("--repetitions", type=int, default=10, help="blackouts (10)")
     p.add_argument("--count", type=int, default=1000, help="frames asked on their own (1000)")
-    p.add_argument("--grow", type=int, default=1, help="the map, this many times over (1)")
     p.add_argument("--seed", type=int, default=0, help="of the places that are drawn (0)")
     p.add_argument("--cores", type=int, default=2, help="processor cores it may use (2)")
     p.add_argument("--json", metavar="F", help="write everything measured to this file")
@@ -92,12 +84,9 @@ def study_of(args: argparse.Namespace) -> Study:
     settings = (
         config.load(args.settings, LocalizerSettings) if args.settings else load_preset("default")
     )
-    map_ = load(args.map)
     return Study(
-        map_=grown(map_, args.grow) if args.grow > 1 else map_,
+        map_=load(args.map),
         settings=settings,
-        demo=args.demo or f"{args.map}/flight.mcap",
-        fast=args.fast,
         flights=args.flights,
         others=args.others,
         feed=feed_paced if args.paced else feed,
