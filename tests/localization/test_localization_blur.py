@@ -16,7 +16,7 @@ from ground_station.localization.blur import (
     gradient_energy,
     sharpness,
 )
-from ground_station.localization.settings import BlurSettings, load_preset
+from ground_station.localization.settings import BlurSettings
 
 CAMERA = THESIS_CAMERA
 TWIST = np.array([0.3, -0.7, 0.5, 1.5, -0.4, 2.0])
@@ -121,7 +121,3 @@ def test_only_what_the_scene_cannot_explain_counts_as_blur() -> None:
     assert np.isfinite(blurred_sigma_px(1.0, still, 0.0)).all()
     assert (blurred_sigma_px(1.0, still, np.nan) == 1.0).all()
     assert (blurred_sigma_px(1.0, expected, 0.1, BlurSettings(sigma_per_px=0.0)) == 1.0).all()
-
-
-def test_the_thesis_does_not_weigh_blur() -> None:
-    assert load_preset("default").blur.enabled and not load_preset("thesis").blur.enabled

@@ -13,7 +13,7 @@ from ground_station.geometry import poses
 from ground_station.localization.acquisition import Acquirer
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Counts, no_observations
-from ground_station.localization.estimator import FilterEstimator, PoseEstimator, make_estimator
+from ground_station.localization.estimator import make_estimator
 from ground_station.localization.following import Followed, better, catch_up
 from ground_station.localization.kinematics import no_solution
 from ground_station.localization.matching import Matcher, describe
@@ -41,11 +41,6 @@ def estimator_at(room, wTc, sigma=None):
     estimator = make_estimator(room.camera, load_preset("default"))
     estimator.restart(0, wTc, None if sigma is None else np.eye(6) * sigma**2)
     return estimator
-
-
-def test_the_preset_names_the_estimator(room):
-    assert isinstance(make_estimator(room.camera, load_preset("default")), FilterEstimator)
-    assert isinstance(make_estimator(room.camera, load_preset("thesis")), PoseEstimator)
 
 
 def test_live_nothing_is_waited_for_and_nothing_else_changes():

@@ -11,32 +11,19 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
-from skimage.measure import shannon_entropy
 
 from ground_station.geometry import poses
 from ground_station.geometry.lens import Lens
-from ground_station.localization.association import associate
 from ground_station.localization.motion import MotionModel, constant_velocity
 from ground_station.localization.projection import project
 from ground_station.localization.settings import (
-    PRESETS,
-    AssociationSettings,
     LocalizerSettings,
     MotionSettings,
     ProjectionSettings,
     load_preset,
 )
 from pi_firmware.wire import config
-from pi_firmware.wire.entropy import entropy_bits
 from pi_firmware.wire.errors import ConfigError
-
-
-def test_entropy_is_shannons_as_scikit_image_computes_it():
-    rng = np.random.default_rng(1)
-    for high in (2, 40, 256):
-        image = rng.integers(0, high, (48, 64), dtype=np.uint8)
-        assert entropy_bits(image) == pytest.approx(shannon_entropy(image, base=2), abs=1e-6)
-    assert entropy_bits(np.full((48, 64), 9, np.uint8)) == 0.0
 
 
 def test_constant_velocity_makes_the_last_step_once_more():
@@ -130,55 +117,6 @@ def test_landmarks_looked_at_from_outside_their_cones_are_dropped(room):
     assert seen.landmark.tolist() == wanted
 
 
-def _associate_by_loops(fp, fd, lp, ld, settings, radius):
-    best = {}
-    for i in range(len(fp)):
-        near = np.flatnonzero(np.linalg.norm(lp - fp[i], axis=1) <= radius)
-        if not len(near):
-            continue
-        distance = np.linalg.norm(fd[i].astype(float) - ld[near], axis=1)
-        order = np.argsort(distance, kind="stable")
-        if distance[order[0]] >= settings.max_descriptor_distance:
-            continue
-        if (
-            settings.max_ratio < 1
-            and len(near) > 1
-            and distance[order[0]] > settings.max_ratio * distance[order[1]]
-        ):
-            continue
-        j = int(near[order[0]])
-        if j not in best or distance[order[0]] < best[j][0]:
-            best[j] = (distance[order[0]], i)
-    return sorted((i, j) for j, (_, i) in best.items())
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.9])
-@pytest.mark.parametrize("radius", [8.0, 60.0])
-def test_association_finds_the_pairs_of_a_plain_loop(ratio, radius):
-    rng = np.random.default_rng(3)
-    features, landmarks = 300, 900
-    lp = rng.uniform(0, 1, (landmarks, 2)) * [640, 480]
-    ld = rng.normal(size=(landmarks, 32)).astype(np.float32)
-    ld /= np.linalg.norm(ld, axis=1, keepdims=True)
-    own = rng.integers(0, landmarks, features)
-    fp = lp[own] + rng.normal(0, 3, (features, 2))
-    fd = ld[own] + rng.normal(0, 0.1, (features, 32)).astype(np.float32)
-    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
-    settings = AssociationSettings(max_ratio=ratio, max_descriptor_distance=0.7)
-    pairs = associate(fp, fd, lp, ld, settings, radius)
-    theirs = _associate_by_loops(fp, fd, lp, ld, settings, radius)
-    assert len(theirs) > 50
-    assert list(zip(pairs.feature.tolist(), pairs.candidate.tolist(), strict=True)) == theirs
-    assert len(set(pairs.candidate.tolist())) == len(pairs)
-
-
-def test_association_of_nothing_is_nothing():
-    none, rows = np.empty((0, 2)), np.empty((0, 8), np.float32)
-    some = np.zeros((1, 2)), np.eye(1, 8, dtype=np.float32)
-    assert len(associate(none, rows, *some, AssociationSettings())) == 0
-    assert len(associate(*some, none, rows, AssociationSettings())) == 0
-
-
 def _keys(kind, prefix=""):
     for field in dataclasses.fields(kind):
         inner = field.default_factory
@@ -203,11 +141,6 @@ def test_the_shipped_default_names_every_key_with_its_comment():
     for above, line in itertools.pairwise(text.splitlines()):
         if " = " in line and not line.startswith("#"):
             assert above.startswith("# "), line
-
-
-def test_every_preset_that_ships_is_read():
-    assert {"default", "thesis"} <= set(PRESETS)
-    assert len({load_preset(preset) for preset in PRESETS}) == len(PRESETS)
 
 
 def test_the_thesis_preset_has_the_values_of_the_thesis():

@@ -73,15 +73,6 @@ def test_what_a_map_is_off_is_in_the_covariance_and_degrades_nothing(room, extra
         of("default", sigma_m=[1, 2])
 
 
-def test_the_given_first_pose_is_a_prediction_and_no_result(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(2)
-    guess = path[0] @ poses.exp([0, 0, 0, 0.05, 0.0, 0.0])
-    localizer.set_initial_pose(guess, int(times[0]))
-    estimate = localizer.process_features(int(times[0]), room.features(path[0]))
-    assert errors(estimate, path[0])[0] < 0.02
-
-
 def test_without_a_first_pose_it_finds_itself_and_is_sure(room, extractor):
     localizer = make(room, extractor)
     times, path = room.path(1)
@@ -202,15 +193,6 @@ def test_a_time_that_jumps_back_is_refused_and_changes_nothing(room, extractor):
     localizer.reset()
     localizer.set_initial_pose(path[0], int(times[0]))
     assert localizer.process_features(int(times[0]), room.features(path[0])).localized
-
-
-def test_a_late_frame_is_still_predicted(room, extractor):
-    localizer = make(room, extractor, "thesis")
-    times, path = room.path(20)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    for k in (0, 1, 2, 8, 14):
-        estimate = localizer.process_features(int(times[k]), room.features(path[k]))
-        assert estimate.state is State.TRACKING, estimate.reason
 
 
 def test_a_dull_frame_is_gated_and_degrades_before_it_is_lost(room, extractor):
