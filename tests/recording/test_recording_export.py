@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ground_station.cli import main
 from ground_station.errors import InputError
 from ground_station.geometry.trajectory import read_tum
 from ground_station.recording.export import AGAIN, HEADER, read_poses, tum
@@ -22,7 +21,6 @@ from pi_firmware.wire.recording import (
     RecordingWriter,
 )
 
-BLIMP = Path(sys.executable).with_name("blimp")
 FLIGHT = Path(__file__).parents[2] / "maps" / "atrium" / "flight.mcap"
 OURS = f"/blimp-1{ESTIMATE_TOPIC}"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -42,9 +40,17 @@ def tum_lines(path: Path, topic: str | None = None) -> Iterator[str]:
     return tum(read_poses(path, topic))
 
 
-def blimp(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [BLIMP, "export", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+Blimp = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def blimp(capsys: pytest.CaptureFixture[str]) -> Blimp:
+    """`blimp export` with these arguments: its status, output and errors."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        return main(["export", *map(str, arguments)]), *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture
@@ -63,23 +69,22 @@ def test_lines_are_those_of_tum(flight: Path) -> None:
     ]
 
 
-def test_a_flights_poses_are_read_back_exactly(tmp_path: Path) -> None:
+def test_a_flights_poses_are_read_back_exactly(blimp: Blimp, tmp_path: Path) -> None:
     out = tmp_path / "truth.txt"
-    done = blimp(FLIGHT, "--topic", TRUTH_TOPIC, "--out", out)
-    assert done.returncode == 0 and done.stderr == ""
+    status, said_out, said_err = blimp(FLIGHT, "--topic", TRUTH_TOPIC, "--out", out)
+    assert status == 0 and said_err == ""
     truth, read = trajectory_of(FLIGHT), read_tum(out)
     said = f"{len(truth)} poses of /truth/pose -> {out}"
     after = f"next: blimp evaluate {out} TRUTH.txt    (where you have the truth)"
-    assert done.stdout.splitlines() == [said, after]
+    assert said_out.splitlines() == [said, after]
     assert (read.time_ns == truth.time_ns).all()
     assert np.abs(read.position_m - truth.position_m).max() < 1e-9
     assert np.abs(read.quaternion_xyzw - truth.quaternion_xyzw).max() < 1e-8
 
 
-def test_mcap_has_the_poses_and_nothing_else(flight: Path, tmp_path: Path) -> None:
+def test_mcap_has_the_poses_and_nothing_else(blimp: Blimp, flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "poses.mcap"
-    done = blimp(flight, "--format", "mcap", "--out", out)
-    assert done.returncode == 0, done.stderr
+    assert blimp(flight, "--format", "mcap", "--out", out)[0] == 0
     reader = RecordingReader(out)
     assert reader.topics() == {OURS: 2} and not reader.cut
     assert reader.poses(OURS) == RecordingReader(flight).poses(OURS)
@@ -93,14 +98,13 @@ def test_times_are_the_cameras_and_not_the_logs(tmp_path: Path) -> None:
     assert list(tum_lines(tmp_path / "f.mcap"))[1].startswith("5.000000000 ")
 
 
-def test_a_camera_whose_time_begins_again_is_told(tmp_path: Path) -> None:
+def test_a_camera_whose_time_begins_again_is_told(blimp: Blimp, tmp_path: Path) -> None:
     samples = [(10, 1.0), (20, 2.0), (10, 3.0), (20, 4.0)]
     path = record(tmp_path / "f.mcap", {OURS: samples})
     lines = list(tum_lines(path))
     assert [line[0] for line in lines] == ["#", "0", "0", "#", "0", "0"] and lines[3] == AGAIN
-    done = blimp(path, "--out", tmp_path / "est.txt")
-    assert done.returncode == 0
-    assert "the camera's time begins again 1 times" in done.stderr
+    status, _, said = blimp(path, "--out", tmp_path / "est.txt")
+    assert status == 0 and "the camera's time begins again 1 times" in said
 
 
 def test_of_several_payloads_one_must_be_chosen(tmp_path: Path) -> None:
@@ -112,7 +116,9 @@ def test_of_several_payloads_one_must_be_chosen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [(-1, 1.0), (5, float("nan")), (5, float("inf"))])
-def test_what_is_no_pose_is_left_out_and_counted(bad: tuple[int, float], tmp_path: Path) -> None:
+def test_what_is_no_pose_is_left_out_and_counted(
+    bad: tuple[int, float], blimp: Blimp, tmp_path: Path
+) -> None:
     path = tmp_path / "f.mcap"
     with RecordingWriter(path) as writer:
         for time_ns, x_m in ((1, 1.0), bad, (9, 2.0)):
@@ -120,19 +126,19 @@ def test_what_is_no_pose_is_left_out_and_counted(bad: tuple[int, float], tmp_pat
         writer.write_pose(10, (1, 2, 3), (0, 0, 0, 0), topic=OURS)
     lines = list(tum_lines(path))
     assert len(lines) == 4 and lines[-1] == "# 2 left out: no finite pose or time\n"
-    done = blimp(path, "--out", tmp_path / "est.txt")
-    assert done.returncode == 0 and "2 left out: no finite pose or time" in done.stderr
+    status, _, said = blimp(path, "--out", tmp_path / "est.txt")
+    assert status == 0 and "2 left out: no finite pose or time" in said
     assert len(read_tum(tmp_path / "est.txt")) == 2
 
 
-def test_a_cut_recording_gives_what_is_whole(tmp_path: Path) -> None:
+def test_a_cut_recording_gives_what_is_whole(blimp: Blimp, tmp_path: Path) -> None:
     path = tmp_path / "f.mcap"
     with RecordingWriter(path, chunk_bytes=1000) as writer:
         for k in range(200):
             writer.write_pose(k, (k, 2, 3), UPRIGHT, topic=OURS)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    done = blimp(path, "--out", tmp_path / "est.txt")
-    assert done.returncode == 0 and "cut (" in done.stderr
+    status, _, said = blimp(path, "--out", tmp_path / "est.txt")
+    assert status == 0 and "cut (" in said
     assert 50 < len(read_tum(tmp_path / "est.txt")) < 150
     assert list(tum_lines(path))[-1].startswith("# the recording is cut: ")
 
@@ -151,7 +157,7 @@ def test_errors_are_told_before_the_first_line(flight: Path, tmp_path: Path) -> 
 
 
 def test_the_command_refuses_in_one_line_and_spares_the_recording(
-    flight: Path, tmp_path: Path
+    blimp: Blimp, flight: Path, tmp_path: Path
 ) -> None:
     before = flight.read_bytes()
     for arguments in (
@@ -162,8 +168,8 @@ def test_the_command_refuses_in_one_line_and_spares_the_recording(
         (tmp_path / "absent.mcap", "--out", tmp_path / "est.txt"),
         (flight, "--format", "mcap", "--out", tmp_path),
     ):
-        done = blimp(*arguments)
-        assert done.returncode == 2 and done.stdout == ""
-        assert done.stderr.startswith("blimp export: ") and done.stderr.count("\n") == 1
+        status, out, said = blimp(*arguments)
+        assert status == 2 and out == ""
+        assert said.startswith("blimp export: ") and said.count("\n") == 1
     assert flight.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flight.mcap"]

@@ -142,12 +142,6 @@ def test_an_impossible_rate_is_refused(folder: Path, rate_hz: float) -> None:
         open_input(folder, rate_hz=rate_hz)
 
 
-@pytest.mark.parametrize("text", ["", "5", "5:3", "1:2:0", "-1:2", "²:3", "1" * 30_000 + ":", "\n"])
-def test_a_range_that_is_none_is_refused_in_one_short_line(text: str) -> None:
-    with pytest.raises(InputError, match=r"^the range [^\n]{1,150}$"):
-        parse_range(text)
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60), st.integers(1, 9), st.integers(0, 80))
 def test_a_range_takes_what_a_slice_takes(start: int, length: int, step: int, n: int) -> None:
@@ -165,24 +159,14 @@ def test_ends_of_a_range_may_be_left_out() -> None:
     assert not FrameRange(5, None).is_past(10**9) and FrameRange(0, 7).is_past(7)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "5",
-        "a:b",
-        "5:5",
-        "7:3",
-        "-1:4",
-        "0:10:0",
-        "0:10:-1",
-        "0:1:2:3",
-        "1.5:4",
-        "0:9\n9",
-        "٣:٤",
-    ],
-)
-def test_a_bad_range_is_told_in_one_line(text: str) -> None:
-    with pytest.raises(InputError) as error:
+BAD = [
+    *("", "5", "a:b", "5:5", "7:3", "-1:4", "0:10:0", "0:10:-1", "0:1:2:3", "1.5:4", "0:9\n9"),
+    *("٣:٤", "²:3", "1" * 30_000 + ":", "\n"),
+]
+
+
+@pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
+def test_a_bad_range_is_told_in_one_short_line(text: str) -> None:
+    with pytest.raises(InputError, match=r"^the range [^\n]{1,150}$") as error:
         parse_range(text)
-    assert "A:B" in str(error.value) and "\n" not in str(error.value)
+    assert "A:B" in str(error.value)

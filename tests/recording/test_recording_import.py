@@ -11,6 +11,7 @@ import pytest
 from numbered_video import HEIGHT, WIDTH, number_in
 from test_recording_video import write_video
 
+from ground_station.cli import main
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera, load_camera
 from ground_station.recording.flight import FlightRecording
@@ -22,11 +23,6 @@ from pi_firmware.wire.recording import RecordingReader
 CAMERA = "width_px = 160\nheight_px = 120\nfx_px = 150\nfy_px = 151\ncx_px = 79.5\ncy_px = 59.5\n"
 LENS = "k1 = 0.1\nreadout_s = 0.02\n"
 TIMES_MS = [0, 40, 70, 170, 171, 700, 1300, 1366, 1400, 2000]
-
-
-def blimp(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [Path(sys.executable).with_name("blimp"), "import", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
 @pytest.fixture
@@ -43,11 +39,12 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def test_frames_times_and_camera_are_the_videos(video: Path, camera: Path, tmp_path: Path) -> None:
+def test_frames_times_and_camera_are_the_videos(
+    video: Path, camera: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "walk.mcap"
-    done = blimp(video, "--camera", camera, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == f"next: blimp replay {out} --map maps/NAME"
+    assert main(["import", str(video), "--camera", str(camera), "--out", str(out)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"next: blimp replay {out} --map maps/NAME"
     source = FlightRecording(out)
     frames = list(source)
     assert [f.time_ns for f in frames] == [ms * 1_000_000 for ms in TIMES_MS]
@@ -87,7 +84,7 @@ def test_a_payload_plays_it(video: Path, camera: Path, tmp_path: Path) -> None:
 
 
 def test_a_refusal_is_one_line_and_leaves_nothing(
-    video: Path, camera: Path, tmp_path: Path
+    video: Path, camera: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "walk.mcap"
     lens = load_camera(camera)
@@ -99,6 +96,7 @@ def test_a_refusal_is_one_line_and_leaves_nothing(
         import_frames(open_input(video), sides, out, name="walk")
     assert not out.exists() and not list(tmp_path.glob("*.part*"))
     import_frames(open_input(video), lens, out, name="walk")
-    done = blimp(out, "--camera", camera, "--out", tmp_path / "again.mcap")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "is a recording already: blimp replay" in done.stderr
+    again = str(tmp_path / "again.mcap")
+    assert main(["import", str(out), "--camera", str(camera), "--out", again]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "is a recording already: blimp replay" in said
