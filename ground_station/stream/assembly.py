@@ -20,7 +20,7 @@ from ground_station.stream.retransmission import Retransmission
 from ground_station.stream.stamps import Stamps
 from pi_firmware.wire import annexb, sei
 
-SETS_TIMEOUT_S = 3.0
+_SETS_TIMEOUT_NS = 3_000_000_000
 """A stream that has come for so long without parameter sets cannot be shown."""
 
 _TOO_MANY_LOST = 0.05
@@ -58,13 +58,7 @@ class Assembly:
     loss, none is without capture time. All else is counted in `counters`.
     """
 
-    def __init__(
-        self,
-        ssrc: int,
-        counters: Counters,
-        *,
-        sets_timeout_s: float = SETS_TIMEOUT_S,
-    ) -> None:
+    def __init__(self, ssrc: int, counters: Counters) -> None:
         self.ssrc = ssrc
         self.last_arrival_ns = 0
         """Monotonic, of the newest packet."""
@@ -79,7 +73,6 @@ class Assembly:
         self._depacketizer = rtp.Depacketizer(counters)
         self._decoder = Decoder(counters)
         self._stamps = Stamps()
-        self._sets_timeout_ns = int(sets_timeout_s * 1e9)
         self._first_arrival_ns: int | None = None
 
     @property
@@ -93,7 +86,7 @@ class Assembly:
         if self._first_arrival_ns is None or self._decoder.saw_parameter_sets:
             return None
         came_ns = self.last_arrival_ns - self._first_arrival_ns
-        if came_ns <= self._sets_timeout_ns:
+        if came_ns <= _SETS_TIMEOUT_NS:
             return None
         counters = self._counters
         sent, lost = counters.packets - counters.packets_late, counters.packets_lost

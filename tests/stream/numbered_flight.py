@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import struct
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -47,7 +48,6 @@ def number_in(image: NDArray[np.uint8]) -> int:
     return sum(1 << bit for bit, level in enumerate(blocks) if level > 120)
 
 
-@functools.cache
 def encoded(
     frames: int, dark: frozenset[int] = frozenset(), slices: int = 1, more: str = "cabac=0"
 ) -> tuple[bytes, ...]:
@@ -55,6 +55,18 @@ def encoded(
 
     `more` are settings of x264's.
     """
+    made, later = _encoding(dark, slices, more)
+    made += itertools.islice(later, max(0, frames - len(made)))
+    return tuple(made[:frames])
+
+
+@functools.cache
+def _encoding(dark: frozenset[int], slices: int, more: str) -> tuple[list[bytes], Iterator[bytes]]:
+    """The access units that were made so far, and those to come."""
+    return [], _encode(dark, slices, more)
+
+
+def _encode(dark: frozenset[int], slices: int, more: str) -> Iterator[bytes]:
     codec = av.CodecContext.create("libx264", "w")
     codec.width, codec.height, codec.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
     codec.time_base, codec.framerate = Fraction(1, RATE_HZ), Fraction(RATE_HZ)
@@ -63,14 +75,12 @@ def encoded(
         "tune": "zerolatency", "preset": "ultrafast", "crf": "18", "g": str(GOP),
         "slices": str(slices), "x264-params": more,
     }  # fmt: skip
-    units = []
-    for index in range(frames):
+    for index in itertools.count():
         gray = picture(index, dark=index in dark)
         frame = av.VideoFrame.from_ndarray(np.dstack([gray] * 3), format="rgb24")
         frame.pts = index
         (packet,) = codec.encode(frame)
-        units.append(bytes(packet))
-    return tuple(units)
+        yield bytes(packet)
 
 
 def write_flight(path: Path, frames: int, dark: Iterable[int] = ()) -> Path:

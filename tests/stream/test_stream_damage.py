@@ -156,7 +156,7 @@ def test_after_a_whole_picture_all_is_withheld_up_to_the_next_idr(part: str) -> 
 
 def test_two_idrs_in_a_row_of_which_one_is_lost_are_told_from_none() -> None:
     """Both count their pictures from 0: only the payload's own number shows the gap."""
-    one = units(more="cabac=1:keyint=1")[:1]
+    one = [stamped(encoded(1, more="cabac=1:keyint=1")[0], 0)]
     sent = [*one, stamped(encoded(FRAMES, more=CABAC)[0], 1)]
     sent += [stamped(unit, n + 1) for n, unit in enumerate(encoded(FRAMES, more=CABAC)) if n]
     frames, _ = received(packets(sent), [*in_frame(sent, 1)])

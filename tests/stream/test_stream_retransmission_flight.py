@@ -102,9 +102,8 @@ def numbers(frames: Sequence[ReceivedFrame]) -> list[int]:
     return sequences
 
 
-@pytest.mark.parametrize("key", [None, KEY], ids=["plain", "encrypted"])
-def test_the_payloads_own_link_sends_again_what_was_lost(key: bytes | None) -> None:
-    with flying(key=key) as flown:
+def test_the_payloads_own_link_sends_again_what_was_lost() -> None:
+    with flying(key=KEY) as flown:
         send(flown, 5)
         eventually(lambda: len(flown.frames) == 5)
         flown.stream.retransmits(flown.link.rtx_ssrc, 0.001)
@@ -126,11 +125,8 @@ def test_the_payloads_own_link_sends_again_what_was_lost(key: bytes | None) -> N
 LOSSY = LinkReport(1, "main", 5600, ssrc=77, corrects=True, dropped=0.05, burst=1.0)
 
 
-@pytest.mark.parametrize("key", [None, KEY], ids=["plain", "encrypted"])
-def test_the_payloads_own_link_corrects_what_was_lost_and_a_clean_one_carries_no_more(
-    key: bytes | None,
-) -> None:
-    with flying(key=key, history_s=0.0) as flown:
+def test_the_payloads_own_link_corrects_what_was_lost_and_a_clean_one_carries_no_more() -> None:
+    with flying(key=KEY, history_s=0.0) as flown:
         kinds: Counter[int] = Counter()
         sizes: list[int] = []
 
