@@ -66,6 +66,12 @@ class Station:
         if note.name == NAME:
             self.beats.append(note)
 
+    def anew(self) -> None:
+        """Another session of the payload begins, of which nothing was said yet."""
+        self.said, self.ssrc = 0, self.ssrc + 1
+        self.estimates.clear()
+        self.events.clear()
+
     def close(self) -> None:
         self.bus.close()
         self.router.close()
@@ -81,7 +87,7 @@ class Station:
     def show(self, image: Any, sequence: int, time_ns: int, /, **fields: Any) -> FrameMessage:
         """A frame as an intake tells it."""
         slot, stamp = self.pictures.write(image)
-        ssrc = fields.get("ssrc", 1)
+        ssrc = fields.get("ssrc", self.ssrc)
         if isinstance(ssrc, int) and ssrc != self.ssrc:
             self.ssrc, self.said = ssrc, 0
         now_ns = time.time_ns()
@@ -95,7 +101,7 @@ class Station:
             "arrival_ns": now_ns,
             "width_px": image.shape[1],
             "height_px": image.shape[0],
-            "ssrc": 1,
+            "ssrc": self.ssrc,
             "shown": self.said + 1,
         }
         return self.say(FrameMessage(**(values | fields)))
