@@ -334,18 +334,15 @@ class Service:
         )
 
 
-def joined(folder: Path, port: int = 0, through: int = 0) -> tuple[Service, Service]:
-    """Two stations of one authority, the second of which joins the first and takes its map.
-
-    The first listens at `port`, where the second finds it, or else at the port `through`.
-    """
+def joined(folder: Path) -> tuple[Service, Service]:
+    """Two stations of one authority, the second of which joins the first and takes its map."""
     for name in ("first", "second"):
         (folder / name).mkdir()
-    port = port or free_port(socket.SOCK_STREAM)
+    port = free_port(socket.SOCK_STREAM)
     first = Service(folder / "first", f'fleet.listen=["tls/127.0.0.1:{port}"]')
     second = Service(
         folder / "second",
-        f'fleet.join=["tls/127.0.0.1:{through or port}"]',
+        f'fleet.join=["tls/127.0.0.1:{port}"]',
         f"map.shelf={folder / 'maps'}",
         name="spare",
         authority=first.authority,

@@ -171,14 +171,6 @@ def test_of_two_payloads_with_one_id_the_first_is_kept(tmp_path: Path) -> None:
         all_right(stand, "blimp-1")
 
 
-def test_who_is_not_named_is_not_taken_up(tmp_path: Path) -> None:
-    with Stand(tmp_path, payloads={"ids": ["blimp-2"]}) as stand:
-        stand.payload("blimp-1")
-        stand.payload("blimp-2")
-        eventually(lambda: len(stand.heard.of("blimp-2")) > 30)
-        assert set(stand.heard.payloads) == {"blimp-2"} and not stand.heard.of("blimp-1")
-
-
 def test_hostile_telemetry_neither_ends_the_intake_nor_takes_a_place(tmp_path: Path) -> None:
     draw = random.Random(8)
     gate = messages.Gate(

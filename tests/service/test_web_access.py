@@ -20,28 +20,43 @@ BEARER = {"authorization": f"Bearer {station.TOKEN}"}
 OWN = {"origin": HERE}
 
 
-def client_of(folder, token=None, **http):
+def asked(folder, token=None):
     bus = station.SilentBus()
-    web = build(station.run_of(folder, **http), folder, bus, token)
-    return station.TestClient(web.guarded, HERE, follow_redirects=False), web, bus
+    web = build(station.run_of(folder), folder, bus, token)
+    with station.TestClient(web.guarded, HERE, follow_redirects=False) as client:
+        station.say_all(bus.put)
+        yield client, web
+
+
+@pytest.fixture(scope="module")
+def opened_once(tmp_path_factory):
+    yield from asked(tmp_path_factory.mktemp("opened"))
+
+
+@pytest.fixture(scope="module")
+def closed_once(tmp_path_factory):
+    yield from asked(tmp_path_factory.mktemp("closed"), station.TOKEN)
+
+
+def fresh(parts):
+    """As at its start: nobody is logged in, nobody has asked."""
+    client, web = parts
+    client.cookies.clear()
+    web.access.sessions._until_s.clear()
+    web.access.posts, web.access.failures = Buckets(10.0, 30), Buckets(1 / 12, 5)
+    return parts
 
 
 @pytest.fixture
-def opened(tmp_path):
+def opened(opened_once):
     """On loopback, without a token."""
-    client, web, bus = client_of(tmp_path)
-    with client:
-        station.say_all(bus.put)
-        yield client, web
+    return fresh(opened_once)
 
 
 @pytest.fixture
-def closed(tmp_path):
+def closed(closed_once):
     """With a token."""
-    client, web, bus = client_of(tmp_path, station.TOKEN)
-    with client:
-        station.say_all(bus.put)
-        yield client, web
+    return fresh(closed_once)
 
 
 # Settings

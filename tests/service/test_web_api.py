@@ -159,16 +159,16 @@ def test_localizers_and_recording_are_asked(served):
         ("recording", {}, 422),
     ],
 )
-def test_what_is_not_as_described_is_asked_of_nobody(served, path, body, status):
-    client, bus, _ = served
+def test_what_is_not_as_described_is_asked_of_nobody(unchanged, path, body, status):
+    client, bus, _ = unchanged
     answer = client.post(f"/api/{path}", json=body)
     assert answer.status_code == status
     assert isinstance(answer.json()["detail"], str) and "\n" not in answer.json()["detail"]
     assert bus.asked == []
 
 
-def test_a_number_that_is_none_is_refused(served):
-    client, bus, _ = served
+def test_a_number_that_is_none_is_refused(unchanged):
+    client, bus, _ = unchanged
     for number in ("NaN", "Infinity", "-Infinity", "1e999"):
         answer = client.post(
             f"/api/payloads/{P}/command",
@@ -205,16 +205,16 @@ def test_what_fails_here_is_one_line_and_no_traceback(served, monkeypatch, capsy
         ("GET", "/docs", 404), ("GET", "/redoc", 404), ("GET", "/openapi.json", 404),
     ],
 )  # fmt: skip
-def test_errors_have_a_detail(served, method, path, status):
-    answer = served[0].request(method, path)
+def test_errors_have_a_detail(unchanged, method, path, status):
+    answer = unchanged[0].request(method, path)
     assert answer.status_code == status
     assert isinstance(answer.json()["detail"], str)
 
 
-def test_the_description_describes_every_error_as_it_is(served):
-    schema = served[0].get("/api/openapi.json").json()
+def test_the_description_describes_every_error_as_it_is(unchanged):
+    schema = unchanged[0].get("/api/openapi.json").json()
     assert "HTTPValidationError" not in schema["components"]["schemas"]
-    page = served[0].get("/api/docs").text
+    page = unchanged[0].get("/api/docs").text
     for path in schema["paths"]:
         assert path in page
 

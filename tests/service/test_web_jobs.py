@@ -151,9 +151,13 @@ def test_a_job_outlives_a_killed_web_process_and_ends_with_the_service(
         router.close()
 
 
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [
+def test_only_what_is_there_is_built_and_nothing_is_overwritten(
+    served: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "--out.mp4").touch()
+    shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
+    for body, status in (
         ({"step": "build", "choice": "a.mcap", "map": "../x"}, 422),
         ({"step": "build", "choice": "../recordings/a.mcap", "map": "x"}, 404),
         ({"step": "build", "choice": "none.mcap", "map": "x"}, 404),
@@ -165,19 +169,8 @@ def test_a_job_outlives_a_killed_web_process_and_ends_with_the_service(
         ({"step": "build"}, 422),
         ({"step": "build", "choice": "--out.mp4", "map": "x"}, 404),
         ({"step": "build", "choice": "a.mcap", "map": "x", "command": "rm"}, 422),
-    ],
-)
-def test_only_what_is_there_is_built_and_nothing_is_overwritten(
-    served: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    body: dict[str, Any],
-    status: int,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "--out.mp4").touch()
-    shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
-    assert served[0].post("/api/job", json=body).status_code == status
+    ):
+        assert served[0].post("/api/job", json=body).status_code == status, body
     assert served[0].get("/api/state").json()["job"] is None
 
 

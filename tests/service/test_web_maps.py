@@ -14,8 +14,8 @@ from ground_station.service.web import maps
 from pi_firmware.wire.errors import BlimpError
 
 
-def test_the_sample_map(served):
-    client = served[0]
+def test_the_sample_map(unchanged):
+    client = unchanged[0]
     assert [item["name"] for item in client.get("/api/maps").json()] == ["atrium"]
     details = client.get("/api/maps/atrium").json()
     plan = details["floorplan"]
@@ -46,8 +46,8 @@ def test_a_configured_camera_takes_the_place_of_the_maps(tmp_path):
     assert (camera["width_px"], camera["height_px"]) == (320, 240)
 
 
-def test_what_is_the_same_is_not_sent_again(served):
-    client = served[0]
+def test_what_is_the_same_is_not_sent_again(unchanged):
+    client = unchanged[0]
     first = client.get("/api/maps/atrium/landmarks")
     again = client.get(
         "/api/maps/atrium/landmarks", headers={"if-none-match": first.headers["etag"]}
@@ -57,8 +57,8 @@ def test_what_is_the_same_is_not_sent_again(served):
 
 @pytest.mark.parametrize("name", ["nope", "..", "...", "%2e%2e", "..%2fatrium", ".hidden", "a%00b"])
 @pytest.mark.parametrize("rest", ["", "/landmarks", "/floorplan.png"])
-def test_maps_are_asked_for_by_name_only(served, name, rest):
-    assert served[0].get(f"/api/maps/{name}{rest}").status_code in (404, 422)
+def test_maps_are_asked_for_by_name_only(unchanged, name, rest):
+    assert unchanged[0].get(f"/api/maps/{name}{rest}").status_code in (404, 422)
 
 
 def save_map(folder, positions, plan=b""):

@@ -197,26 +197,6 @@ def refuses_a_port_in_use(service: Service) -> None:
     assert service.answers()
 
 
-def test_of_two_payloads_neither_starves_the_other(tmp_path: Path) -> None:
-    # Before the service that all other tests share is there: it would be a third on two cores.
-    names = ("blimp-1", "blimp-2")
-    with contextlib.ExitStack() as stack:
-        service = stack.enter_context(Service(tmp_path))
-        flying = [stack.enter_context(service.fly(n, tmp_path / n, rate_hz=15)) for n in names]
-        for name in names:
-            eventually(lambda one=name: service.tracking(one))
-        estimates = Estimates(stack.enter_context(service.bus()))
-        viewers = [stack.enter_context(Viewer(service, name)) for name in names]
-        eventually(lambda: all(len(estimates.done_ns.get(name, ())) > 60 for name in names))
-        taken = [len(estimates.done_ns[name]) for name in names]
-        assert min(taken) > 0.5 * max(taken)
-        for viewer in viewers:
-            eventually(lambda one=viewer: one.counts.get("video", 0) > 10)
-        print(f"\ntwo at 15 Hz: {taken} estimates, latest {estimates.states}")
-        for one in flying:
-            one.end().assert_in_order()
-
-
 def test_after_sigkill_the_recording_opens_and_the_flight_goes_on(tracked: Flying) -> None:
     service = tracked.service
     service.record(active=True)
