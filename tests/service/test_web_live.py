@@ -103,7 +103,7 @@ def test_estimates_are_bounded_in_rate_and_those_of_others_come_seldom(served):
         async with connect(port, f"/api/live?payload={P}") as viewer:
             await next_of(viewer, "hello")
             begin_s = time.monotonic()
-            while time.monotonic() - begin_s < 2.0:
+            while time.monotonic() - begin_s < 1.0:
                 for name in (P, "blimp-2"):  # a hundred times a second, or as often as can be
                     bus.put(bus_messages.ESTIMATE, name, station.estimate())
                 with contextlib.suppress(TimeoutError):
@@ -185,26 +185,23 @@ def test_another_payload_is_chosen(served):
     run(main())
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        "no json", "[]", "{}", '{"type": 5}', "[" * 2000, '{"type":"select"}', b"bytes",
-        '{"type":"select","payload":"' + "x" * 40 + '"}', '{"type":"video","on":1}',
-        '{"type":"shown","shown_ms":NaN}', '{"type":"shown","shown_ms":1' + "0" * 400 + "}",
-        '{"type":"ping","sent_ms":true}', '{"type":"ping","x":"' + "x" * 4000 + '"}',
-        "x" * 100_000,
-    ],
-)  # fmt: skip
-def test_who_speaks_otherwise_is_closed(served, message):
+def test_who_speaks_otherwise_is_closed(served):
     _, _, port = served
 
     async def main():
-        async with connect(port) as viewer:
-            await viewer.send(message)
-            with pytest.raises(websockets.ConnectionClosed) as closed:
-                await next_of(viewer, "pong")
+        for message in (
+            "no json", "[]", "{}", '{"type": 5}', "[" * 2000, '{"type":"select"}', b"bytes",
+            '{"type":"select","payload":"' + "x" * 40 + '"}', '{"type":"video","on":1}',
+            '{"type":"shown","shown_ms":NaN}', '{"type":"shown","shown_ms":1' + "0" * 400 + "}",
+            '{"type":"ping","sent_ms":true}', '{"type":"ping","x":"' + "x" * 4000 + '"}',
+            "x" * 100_000,
+        ):  # fmt: skip
+            async with connect(port) as viewer:
+                await viewer.send(message)
+                with pytest.raises(websockets.ConnectionClosed) as closed:
+                    await next_of(viewer, "pong")
             code = closed.value.rcvd.code if closed.value.rcvd else None
-            assert code == (1009 if len(message) > 50_000 else 1008)
+            assert code == (1009 if len(message) > 50_000 else 1008), message
 
     run(main())
 
@@ -262,7 +259,7 @@ def stopped_viewer(port) -> socket.socket:
 
 def test_a_viewer_that_takes_nothing_harms_nobody_and_is_closed(served, monkeypatch):
     web, _, port = served
-    monkeypatch.setattr(viewer_module, "TAKES_NOTHING_S", 6.0)
+    monkeypatch.setattr(viewer_module, "TAKES_NOTHING_S", 2.0)
     stopped = stopped_viewer(port)
     station.eventually(lambda: web.live.viewers == 1)
     loop = web.loop()
@@ -284,7 +281,7 @@ def test_a_viewer_that_takes_nothing_harms_nobody_and_is_closed(served, monkeypa
 
     run(main())
     assert len(received) > 20
-    assert max(np.diff(received)) < 5.0  # the other one saw its pictures all the while
+    assert max(np.diff(received)) < 1.9  # the other one saw its pictures all the while
     station.eventually(lambda: web.live.viewers == 0)
     assert "blimp_viewer_pictures_lost_total 0.0" not in web.metrics.text().decode()
     # The connection is gone, not only its place, though what was sent still lies unread.
@@ -326,7 +323,7 @@ def test_encoding_keeps_the_rate_and_skips_the_rest(tmp_path):
         video.want(frozenset({P}))
         begin_s = time.monotonic()
         count = 0
-        while time.monotonic() - begin_s < 2.0:
+        while time.monotonic() - begin_s < 1.0:
             slot, stamp = ring.write(station.texture())
             video.frame(P, station.frame(slot, stamp, count))
             video.frame("other", station.frame(slot, stamp, count))
