@@ -1,7 +1,10 @@
 """What a person has put onto the boot partition, read with bounds and told apart from what is old.
 
 Two traces of the card's own work are no new input: a blimp.toml from which it took the password,
-and files of certificates/ that it was overwriting with zeros when power went.
+and files of certificates/ that it was overwriting with zeros when power went: once the card has the
+secrets, each file is overwritten in its own blocks, written through, and only then removed. On
+flash memory that is all a program can do: the card's controller may keep old cells out of
+everybody's sight.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from deploy.board.card import Card
-from deploy.board.disk import read_bounded
+from deploy.board.disk import Disk, read_bounded
 from deploy.errors import DeployError
 
 FILE, KEPT_FILE, SETTINGS, CERTIFICATES = "blimp.toml", "blimp.new", "payload.toml", "certificates"
@@ -101,3 +104,40 @@ def _bytes(path: Path, most: int) -> bytes | None:
     if data is not None and len(data) > most:
         raise DeployError(f"{where} has more than {most} bytes")
     return data
+
+
+def is_needed(card: Card, kept: bytes) -> bool:
+    """Whether anything is left to be taken out."""
+    try:
+        same = (card.boot / FILE).read_bytes() == kept
+    except OSError:
+        same = False
+    return not same or (card.boot / KEPT_FILE).exists() or (card.boot / CERTIFICATES).exists()
+
+
+def shred(card: Card, disk: Disk, kept: bytes) -> None:
+    """Makes blimp.toml what `kept` says and removes certificates/; raises `OSError`.
+
+    blimp.toml is overwritten with zeros first: a file half zeros is no valid TOML, so that it can't
+    be mistaken for one that a person wrote, and the whole lies beside it meanwhile.
+    """
+    file, beside = card.boot / FILE, card.boot / KEPT_FILE
+    if file.read_bytes() != kept:
+        disk.write(beside, kept)
+        # As long as what comes then: until that is whole there are zeros in it.
+        disk.overwrite(file, bytes(max(file.stat().st_size, len(kept))))
+        disk.overwrite(file, kept)
+    disk.remove(beside)
+    _shred_folder(card.boot / CERTIFICATES, disk)
+
+
+def _shred_folder(folder: Path, disk: Disk) -> None:
+    """Those that we know last: a folder that power left half empty still has one of them."""
+    if not folder.is_dir():
+        return
+    ours = {folder / name for name in KNOWN}
+    for path in sorted(folder.rglob("*"), key=lambda path: (path in ours, path)):
+        if path.is_file() and not path.is_symlink():
+            disk.overwrite(path, bytes(path.stat().st_size))
+            disk.remove(path)
+    disk.remove(folder)

@@ -5,25 +5,149 @@ It decides nothing and fixes nothing: what it tells of goes on without it.
 
 from __future__ import annotations
 
+import fcntl
+import ipaddress
+import socket
+import struct
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from deploy.board import faults, journal, network, provision, status
+from deploy.board import provision, status
 from deploy.board.card import Card
 from deploy.board.disk import Disk
-from deploy.board.faults import Fault
-from deploy.board.network import Link
 from deploy.board.releases import places
 from deploy.board.releases.places import Places
 from deploy.board.releases.service import UNIT, Seen, Service
-from deploy.board.status import Status
-from deploy.board.status_led import StatusLed
+from deploy.board.status import Fault, Status
 from deploy.errors import DeployError
+
+_SIOCGIFADDR = 0x8915  # linux/sockios.h
+_MOST_SERVERS = 3  # resolv.conf(5)
+
+
+class Link(NamedTuple):
+    """An interface that can carry something; `address` is empty while it has none."""
+
+    name: str
+    radio: bool
+    address: str
+
+
+def ipv4(interface: str) -> str:
+    """The interface's address; empty when it has none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        try:
+            reply = fcntl.ioctl(any_socket, _SIOCGIFADDR, struct.pack("256s", interface.encode()))
+        except OSError:
+            return ""
+    return socket.inet_ntoa(reply[20:24])
+
+
+def links(root: Path, address: Callable[[str], str] = ipv4) -> list[Link]:
+    """All interfaces but the loopback, by name; an address counts where there is a carrier."""
+    try:
+        folders = sorted((root / "sys/class/net").iterdir())
+    except OSError:
+        return []
+    found = []
+    for folder in folders:
+        if folder.name == "lo" or not folder.is_dir():
+            continue
+        radio = (folder / "phy80211").exists() or (folder / "wireless").exists()
+        found.append(Link(folder.name, radio, address(folder.name) if _carries(folder) else ""))
+    return found
+
+
+def name_servers(root: Path) -> list[str]:
+    """Those that the networks have given, at most three."""
+    try:
+        lines = (root / "run/systemd/netif/state").read_text().splitlines()
+    except (OSError, ValueError):
+        return []
+    words = next((line[4:].split() for line in lines if line.startswith("DNS=")), [])
+    return [word for word in words if _is_address(word)][:_MOST_SERVERS]
+
+
+def resolver_text(servers: list[str]) -> str:
+    """resolv.conf; one question and no long wait, as a flight looks for one host at most."""
+    return (
+        "".join(f"nameserver {server}\n" for server in servers) + "options timeout:2 attempts:2\n"
+    )
+
+
+def _carries(folder: Path) -> bool:
+    try:
+        return (folder / "carrier").read_text().strip() == "1"
+    except OSError:  # it is switched off
+        return False
+
+
+def _is_address(word: str) -> bool:
+    try:
+        ipaddress.ip_address(word)
+    except ValueError:
+        return False
+    return True
+
+
+_NAMES = ("ACT", "led0")  # of today's kernels and of older ones
+_ON_S, _OFF_S, _PAUSE_S = 0.2, 0.3, 1.5
+
+
+class StatusLed:
+    """The light below `root`/sys; a board without one is dark and nothing fails."""
+
+    def __init__(self, root: Path, sleep: Callable[[float], object] = time.sleep) -> None:
+        self._sleep = sleep
+        folders = [root / "sys/class/leds" / name for name in _NAMES]
+        self._folder = next((folder for folder in folders if folder.is_dir()), None)
+        self._trigger: str | None = None
+
+    def heartbeat(self) -> None:
+        """All is well: the kernel blinks twice a second; without its trigger the light is on."""
+        if not self._set_trigger("heartbeat"):
+            self.steady()
+
+    def steady(self) -> None:
+        """It is starting."""
+        if self._set_trigger("none"):
+            self._light(True)
+
+    def blink(self, count: int) -> None:
+        """`count` short blinks and the pause after them; it takes as long as that does."""
+        self._set_trigger("none")
+        for _ in range(count):
+            self._light(True)
+            self._sleep(_ON_S)
+            self._light(False)
+            self._sleep(_OFF_S)
+        self._sleep(_PAUSE_S)
+
+    def _set_trigger(self, name: str) -> bool:
+        if self._trigger == name:
+            return True
+        if self._write("trigger", name):
+            self._trigger = name
+            return True
+        return False
+
+    def _light(self, on: bool) -> None:
+        self._write("brightness", "255" if on else "0")
+
+    def _write(self, file: str, text: str) -> bool:
+        if self._folder is None:
+            return False
+        try:
+            (self._folder / file).write_text(text)
+        except OSError:
+            return False
+        return True
+
 
 LOOK_S, CALM_S = 5.0, 20.0
 """So often it looks until a state has settled, and from then on: each look runs systemctl."""
@@ -68,16 +192,16 @@ class Judge:
             self._network_s = now_s
         state = view.outcome.get("state")
         if view.data:
-            return faults.NO_DATA, False
+            return status.NO_DATA, False
         if state == provision.NONE and not view.outcome.get("reason"):
-            return faults.NO_PROVISIONING, False
+            return status.NO_PROVISIONING, False
         if state != provision.IN_FORCE:
-            return faults.REFUSED, view.firmware.active
+            return status.REFUSED, view.firmware.active
         first = view.firmware.said == "activating" and not view.firmware.restarts
         if now_s - self._video_s >= (START_S if first else PATIENCE_S):
-            return faults.NO_VIDEO, False
+            return status.NO_VIDEO, False
         if now_s - self._network_s >= PATIENCE_S:
-            return faults.NO_NETWORK, view.firmware.active
+            return status.NO_NETWORK, view.firmware.active
         return None, view.firmware.active
 
 
@@ -131,24 +255,24 @@ def look(card: Card, service: Service) -> View:
         outcome=places.read(card.outcome) or {},
         data=data_fault(card.root),
         firmware=service.seen(),
-        links=tuple(network.links(card.root)),
+        links=tuple(links(card.root)),
     )
 
 
 def reason(fault: Fault | None, view: View) -> str:
     """What is known of a fault's cause, in one line."""
-    if fault is faults.NO_DATA:
+    if fault is status.NO_DATA:
         return view.data
-    if fault is faults.REFUSED:
+    if fault is status.REFUSED:
         told = str(view.outcome.get("reason", ""))
         return told or "the program that reads this folder did not come to an end"
-    if fault is faults.NO_VIDEO:
-        return journal.of_firmware(journal.said(UNIT)) or view.firmware.said
-    if fault is faults.NO_NETWORK and view.outcome.get("wifi"):
+    if fault is status.NO_VIDEO:
+        return status.of_firmware(status.said(UNIT)) or view.firmware.said
+    if fault is status.NO_NETWORK and view.outcome.get("wifi"):
         if not any(link.radio for link in view.links):
             return "this board has no radio, or its driver did not start"
-        return journal.of_wifi(journal.said(_WIFI_UNIT))
-    return "no cable, or nobody there who gives addresses" if fault is faults.NO_NETWORK else ""
+        return status.of_wifi(status.said(_WIFI_UNIT))
+    return "no cable, or nobody there who gives addresses" if fault is status.NO_NETWORK else ""
 
 
 def text_of(card: Card, fault: Fault | None, view: View) -> bytes:
@@ -175,7 +299,7 @@ def text_of(card: Card, fault: Fault | None, view: View) -> bytes:
 
 def resolve(card: Card) -> None:
     """Keeps the name servers' file; a change is written beside and renamed."""
-    text = network.resolver_text(network.name_servers(card.root))
+    text = resolver_text(name_servers(card.root))
     try:
         if card.resolver.exists() and card.resolver.read_text() == text:
             return

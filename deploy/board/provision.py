@@ -15,9 +15,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from deploy.board import inputs, shred, ssh
+from deploy.board import inputs
 from deploy.board.candidate import (
+    KEYS,
     RADIO,
+    SSH,
     Check,
     Record,
     build,
@@ -27,11 +29,12 @@ from deploy.board.candidate import (
 )
 from deploy.board.card import USER, Card, Owners, writable
 from deploy.board.disk import Disk, read_bounded
-from deploy.board.inputs import Inputs, digest
+from deploy.board.inputs import HOST_KEY, HOST_KEY_PUBLIC, MOST_BYTES, Inputs, digest
 from deploy.board.releases import places, shelf
 from deploy.board.releases.places import Places
 from deploy.errors import DeployError
 from deploy.provisioning.text import parse
+from deploy.run import run
 
 IN_FORCE, NONE, REFUSED = "in force", "none", "refused"
 
@@ -86,7 +89,7 @@ def provision(card: Card, disk: Disk, owners: Owners, check: Check) -> Outcome:
         outcome = replace(outcome, state=REFUSED, reason=_told(error))
     if outcome.payload_id:
         try:
-            ssh.install(card, disk, owners)
+            install(card, disk, owners)
         except (DeployError, OSError) as error:
             outcome = replace(outcome, warning=f"SSH is not set up: {_told(error)}")
     return replace(outcome, wifi=(card.blimp / RADIO).exists())
@@ -109,10 +112,10 @@ def _take(card: Card, disk: Disk, owners: Owners, check: Check, held: Record | N
         # Taken at an earlier boot, which ended before its password was out.
         kept = kept_toml(found.toml, parse(found.toml))
     warning = ""
-    if shred.is_needed(card, kept):
+    if inputs.is_needed(card, kept):
         try:
             with writable(card):
-                shred.shred(card, disk, kept)
+                inputs.shred(card, disk, kept)
         except (DeployError, OSError) as error:
             warning = f"the secrets are still on the boot partition: {_told(error)}"
     disk.remove(_beside(card)[1])
@@ -193,6 +196,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = [f"provision: {outcome.state}", outcome.payload_id, outcome.reason, outcome.warning]
     print(": ".join(word for word in words if word), flush=True)
     return 0
+
+
+HOST_KEY_FILE = "ssh_host_ed25519_key"
+
+
+def install(card: Card, disk: Disk, owners: Owners) -> None:
+    """Host key and authorized_keys; without a key of a person's, no authorized_keys, so no sshd.
+
+    The host key is the one that came with the certificates, so that the ground station knows this
+    payload by it; without one, a key of the card's own. Raises `DeployError` and `OSError`.
+    """
+    source = card.blimp / SSH
+    authorized = read_bounded(source / KEYS, MOST_BYTES)
+    if authorized is None:
+        disk.remove(card.ssh / KEYS)
+        return
+    if not card.ssh.is_dir():
+        disk.make_folder(card.ssh, 0o755, owners.root)
+    host = read_bounded(source / HOST_KEY, MOST_BYTES)
+    public = read_bounded(source / HOST_KEY_PUBLIC, MOST_BYTES)
+    key = card.ssh / HOST_KEY_FILE
+    if host is not None:
+        _put(disk, key, host, 0o600, owners)
+        if public is not None:
+            _put(disk, Path(f"{key}.pub"), public, 0o644, owners)
+    elif not key.is_file():
+        _make(disk, key)
+    # sshd reads it as the one who logs in.
+    _put(disk, card.ssh / KEYS, authorized, 0o644, owners)
+
+
+def _put(disk: Disk, path: Path, data: bytes, mode: int, owners: Owners) -> None:
+    if read_bounded(path, MOST_BYTES) == data:
+        return
+    part = path.with_name(path.name + ".part")
+    disk.write(part, data, mode, owners.root)
+    disk.rename(part, path)
+
+
+def _make(disk: Disk, key: Path) -> None:
+    part = key.with_name(key.name + ".part")
+    for path in (part, Path(f"{part}.pub")):
+        disk.remove(path)
+    run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", part], timeout_s=60)
+    disk.rename(Path(f"{part}.pub"), Path(f"{key}.pub"))
+    disk.rename(part, key)
 
 
 if __name__ == "__main__":

@@ -11,17 +11,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from deploy.errors import DeployError
-from deploy.provisioning import toml_text
+from deploy.provisioning import text as toml
 from deploy.provisioning.model import Provisioning
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
 CABLE, RADIO = "eth0", "wlan0"
 
 
-def read(text: bytes, name: str) -> dict[str, Any]:
+def read(data: bytes, name: str) -> dict[str, Any]:
     """A TOML file's document; raises `DeployError` that begins with `name`."""
     try:
-        return toml_text.read(text)
+        return toml.read(data)
     except DeployError as error:
         raise DeployError(f"{name}: {error}") from None
 
@@ -88,12 +88,12 @@ def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else toml_text.string(key)
+    return key if _BARE.fullmatch(key) else toml.string(key)
 
 
 def _value(value: Any, name: str) -> str:
     if isinstance(value, str):
-        return toml_text.string(value)
+        return toml.string(value)
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):

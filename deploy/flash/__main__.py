@@ -11,12 +11,12 @@ from pathlib import Path
 
 from deploy.board.inputs import SIGNERS
 from deploy.errors import DeployError, Interrupted
-from deploy.flash import customise, image, keys, refusals, wishes, write
+from deploy.flash import customise, disks, image, keys, wishes, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
 from deploy.flash.disks import Disk, Machine
-from deploy.flash.target import Target
 from deploy.flash.wishes import WifiOptions
+from deploy.flash.write import Target
 from deploy.provisioning.model import Provisioning, Wifi
 
 _INTERRUPTED = 130  # as a shell says it: 128 and SIGINT's number
@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> None:
     device = options.device
     if not options.customise_only:
         _needed(options)
-    disk = refusals.find(Machine(), device)
+    disk = disks.find(Machine(), device)
     if options.customise_only:
         with Target.open(device) as target:
             boot = BootPartition.find(target.fileno(), str(device))
@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace) -> None:
         image.opened(options.image, checksum=not options.no_checksum, board=options.board) as card,
         Target.open(device) as target,
     ):
-        refusals.check_size(device, target.size, card.size)
+        disks.check_size(device, target.size, card.size)
         content = _content(options, None)
         customise.check_room(card.boot, content)
         print(f"image: {card.path.name}{_of_board(card)}")
@@ -198,7 +198,7 @@ def _ssh_keys(
 
 def _confirm(options: argparse.Namespace, disk: Disk | None, target: Target, what: str) -> None:
     """Shows the device and lets its name be typed; raises `DeployError` when it is another one."""
-    print(refusals.describe(target.path, disk, target.size), flush=True)
+    print(disks.describe(target.path, disk, target.size), flush=True)
     if options.yes:
         return
     name = target.path.name

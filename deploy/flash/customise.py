@@ -16,7 +16,7 @@ from deploy.board import settings
 from deploy.errors import DeployError, Interrupted
 from deploy.flash.boot import FOLDER, BootPartition
 from deploy.flash.keys import Keys
-from deploy.flash.target import Target
+from deploy.flash.write import Target
 from deploy.provisioning.model import Provisioning
 from deploy.provisioning.text import parse, render
 from deploy.run import run

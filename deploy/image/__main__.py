@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import card, checkout, raspios
+from deploy.image import card, raspios, release
 from deploy.image.packages.board import load_board, with_archives
 from deploy.image.packages.kernel import unpack_kernel
 from deploy.image.packages.python import byte_compile
@@ -114,7 +114,7 @@ def _epoch(options: argparse.Namespace) -> int:
         return int(options.epoch)
     given = os.environ.get("SOURCE_DATE_EPOCH")
     if given is None:
-        return checkout.epoch(_CHECKOUT)
+        return release.epoch(_CHECKOUT)
     if not given.isdigit():
         raise DeployError(f"SOURCE_DATE_EPOCH='{given}': not a number of seconds")
     return int(given)

@@ -9,19 +9,24 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import json
 import os
+import re
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deploy.errors import DeployError
-from deploy.image import boot, ext4, fat, initrd, manifest, partitions, release, root
+from deploy.image import boot, ext4, fat, initrd, partitions, release, root
 from deploy.image.packages.board import Board
 from deploy.image.packages.kernel import Kernel
-from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two
-from deploy.image.sparse import sha256
+from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two, table
+from deploy.image.release import folder_files, utc
+from deploy.image.sparse import Range, sha256
 from deploy.image.tree import Tree
 from deploy.run import run
 
@@ -107,14 +112,12 @@ def build(
         size = align(ext4.bytes_needed(tree))
         ext4.make(place, size, tree, ROOT_LABEL, new.uuid("root"), epoch)
         say("boot and data partition, image, block map and checksums")
-        packages = manifest.packages_of(tree)
-        told = manifest.Told(board.name, checkout, epoch, packages, site, units)
+        packages = packages_of(tree)
+        told = Told(board.name, checkout, epoch, packages, site, units)
         finish(work / image.name, front, place, new, told)
 
 
-def finish(
-    image: Path, front: Tree, root_place: Path, new: Identifiers, told: manifest.Told
-) -> None:
+def finish(image: Path, front: Tree, root_place: Path, new: Identifiers, told: Told) -> None:
     """Puts an image together from a boot partition's files and a root partition's file system.
 
     Adds the data partition, empty: the card makes its folders and grows it. Writes block map,
@@ -137,7 +140,7 @@ def finish(
     run(["bmaptool", "create", "-o", beside(image, ".bmap"), image])
     digest = sha256(image)
     beside(image, ".sha256").write_text(f"{digest}  {image.name}\n")
-    manifest.write(image, beside(image, ".manifest.json"), digest, told)
+    write(image, beside(image, ".manifest.json"), digest, told)
 
 
 def check_epoch(epoch: int) -> None:
@@ -190,3 +193,105 @@ def _files(folder: Path) -> list[str]:
     if not found:
         raise DeployError(f"{folder}: no files in it")
     return found
+
+
+SCHEMA = "blimp.image/1"
+_PARTITIONS = ("boot", "root", "data")
+_NUMBER = re.compile(r"\d\.\d")
+
+# The tools whose work is in the bytes, and how each says its version.
+_TOOLS = {
+    "debugfs": ["debugfs", "-V"],
+    "mcopy": ["mcopy", "--version"],
+    "mke2fs": ["mke2fs", "-V"],
+    # mkfs.vfat says its version only at work; its sister of the same package always.
+    "mkfs.vfat": ["fsck.vfat", "-n", "/dev/null"],
+    "sfdisk": ["sfdisk", "--version"],
+}
+
+
+@dataclass(frozen=True)
+class Told:
+    """What an image does not tell by itself.
+
+    Attributes:
+        board, checkout, epoch: what it was made for, of and at.
+        packages: name, version, architecture of what is installed.
+        site: the unpacked wheels.
+        units: that are enabled.
+        base: the image that it was made from, if any.
+    """
+
+    board: str
+    checkout: Path
+    epoch: int
+    packages: Sequence[tuple[str, str, str]]
+    site: Path | None
+    units: Sequence[str]
+    base: Path | None = None
+
+
+def write(image: Path, to: Path, digest: str, told: Told) -> None:
+    """Writes the manifest of a finished image, whose SHA-256 in hex is `digest`."""
+    partitions = []
+    for name, part in zip(_PARTITIONS, table(image), strict=True):
+        span = Range(part["start"], part["start"] + part["size"])
+        partitions.append({"name": name, **part, "sha256": sha256(image, span)})
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "board": told.board,
+        "version": release.version(told.checkout),
+        "revision": release.revision(told.checkout),
+        "epoch": told.epoch,
+        "made": utc(told.epoch),
+        "image": {"size": image.stat().st_size, "sha256": digest},
+        "partitions": partitions,
+        "units": list(told.units),
+        "packages": [
+            {"name": name, "version": version, "architecture": architecture}
+            for name, version, architecture in told.packages
+        ],
+        "wheels": wheels(told.site),
+        "wheels_sha256": _all_files(told.site),
+        "tools": {name: _version(words) for name, words in _TOOLS.items()},
+    }
+    if told.base is not None:
+        document["base"] = {"name": told.base.name, "sha256": sha256(told.base)}
+    to.write_text(json.dumps(document, indent=2) + "\n")
+
+
+def packages_of(tree: Tree) -> list[tuple[str, str, str]]:
+    """Name, version and architecture of what dpkg calls installed in a tree, if it was there."""
+    path = "var/lib/dpkg/status"
+    status = tree.read(path).decode("utf-8", "replace") if path in tree else ""
+    found = []
+    for stanza in status.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in stanza.splitlines() if ": " in line[1:])
+        if fields.get("Status", "").endswith(" installed"):
+            found.append((fields["Package"], fields["Version"], fields["Architecture"]))
+    return sorted(found)
+
+
+def wheels(site: Path | None) -> list[dict[str, str]]:
+    """Name, version and the hash of its list of files (RECORD) of each unpacked wheel."""
+    result = []
+    for info in sorted(site.glob("*.dist-info")) if site is not None else ():
+        name, _, version = info.name.removesuffix(".dist-info").rpartition("-")
+        record = info / "RECORD"
+        digest = sha256(record) if record.is_file() else ""
+        result.append({"name": name, "version": version, "record_sha256": digest})
+    return result
+
+
+def _all_files(site: Path | None) -> str:
+    """One hash over all files of the wheels, as of what `sha256sum` prints for them."""
+    whole = hashlib.sha256()
+    if site is not None:
+        for path in folder_files(site):
+            whole.update(f"{sha256(site / path)}  {path}\n".encode())
+    return whole.hexdigest()
+
+
+def _version(words: list[str]) -> str:
+    said = run(words, merge=True, ok=(0, 1)).decode(errors="replace")
+    return next((line.strip() for line in said.splitlines() if _NUMBER.search(line)), "")

@@ -16,20 +16,9 @@ import shutil
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import (
-    boot,
-    card,
-    ext4,
-    ext4_read,
-    initrd,
-    manifest,
-    partitions,
-    release,
-    root,
-)
+from deploy.image import boot, card, ext4, initrd, partitions, release, root
 from deploy.image.card import Identifiers, building
-from deploy.image.packages import layer
-from deploy.image.packages.base import add_packages
+from deploy.image.packages.base import add_packages, lay_over
 from deploy.image.packages.board import Board
 from deploy.image.partitions import FAT32_LBA, LINUX
 from deploy.image.sparse import Range, cut_out, sha256
@@ -76,7 +65,7 @@ def build(
         contents = work / "contents"
         contents.mkdir()
         run(["e2fsck", "-fp", root_place], ok=(0, 1), env=ext4.clock(epoch))
-        before = ext4_read.read_tree(root_place, _is_wanted, contents)
+        before = ext4.read_tree(root_place, _is_wanted, contents)
         missing = _check(base, before, board)
         tree = Tree()
         for path, entry in before.items():
@@ -85,8 +74,8 @@ def build(
         if missing:
             say(f"{len(missing)} packages that the base lacks (emulated, the first time)")
             added = add_packages(board, digest_of_base, root_place, before, missing, cache_folder)
-            layer.lay_over(tree, Tree.from_tar(added))
-        packages = manifest.packages_of(tree)
+            lay_over(tree, Tree.from_tar(added))
+        packages = card.packages_of(tree)
         firmware = release.build(checkout, site, board.machine, board.python, epoch)
         units = root.customise(tree, checkout, board.name, firmware, epoch)
         ours = tree.changed(before)
@@ -100,7 +89,7 @@ def build(
         files = _boot_files(base, boot_place, work / "base-files")
         front = boot.contents(board.name, _KERNEL, board.machine, files, first, where)
         say("boot and data partition, image, block map and checksums")
-        told = manifest.Told(board.name, checkout, epoch, packages, site, units, base)
+        told = card.Told(board.name, checkout, epoch, packages, site, units, base)
         card.finish(work / image.name, front, root_place, new, told)
 
 
@@ -144,7 +133,7 @@ def _check(base: Path, tree: Tree, board: Board) -> list[str]:
     codename = says.get("VERSION_CODENAME", "")
     if codename != board.suite:
         raise DeployError(f"{base}: of '{codename}'; expected '{board.suite}'")
-    packages = manifest.packages_of(tree)
+    packages = card.packages_of(tree)
     architectures = {row[2] for row in packages if row[0] == "base-files"}
     if architectures != {board.architecture}:
         found = ", ".join(architectures) or "no package base-files"

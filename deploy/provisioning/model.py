@@ -2,14 +2,102 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import dataclasses
 import ipaddress
 import re
 from dataclasses import dataclass, field
 
 from deploy.errors import DeployError
-from deploy.provisioning.countries import check_country
-from deploy.provisioning.ssh_keys import check_authorized_key
+
+TYPES = (
+    "ssh-ed25519",
+    "ecdsa-sha2-nistp256",
+    "ecdsa-sha2-nistp384",
+    "ecdsa-sha2-nistp521",
+    "ssh-rsa",
+    "sk-ssh-ed25519@openssh.com",
+    "sk-ecdsa-sha2-nistp256@openssh.com",
+)
+MAX_BYTES = 8192
+# sshd's own least size; shorter ones it refuses at log-in, which nobody would understand.
+MIN_RSA_BITS = 2048
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+
+
+def check_authorized_key(line: str, what: str) -> str:
+    """Returns the line without blanks around it; raises `DeployError` when it is no public key.
+
+    The key's bytes must begin with its type (RFC 4253, 6.6), so a line cut while it was copied is
+    found here and not when the card is out of reach. `what` names the line in the error.
+    """
+    text = line.strip()
+    if "PRIVATE KEY" in text:
+        raise DeployError(f"{what} is a private key; give the public one, the file with .pub")
+    if _UNPRINTABLE.search(text) or len(text.encode()) > MAX_BYTES:
+        raise DeployError(f"{what}: expected one line of at most {MAX_BYTES} bytes")
+    kind, _, rest = text.partition(" ")
+    if kind not in TYPES:
+        raise DeployError(
+            f"{what} starts with {kind[:30]!r}; expected 'TYPE KEY NAME' without options, TYPE one"
+            f" of {', '.join(TYPES)}"
+        )
+    try:
+        blob = base64.b64decode(rest.split(" ")[0], validate=True)
+        parts = _strings(blob)
+    except (binascii.Error, ValueError):
+        parts = []
+    if len(parts) < 2 or parts[0] != kind.encode():
+        raise DeployError(f"{what}: the key after {kind} is cut or damaged")
+    if kind == "ssh-rsa":
+        bits = int.from_bytes(parts[-1], "big").bit_length()
+        if bits < MIN_RSA_BITS:
+            raise DeployError(f"{what} is an RSA key of {bits} bits; allowed: {MIN_RSA_BITS} on")
+    return text
+
+
+def _strings(blob: bytes) -> list[bytes]:
+    """SSH's strings in a row, each after its length; raises `ValueError` when they don't fit."""
+    parts = []
+    while blob:
+        length = int.from_bytes(blob[:4], "big")
+        if len(blob) < 4 + length:
+            raise ValueError("cut")
+        parts.append(blob[4 : 4 + length])
+        blob = blob[4 + length :]
+    return parts
+
+
+# ISO 3166-1 alpha-2, as the kernel's rules for radios name them. A code that the kernel does not
+# know leaves the radio on the world's common denominator without a word: the network on channel 13
+# is then never found. So a code that does not exist is refused.
+_COUNTRIES = """
+    AD AE AF AG AI AL AM AO AQ AR AS AT AU AW AX AZ BA BB BD BE BF BG BH BI BJ BL BM BN BO BQ BR BS
+    BT BV BW BY BZ CA CC CD CF CG CH CI CK CL CM CN CO CR CU CV CW CX CY CZ DE DJ DK DM DO DZ EC EE
+    EG EH ER ES ET FI FJ FK FM FO FR GA GB GD GE GF GG GH GI GL GM GN GP GQ GR GS GT GU GW GY HK HM
+    HN HR HT HU ID IE IL IM IN IO IQ IR IS IT JE JM JO JP KE KG KH KI KM KN KP KR KW KY KZ LA LB LC
+    LI LK LR LS LT LU LV LY MA MC MD ME MF MG MH MK ML MM MN MO MP MQ MR MS MT MU MV MW MX MY MZ NA
+    NC NE NF NG NI NL NO NP NR NU NZ OM PA PE PF PG PH PK PL PM PN PR PS PT PW PY QA RE RO RS RU RW
+    SA SB SC SD SE SG SH SI SJ SK SL SM SN SO SR SS ST SV SX SY SZ TC TD TF TG TH TJ TK TL TM TN TO
+    TR TT TV TW TZ UA UG UM US UY UZ VA VC VE VG VI VN VU WF WS YE YT ZA ZM ZW
+"""
+CODES = frozenset(_COUNTRIES.split())
+_OFTEN_MEANT = {"UK": "GB", "EN": "GB", "EL": "GR"}
+
+
+def check_country(code: str) -> str:
+    """Returns the code; raises `DeployError` when it is no country's."""
+    if code in CODES:
+        return code
+    capitals = code.upper()
+    meant = capitals if capitals in CODES else _OFTEN_MEANT.get(capitals)
+    hint = f" (is it {meant}?)" if meant else ""
+    raise DeployError(
+        f"'wifi.country' is {code[:20]!r}; expected the two capital letters of ISO 3166, as DE or"
+        f" US{hint}"
+    )
+
 
 WPA2, WPA3, OPEN = "wpa2", "wpa3", "open"
 SECURITIES = (WPA2, WPA3, OPEN)

@@ -19,7 +19,6 @@ from deploy.board.releases import manifest
 from deploy.board.releases.choose import MANIFEST, RELEASE
 from deploy.board.releases.receive import SIGNATURE
 from deploy.errors import DeployError
-from deploy.image import checkout as git
 from deploy.image import release as release_tree
 from deploy.run import run
 
@@ -42,7 +41,7 @@ def release_of(checkout: Path, site: Path | None, machine: str, python: str) -> 
     Changes that no commit holds give a version of their own, made now: a commit's name is that of
     its files and of no others.
     """
-    tree = release_tree.build(checkout, site, machine, python, git.epoch(checkout))
+    tree = release_tree.build(checkout, site, machine, python, release_tree.epoch(checkout))
     files = {}
     for path, entry in tree.items():
         if entry.kind == "link":

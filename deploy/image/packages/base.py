@@ -2,23 +2,28 @@
 
 The base's own sources and keys say where packages come from, as on the board itself: Raspberry Pi
 OS's are the only ones built for ARMv6. Its programs run in a chroot, emulated. Kept is what that
-changed, as a layer (`layer`), so that nothing else of the base is ever written again.
+changed, so that nothing else of the base is ever written again: a layer, a tar that lies over
+another tree. A path that is gone stands in it as in the layers of the OCI image format (image-spec,
+layer.md, "Whiteouts"): an empty file `.wh.NAME` in its folder.
 """
 
 from __future__ import annotations
 
 import fnmatch
+import io
 import os
 import shutil
 import stat
-from collections.abc import Sequence
+import tarfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image.ext4_read import unpack
-from deploy.image.packages import apt, cache, foreign, layer, libraries
+from deploy.image.ext4 import unpack
+from deploy.image.packages import apt, cache, foreign, libraries
 from deploy.image.packages.board import Board, Group
-from deploy.image.packages.long import run_long
+from deploy.image.packages.foreign import run_long
+from deploy.image.packages.python import unchecked
 from deploy.image.tree import Tree
 
 _HERE = Path(__file__).parent
@@ -65,7 +70,7 @@ def add_packages(
         board: whose.
         base: the base image's SHA-256.
         file_system: its root's, ext4 in a file; only read.
-        tree: what `ext4_read.read_tree` gave for it.
+        tree: what `ext4.read_tree` gave for it.
         missing: names of the packages.
         cache_folder: where layers are kept, as `base-BOARD-KEY.tar`.
 
@@ -74,7 +79,7 @@ def add_packages(
             package isn't there or doesn't install; nothing half-made is left. What the tools said
             then stands in `base-BOARD.log` there.
     """
-    made_by = (_RECIPE, *(_HERE / name for name in ("install.sh", "plugins.sh", "layer.py")))
+    made_by = (_RECIPE, *(_HERE / name for name in ("install.sh", "plugins.sh", "base.py")))
     names = sorted(missing)
     key = cache.key(base, board.architecture, names, board.left_out, *made_by)
     target = cache_folder / f"base-{board.name}-{key}.tar"
@@ -95,7 +100,7 @@ def add_packages(
             )
         root = work / "root"
         unpack(file_system, tree, root)
-        before = layer.snapshot(root, _not_kept)
+        before = snapshot(root, _not_kept)
         lacked = set(libraries.missing(root))
         (root / _SETTINGS).parent.mkdir(parents=True, exist_ok=True)
         (root / _SETTINGS).write_text(apt.SETTINGS + _OPTIONS)
@@ -119,18 +124,18 @@ def add_packages(
         )
         if lost := sorted(set(libraries.missing(root)) - lacked):
             raise DeployError(f"packages of {board.name}: misses a library: {lost[0]}")
-        layer.write(root, before, layer.snapshot(root, _not_kept), work / target.name)
+        write(root, before, snapshot(root, _not_kept), work / target.name)
     return target
 
 
-def leave_out(root: Path, before: dict[str, layer.State], rules: Sequence[Group]) -> None:
+def leave_out(root: Path, before: dict[str, State], rules: Sequence[Group]) -> None:
     """Takes what is new and left out on purpose from a root; what the base had, it keeps.
 
     dpkg itself, told so, would leave it out of an upgrade of the base's own packages, too. As with
     dpkg, the last rule that fits counts.
     """
     patterns = [name for group in rules for name in group.names]
-    states = layer.snapshot(root, _not_kept)
+    states = snapshot(root, _not_kept)
     # What lies in a folder goes before it.
     for path in sorted(states.keys() - before.keys(), reverse=True):
         fits = [name for name in patterns if fnmatch.fnmatchcase(f"/{path}", name.lstrip("!"))]
@@ -144,3 +149,105 @@ def leave_out(root: Path, before: dict[str, layer.State], rules: Sequence[Group]
 
 def _not_kept(path: str) -> bool:
     return any(fnmatch.fnmatchcase(path, pattern) for pattern in _NOT_KEPT)
+
+
+_GONE = ".wh."
+_CAPABILITY = "security.capability"
+
+# What tells one state of a file from another; of a folder only its mode and owners.
+State = tuple[int, ...]
+
+
+def snapshot(folder: Path, ignored: Callable[[str], bool]) -> dict[str, State]:
+    """The state of every file, folder and link below a folder, by its path from there.
+
+    Args:
+        folder: looked through without following links.
+        ignored: tells by a path whether it, and all below it, is none of ours.
+    """
+    return dict(_states(folder, "", ignored))
+
+
+def _states(top: Path, folder: str, ignored: Callable[[str], bool]) -> Iterator[tuple[str, State]]:
+    with os.scandir(top / folder) as entries:
+        for entry in entries:
+            path = f"{folder}{entry.name}"
+            if ignored(path):
+                continue
+            facts = entry.stat(follow_symlinks=False)
+            state: State = (facts.st_mode, facts.st_uid, facts.st_gid)
+            if entry.is_dir(follow_symlinks=False):
+                yield path, state
+                yield from _states(top, f"{path}/", ignored)
+            elif entry.is_file(follow_symlinks=False) or entry.is_symlink():
+                # Not the time of its inode: a second name that came and went changes nothing.
+                yield path, (*state, facts.st_ino, facts.st_size, facts.st_mtime_ns)
+
+
+def write(folder: Path, before: dict[str, State], after: dict[str, State], target: Path) -> None:
+    """Writes what lies between two snapshots of a folder as a tar, sorted.
+
+    Owners, modes and capabilities are the folder's. Byte code no longer asks for its source's time,
+    which a card's may not keep. Folders above a change are in it as they are.
+    """
+    gone = {path for path, old in before.items() if not _same_kind(old, after.get(path))}
+    # A folder that is gone takes what was in it along.
+    gone = {path for path in gone if not any(above in gone for above in _above(path))}
+    changed = {path for path, state in after.items() if before.get(path) != state}
+    folders = {above for path in (*changed, *gone) for above in _above(path)}
+    with tarfile.open(target, "w", format=tarfile.PAX_FORMAT) as tar:
+        for path in sorted(gone):
+            head, _, name = path.rpartition("/")
+            tar.addfile(tarfile.TarInfo(f"{head}/{_GONE}{name}".lstrip("/")))
+        for path in sorted(changed | (folders & after.keys())):
+            _add(tar, folder / path, path)
+
+
+def _add(tar: tarfile.TarFile, place: Path, path: str) -> None:
+    member = tar.gettarinfo(place, path)
+    member.uname = member.gname = ""
+    member.mtime = int(member.mtime)
+    if not member.isreg():
+        tar.addfile(member)
+        return
+    if _CAPABILITY in os.listxattr(place, follow_symlinks=False):
+        value = os.getxattr(place, _CAPABILITY, follow_symlinks=False)
+        text = value.decode("utf-8", "surrogateescape")
+        member.pax_headers = {f"SCHILY.xattr.{_CAPABILITY}": text}
+    if place.suffix == ".pyc" and place.parent.name == "__pycache__":
+        data = unchecked(place.read_bytes())
+        member.size = len(data)
+        tar.addfile(member, io.BytesIO(data))
+        return
+    with place.open("rb") as file:
+        tar.addfile(member, file)
+
+
+def lay_over(tree: Tree, layer: Tree) -> None:
+    """Changes a tree as a layer says; what the layer doesn't name stays the very entry it was."""
+    entries = list(layer.items())
+    for path, _ in entries:
+        head, _, name = path.rpartition("/")
+        if name.startswith(_GONE):
+            tree.remove(f"{head}/{name.removeprefix(_GONE)}")
+    for path, entry in entries:
+        if path.rpartition("/")[2].startswith(_GONE):
+            continue
+        old = tree[path] if entry.kind == "folder" and path in tree else entry
+        same = (old.kind, old.mode, old.uid, old.gid) == (
+            "folder",
+            entry.mode,
+            entry.uid,
+            entry.gid,
+        )
+        if old is entry or not same:
+            tree.put(path, entry)
+
+
+def _same_kind(old: State, new: State | None) -> bool:
+    return new is not None and stat.S_IFMT(old[0]) == stat.S_IFMT(new[0])
+
+
+def _above(path: str) -> list[str]:
+    parts = path.split("/")[:-1]
+    return ["/".join(parts[:count]) for count in range(1, len(parts) + 1)]

@@ -1,12 +1,19 @@
 """Compiles Python for the card with the card's own Python, emulated: no root, nothing installed.
 
-On a read-only root no byte code can be kept, so each start would compile the firmware again.
+On a read-only root no byte code can be kept, so each start would compile the firmware again. And
+a `.pyc` names the time of its source, and one that doesn't match is compiled again, whenever the
+image's times are clamped: PEP 552 lets it name the source's hash instead, and not look.
+
+    python -m deploy.image.packages.python ROOT
+
+settles so all byte code in a root file system.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -96,3 +103,30 @@ def _take(board: Board, rootfs: Path, root: Path) -> None:
             place.chmod(entry.mode & 0o777)
         elif entry.kind == "link":
             place.symlink_to(entry.target)
+
+
+_HEADER_BYTES = 16
+_MAGIC_BYTES = 4
+_UNCHECKED_HASH = (1).to_bytes(4, "little")
+# What PEP 552 fills with the source's hash; nobody compares it in an unchecked file.
+_NO_HASH = bytes(8)
+
+
+def unchecked(data: bytes) -> bytes:
+    """A `.pyc` file's bytes with a header (PEP 552) that asks for no comparison with its source."""
+    return data[:_MAGIC_BYTES] + _UNCHECKED_HASH + _NO_HASH + data[_HEADER_BYTES:]
+
+
+def settle(root: Path) -> int:
+    """Rewrites every cached `.pyc` under `root`; how many there are."""
+    count = 0
+    for path in sorted(root.glob("usr/**/__pycache__/*.pyc")):
+        data = path.read_bytes()
+        if len(data) > _HEADER_BYTES and not path.is_symlink():
+            path.write_bytes(unchecked(data))
+            count += 1
+    return count
+
+
+if __name__ == "__main__":
+    settle(Path(sys.argv[1]))

@@ -11,7 +11,7 @@ from pathlib import Path
 from deploy.errors import DeployError
 from deploy.image.packages import apt, cache, foreign
 from deploy.image.packages.board import Board
-from deploy.image.packages.long import run_long
+from deploy.image.packages.foreign import run_long
 
 _HERE = Path(__file__).parent
 # Raised when this module makes another tar of the same inputs.
@@ -37,7 +37,7 @@ def build_rootfs(board: Board, cache_folder: Path, epoch: int) -> Path:
             package isn't there; nothing half-made is left. What the tools said then stands in
             `rootfs-BOARD.log` there.
     """
-    made_by = (_RECIPE, *(_HERE / name for name in ("finish.sh", "plugins.sh", "bytecode.py")))
+    made_by = (_RECIPE, *(_HERE / name for name in ("finish.sh", "plugins.sh", "python.py")))
     inputs = (board.architecture, board.suite, board.archives, board.packages, board.left_out)
     target = cache_folder / f"rootfs-{board.name}-{cache.key(*inputs, epoch, *made_by)}.tar"
     with cache.made(target) as work:
@@ -97,7 +97,7 @@ def _mmdebstrap(board: Board, work: Path, tar: Path) -> list[str]:
         # `finish.sh` takes them away as it would real ones.
         f'--essential-hook=mkdir -p "$1/etc/ssh"; cd "$1/etc/ssh"; touch {_HOST_KEYS}',
         f'--customize-hook={python}.libraries "$1"',
-        f'--customize-hook={python}.bytecode "$1"',
+        f'--customize-hook={python}.python "$1"',
         f"--customize-hook={plugins}",
         f"--customize-hook={finish}",
         "--format=tar",

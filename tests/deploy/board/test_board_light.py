@@ -9,13 +9,11 @@ from typing import Any
 import pytest
 from board_cards import FastDisk, Person
 
-from deploy.board import faults, light, network, provision, status
-from deploy.board.faults import Fault
-from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Teller, View
-from deploy.board.network import Link
+from deploy.board import light, provision, status
+from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Link, StatusLed, Teller, View
 from deploy.board.releases.places import Places
 from deploy.board.releases.service import Seen
-from deploy.board.status_led import StatusLed
+from deploy.board.status import Fault
 from deploy.errors import DeployError
 
 GOOD = {"state": provision.IN_FORCE, "payload_id": "blimp-1", "wifi": True}
@@ -81,14 +79,14 @@ def test_a_kernel_without_the_heartbeat_and_a_board_without_a_light(
 
 JUDGED: list[tuple[View, Fault | None, bool]] = [
     (View(GOOD, firmware=STREAMS, links=UP), None, True),
-    (View(GOOD, "it could not be mounted", STREAMS, UP), faults.NO_DATA, False),
-    (View({"state": provision.NONE, "reason": ""}), faults.NO_PROVISIONING, False),
-    (View({"state": provision.NONE, "reason": "no user"}), faults.REFUSED, False),
-    (View({**GOOD, "state": provision.REFUSED}, "", STREAMS, UP), faults.REFUSED, True),
-    (View({}), faults.REFUSED, False),
-    (View(GOOD, links=UP), faults.NO_VIDEO, False),
-    (View(GOOD, firmware=STREAMS), faults.NO_NETWORK, True),
-    (View(GOOD, firmware=STREAMS, links=(Link("wlan0", True, ""),)), faults.NO_NETWORK, True),
+    (View(GOOD, "it could not be mounted", STREAMS, UP), status.NO_DATA, False),
+    (View({"state": provision.NONE, "reason": ""}), status.NO_PROVISIONING, False),
+    (View({"state": provision.NONE, "reason": "no user"}), status.REFUSED, False),
+    (View({**GOOD, "state": provision.REFUSED}, "", STREAMS, UP), status.REFUSED, True),
+    (View({}), status.REFUSED, False),
+    (View(GOOD, links=UP), status.NO_VIDEO, False),
+    (View(GOOD, firmware=STREAMS), status.NO_NETWORK, True),
+    (View(GOOD, firmware=STREAMS, links=(Link("wlan0", True, ""),)), status.NO_NETWORK, True),
     (View(GOOD, firmware=STREAMS, links=(Link("eth0", False, "192.0.2.1"),)), None, True),
 ]
 
@@ -97,7 +95,7 @@ JUDGED: list[tuple[View, Fault | None, bool]] = [
 def test_the_worst_fault_is_told(view: View, fault: Fault | None, streams: bool) -> None:
     judge = Judge(100.0)
     early, _ = judge.fault(view, 100.0)
-    if fault in (faults.NO_VIDEO, faults.NO_NETWORK):
+    if fault in (status.NO_VIDEO, status.NO_NETWORK):
         assert early is None  # the first frame and the first address take their time
         assert judge.fault(view, 99.9 + PATIENCE_S)[0] is None
     assert judge.fault(view, 100.0 + PATIENCE_S) == (fault, streams)
@@ -109,7 +107,7 @@ def test_a_firmware_that_comes_and_goes_is_given_time_again() -> None:
     assert judge.fault(down, 80.0)[0] is None
     assert judge.fault(up, 85.0) == (None, True)
     assert judge.fault(down, 85.0 + PATIENCE_S - 1) == (None, False)
-    assert judge.fault(down, 85.0 + PATIENCE_S)[0] is faults.NO_VIDEO
+    assert judge.fault(down, 85.0 + PATIENCE_S)[0] is status.NO_VIDEO
 
 
 def test_the_first_start_of_the_firmware_may_take_longer() -> None:
@@ -117,13 +115,13 @@ def test_the_first_start_of_the_firmware_may_take_longer() -> None:
     first = View(GOOD, firmware=Seen(said="activating"), links=UP)
     again = View(GOOD, firmware=Seen(said="activating", restarts=1), links=UP)
     assert judge.fault(first, PATIENCE_S)[0] is None
-    assert judge.fault(again, PATIENCE_S)[0] is faults.NO_VIDEO
-    assert judge.fault(first, light.START_S)[0] is faults.NO_VIDEO
+    assert judge.fault(again, PATIENCE_S)[0] is status.NO_VIDEO
+    assert judge.fault(first, light.START_S)[0] is status.NO_VIDEO
 
 
 def test_every_fault_has_its_own_number_of_blinks() -> None:
-    assert [fault.blinks for fault in faults.ALL] == [2, 3, 4, 5, 6]
-    assert all(fault.fix.endswith(".") for fault in faults.ALL)
+    assert [fault.blinks for fault in status.ALL] == [2, 3, 4, 5, 6]
+    assert all(fault.fix.endswith(".") for fault in status.ALL)
 
 
 class Written(FastDisk):
@@ -138,13 +136,13 @@ class Written(FastDisk):
 def test_the_card_is_written_to_when_a_state_has_settled_and_seldom(person: Person) -> None:
     disk = Written()
     teller = Teller(person.card, disk, 0.0)
-    teller.tell(faults.NO_NETWORK, True, lambda: b"no network", 10.0)
-    teller.tell(faults.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S - 1)
+    teller.tell(status.NO_NETWORK, True, lambda: b"no network", 10.0)
+    teller.tell(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S - 1)
     assert disk.count == 0
-    teller.tell(faults.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S)
+    teller.tell(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S)
     assert (person.card.boot / "STATUS.txt").read_bytes() == b"no network"
     for second in range(100):
-        teller.tell(faults.NO_NETWORK, True, lambda: b"other words", 50.0 + second)
+        teller.tell(status.NO_NETWORK, True, lambda: b"other words", 50.0 + second)
     assert disk.count == 1
     teller.tell(None, False, lambda: b"starting", 200.0)
     teller.tell(None, False, lambda: b"starting", 400.0)
@@ -152,7 +150,7 @@ def test_the_card_is_written_to_when_a_state_has_settled_and_seldom(person: Pers
     for turn in range(50):  # it comes and goes all flight long
         now_s = 1000.0 + 100 * turn
         text = f"turn {turn}".encode()
-        fault = faults.NO_NETWORK if turn % 2 else None
+        fault = status.NO_NETWORK if turn % 2 else None
         teller.tell(fault, True, lambda: b"never", now_s)
         teller.tell(fault, True, lambda text=text: text, now_s + SETTLED_S)
     assert disk.count == light.MOST_WRITES
@@ -171,7 +169,7 @@ def test_a_boot_partition_that_is_not_there_is_said_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     teller = Teller(light.Card(tmp_path), FastDisk(), 0.0)
-    for fault in faults.ALL:
+    for fault in status.ALL:
         teller.tell(fault, False, lambda: b"", 0.0)
         teller.tell(fault, False, lambda: b"", SETTLED_S)
     assert (
@@ -188,17 +186,17 @@ def test_status_txt_names_everything_and_how_to_mend_it(
     running.parent.mkdir(parents=True)
     running.write_text(json.dumps({"version": "0.2.0", "how": "fell back\r\nFAULT: forged"}))
     monkeypatch.setattr(
-        light.journal,
+        status,
         "said",
         lambda unit: ["wlan0: CTRL-EVENT-SSID-TEMP-DISABLED reason=WRONG_KEY"],
     )
     view = View({**GOOD, "warning": "SSH is not set up: ö"}, firmware=STREAMS, links=UP)
-    text = light.text_of(card, faults.NO_NETWORK, view)
+    text = light.text_of(card, status.NO_NETWORK, view)
     lines = text.decode().split("\r\n")
     assert "\n" not in "".join(lines)
     assert "State:    FAULT: no network (5 blinks)" in lines
     assert "Reason:   the network refuses the password" in lines
-    assert f"To fix:  {faults.NO_NETWORK.fix}" in lines
+    assert f"To fix:  {status.NO_NETWORK.fix}" in lines
     assert "Warning:  SSH is not set up: ö" in lines
     assert "Payload:  blimp-1" in lines
     assert "Network:  wlan0 192.0.2.7" in lines
@@ -212,25 +210,25 @@ def test_a_good_card_says_so(person: Person) -> None:
 
 
 REASONS: list[tuple[Fault, View, list[str], str]] = [
-    (faults.NO_DATA, View(GOOD, "it could not be mounted"), [], "it could not be mounted"),
-    (faults.REFUSED, View({"reason": "blimp.toml: x"}), [], "blimp.toml: x"),
-    (faults.REFUSED, View({}), [], "the program that reads this folder did not come to an end"),
+    (status.NO_DATA, View(GOOD, "it could not be mounted"), [], "it could not be mounted"),
+    (status.REFUSED, View({"reason": "blimp.toml: x"}), [], "blimp.toml: x"),
+    (status.REFUSED, View({}), [], "the program that reads this folder did not come to an end"),
     (
-        faults.NO_VIDEO,
+        status.NO_VIDEO,
         View(GOOD),
         ["start: release 1", "pi_firmware: no camera", "Traceback", "start: release 1"],
         "no camera",
     ),
-    (faults.NO_VIDEO, View(GOOD, firmware=Seen(said="failed")), ["start: release 1"], "failed"),
-    (faults.NO_NETWORK, View(GOOD), [], "this board has no radio, or its driver did not start"),
+    (status.NO_VIDEO, View(GOOD, firmware=Seen(said="failed")), ["start: release 1"], "failed"),
+    (status.NO_NETWORK, View(GOOD), [], "this board has no radio, or its driver did not start"),
     (
-        faults.NO_NETWORK,
+        status.NO_NETWORK,
         View(GOOD, links=(Link("wlan0", True, ""),)),
         ["4-Way Handshake failed", "CTRL-EVENT-NETWORK-NOT-FOUND"],
         "the network is not in reach, or has another name",
     ),
     (
-        faults.NO_NETWORK,
+        status.NO_NETWORK,
         View({**GOOD, "wifi": False}),
         [],
         "no cable, or nobody there who gives addresses",
@@ -242,12 +240,12 @@ REASONS: list[tuple[Fault, View, list[str], str]] = [
 def test_the_cause_is_told_as_far_as_it_is_known(
     monkeypatch: pytest.MonkeyPatch, fault: Fault, view: View, lines: list[str], told: str
 ) -> None:
-    monkeypatch.setattr(light.journal, "said", lambda unit: lines)
+    monkeypatch.setattr(status, "said", lambda unit: lines)
     assert light.reason(fault, view) == told
 
 
 def test_what_others_say_is_one_printable_line_of_bounded_length() -> None:
-    line = light.journal.one_line("a\x1b[31m\r\nState: fine\x85" + "x" * 1000)
+    line = status.one_line("a\x1b[31m\r\nState: fine\x85" + "x" * 1000)
     assert line.startswith("a [31m State: fine x") and len(line) == 300
 
 
@@ -273,12 +271,12 @@ def test_links_with_a_carrier_have_their_address(tmp_path: Path) -> None:
         if carrier:
             (folder / "carrier").write_text(f"{carrier}\n")
     (tmp_path / "sys/class/net/wlan0/phy80211").mkdir()
-    assert network.links(tmp_path, lambda name: "192.0.2.9") == [
+    assert light.links(tmp_path, lambda name: "192.0.2.9") == [
         Link("eth0", False, ""),
         Link("usb0", False, ""),
         Link("wlan0", True, "192.0.2.9"),
     ]
-    assert network.ipv4("lo") == "127.0.0.1" and network.ipv4("no-such") == ""
+    assert light.ipv4("lo") == "127.0.0.1" and light.ipv4("no-such") == ""
 
 
 def test_name_servers_are_those_of_the_networks_and_nothing_else(person: Person) -> None:

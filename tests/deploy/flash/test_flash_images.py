@@ -11,7 +11,7 @@ import pytest
 from card_bench import BOOT_OFFSET, MEBI, Bench, make_image, refused, run, sum_of, tool
 
 from deploy.errors import DeployError
-from deploy.flash import bmap
+from deploy.flash import image
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_a_boot_partition_without_room(untouched: Bench) -> None:
 
 
 def test_a_second_flasher_waits_its_turn(untouched: Bench) -> None:
-    from deploy.flash.target import Target
+    from deploy.flash.write import Target
 
     with Target.open(untouched.card):
         refused(untouched.command(), "another program writes it")
@@ -151,7 +151,7 @@ BOMB = b"""<?xml version="1.0"?><!DOCTYPE bmap [<!ENTITY a "aaaaaaaaaa">
 def test_maps_that_are_hostile_cut_or_of_another_image(untouched: Bench) -> None:
     place = Path(f"{untouched.image}.bmap")
     good, size = place.read_bytes(), untouched.image.stat().st_size
-    stretches = bmap.read(place, size)
+    stretches = image.read_map(place, size)
     assert stretches[0].start == 0 and stretches[-1].stop == size and len(stretches) > 1
 
     def signed(data: bytes) -> bytes:
@@ -187,8 +187,8 @@ def test_maps_that_are_hostile_cut_or_of_another_image(untouched: Bench) -> None
     ]
     for data, said in cases:
         place.write_bytes(data)
-        with pytest.raises(DeployError) as caught, open(untouched.image, "rb") as image:
-            if bmap.verify(image, bmap.read(place, size)) is not None:
+        with pytest.raises(DeployError) as caught, open(untouched.image, "rb") as file:
+            if image.verify(file, image.read_map(place, size)) is not None:
                 raise DeployError("not the map of this image")
         assert said in str(caught.value) and "\n" not in str(caught.value)
     for data, said in (cases[0], cases[6]):
@@ -196,4 +196,4 @@ def test_maps_that_are_hostile_cut_or_of_another_image(untouched: Bench) -> None
         refused(untouched.command(), said)
     place.write_bytes(good)
     with pytest.raises(DeployError, match="it is of an image of"):
-        bmap.read(place, size + 512)
+        image.read_map(place, size + 512)

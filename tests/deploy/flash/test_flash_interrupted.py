@@ -21,7 +21,7 @@ from deploy.errors import DeployError, Interrupted
 from deploy.flash import customise, image, keys, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
-from deploy.flash.target import Target
+from deploy.flash.write import Target
 from deploy.provisioning.model import Provisioning
 from deploy.provisioning.text import parse
 

@@ -13,9 +13,9 @@ import pytest
 from card_bench import Bench, refused, tool
 
 from deploy.errors import DeployError
-from deploy.flash import refusals
+from deploy.flash import disks
 from deploy.flash.disks import Machine
-from deploy.flash.target import Target
+from deploy.flash.write import Target
 
 REFUSED = [
     (machines.laptop, "nvme0n1", "this machine runs on it (dm-1 is mounted on /)"),
@@ -40,7 +40,7 @@ def test_it_refuses(tmp_path: Path, make: Callable[[Path], object], name: str, s
     make(tmp_path)
     machine = Machine(tmp_path)
     with pytest.raises(DeployError) as caught:
-        refusals.check(machine, machine.disk(name))
+        disks.check(machine, machine.disk(name))
     assert str(caught.value).startswith(f"/dev/{name}: ") and said in str(caught.value)
 
 
@@ -53,26 +53,26 @@ def test_it_takes_a_card_in_a_reader(
 ) -> None:
     make(tmp_path)
     machine = Machine(tmp_path)
-    refusals.check(machine, machine.disk(name))
+    disks.check(machine, machine.disk(name))
 
 
 def test_it_shows_what_a_person_knows_a_card_by(tmp_path: Path) -> None:
     machines.laptop(tmp_path)
     machine = Machine(tmp_path)
     disk = machine.disk("sdb")
-    assert refusals.describe(Path("/dev/sdb"), disk, disk.size_bytes).splitlines() == [
+    assert disks.describe(Path("/dev/sdb"), disk, disk.size_bytes).splitlines() == [
         "/dev/sdb: Generic STORAGE DEVICE, 31.9 GB, serial 000000001206",
         "  sdb1: 270 MB vfat BLIMPBOOT",
         "  sdb2: 2.1 GB ext4 blimp-root",
     ]
-    shown = refusals.describe(Path("/dev/mmcblk0"), machine.disk("mmcblk0"), 1)
+    shown = disks.describe(Path("/dev/mmcblk0"), machine.disk("mmcblk0"), 1)
     assert shown == "/dev/mmcblk0: SC32G, 31.9 GB, serial 0x12ab34cd\n  no partitions"
 
 
 def test_a_disk_cannot_write_on_the_terminal(tmp_path: Path) -> None:
     tree = machines.Tree(tmp_path)
     tree.disk("sdb", "8:16", 1, removable=1, model="evil\x1b[2J", type="0")
-    assert "\x1b" not in refusals.describe(Path("/dev/sdb"), Machine(tmp_path).disk("sdb"), 1)
+    assert "\x1b" not in disks.describe(Path("/dev/sdb"), Machine(tmp_path).disk("sdb"), 1)
 
 
 def test_a_partition_is_named_with_its_disk(tmp_path: Path) -> None:
@@ -85,11 +85,11 @@ def test_a_partition_is_named_with_its_disk(tmp_path: Path) -> None:
     except PermissionError:
         pytest.skip("only root makes device nodes")
     with pytest.raises(DeployError, match="a partition; name the whole disk, /dev/sdb"):
-        refusals.find(machine, node)
+        disks.find(machine, node)
     other = tmp_path / "other"
     os.mknod(other, stat.S_IFBLK | 0o600, os.makedev(8, 208))
     with pytest.raises(DeployError, match="knows no such disk"):
-        refusals.find(machine, other)
+        disks.find(machine, other)
 
 
 def test_a_file_that_a_loop_shows_is_in_use(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_file_that_a_loop_shows_is_in_use(tmp_path: Path) -> None:
     tree = machines.Tree(tmp_path / "tree")
     tree.loop("loop3", "7:3", str(card.resolve()))
     with pytest.raises(DeployError, match="in use as loop3"):
-        refusals.find(Machine(tmp_path / "tree"), card)
+        disks.find(Machine(tmp_path / "tree"), card)
 
 
 def test_the_disk_that_this_machine_runs_on_is_refused() -> None:
@@ -109,7 +109,7 @@ def test_the_disk_that_this_machine_runs_on_is_refused() -> None:
     if name is None:
         pytest.skip("this system's root is on no block device of its own (a container)")
     with pytest.raises(DeployError, match="this machine runs on it"):
-        refusals.check(machine, machine.disk(machine.whole(name)))
+        disks.check(machine, machine.disk(machine.whole(name)))
 
 
 def test_the_program_says_what_is_no_card(bench: Bench) -> None:

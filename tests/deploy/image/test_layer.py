@@ -9,7 +9,7 @@ import pytest
 from card_parts import CAPABILITY
 
 from deploy.errors import DeployError
-from deploy.image.packages import layer
+from deploy.image.packages import base
 from deploy.image.packages.base import leave_out
 from deploy.image.packages.board import Group
 from deploy.image.tree import Content, Entry, Tree
@@ -48,7 +48,7 @@ def root(tmp_path: Path) -> Path:
 def _tree(root: Path) -> Tree:
     """The base's tree as a file system that is read gives it: owners and all, without content."""
     tree = Tree()
-    for path, state in layer.snapshot(root, _nothing).items():
+    for path, state in base.snapshot(root, _nothing).items():
         place = root / path
         kind = "link" if place.is_symlink() else "folder" if place.is_dir() else "file"
         content = Content.at(place) if kind == "file" else Content()
@@ -56,18 +56,18 @@ def _tree(root: Path) -> Tree:
     return tree
 
 
-def _laid(root: Path, before: dict[str, layer.State], tree: Tree, tmp_path: Path) -> Tree:
-    layer.write(root, before, layer.snapshot(root, _nothing), tmp_path / "layer.tar")
+def _laid(root: Path, before: dict[str, base.State], tree: Tree, tmp_path: Path) -> Tree:
+    base.write(root, before, base.snapshot(root, _nothing), tmp_path / "layer.tar")
     over = Tree.from_tar(tmp_path / "layer.tar")
     result = Tree()
     for path, entry in tree.items():
         result.put(path, entry)
-    layer.lay_over(result, over)
+    base.lay_over(result, over)
     return result
 
 
 def test_what_changed_is_taken_and_the_rest_stays_the_very_entry(root: Path, tmp_path: Path):
-    before, tree = layer.snapshot(root, _nothing), _tree(root)
+    before, tree = base.snapshot(root, _nothing), _tree(root)
     _write(
         root, {"etc/new": "new", "usr/lib/deep/file": "deep", "etc/edited": "longer than before"}
     )
@@ -93,7 +93,7 @@ def test_what_changed_is_taken_and_the_rest_stays_the_very_entry(root: Path, tmp
 
 
 def test_nothing_changed_is_nothing(root: Path, tmp_path: Path):
-    before, tree = layer.snapshot(root, _nothing), _tree(root)
+    before, tree = base.snapshot(root, _nothing), _tree(root)
     # A second name that comes and goes, as dpkg's backups do, is no change.
     os.link(root / "etc/kept", root / "etc/kept.backup")
     (root / "etc/kept.backup").unlink()
@@ -106,15 +106,15 @@ def test_what_is_ignored_is_in_no_layer(root: Path, tmp_path: Path):
     def ignored(path: str) -> bool:
         return path == "tmp"
 
-    before = layer.snapshot(root, ignored)
+    before = base.snapshot(root, ignored)
     assert "tmp" not in before and "tmp/z" not in before
     _write(root, {"tmp/other": "h", "etc/new": "i"})
-    layer.write(root, before, layer.snapshot(root, ignored), tmp_path / "layer.tar")
+    base.write(root, before, base.snapshot(root, ignored), tmp_path / "layer.tar")
     assert [path for path, _ in Tree.from_tar(tmp_path / "layer.tar").items()] == ["etc", "etc/new"]
 
 
 def test_byte_code_in_a_layer_asks_for_no_source(root: Path, tmp_path: Path):
-    before = layer.snapshot(root, _nothing)
+    before = base.snapshot(root, _nothing)
     place = root / "usr/lib/__pycache__/x.cpython-313.pyc"
     place.parent.mkdir(parents=True)
     place.write_bytes(b"\xf3\r\r\n" + bytes(4) + b"time" + b"size" + b"code")
@@ -126,7 +126,7 @@ def test_byte_code_in_a_layer_asks_for_no_source(root: Path, tmp_path: Path):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="owners and capabilities are root's to give")
 def test_owners_set_bits_capabilities_and_second_names_are_kept(root: Path, tmp_path: Path):
-    before = layer.snapshot(root, _nothing)
+    before = base.snapshot(root, _nothing)
     _write(root, {"usr/bin/a": "program"})
     program = root / "usr/bin/a"
     os.chown(program, 3, 44)
@@ -142,9 +142,9 @@ def test_owners_set_bits_capabilities_and_second_names_are_kept(root: Path, tmp_
 
 
 def test_a_layer_that_is_cut_is_told(root: Path, tmp_path: Path):
-    before = layer.snapshot(root, _nothing)
+    before = base.snapshot(root, _nothing)
     _write(root, {"etc/new": "new" * 1000})
-    layer.write(root, before, layer.snapshot(root, _nothing), tmp_path / "layer.tar")
+    base.write(root, before, base.snapshot(root, _nothing), tmp_path / "layer.tar")
     whole = (tmp_path / "layer.tar").read_bytes()
     (tmp_path / "layer.tar").write_bytes(whole[:2500])
     with pytest.raises(DeployError, match=r"no readable tar|cut"):
@@ -153,7 +153,7 @@ def test_a_layer_that_is_cut_is_told(root: Path, tmp_path: Path):
 
 def test_only_what_is_new_is_left_out(root: Path):
     _write(root, {"usr/share/doc/base/README": "the base's"})
-    before = layer.snapshot(root, _nothing)
+    before = base.snapshot(root, _nothing)
     _write(
         root,
         {

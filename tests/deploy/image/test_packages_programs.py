@@ -13,8 +13,8 @@ import pytest
 
 from deploy.errors import DeployError
 from deploy.image.packages import foreign
-from deploy.image.packages.bytecode import settle
 from deploy.image.packages.libraries import missing, needed
+from deploy.image.packages.python import settle
 
 _PROGRAM = Path("/bin/ls").resolve()
 

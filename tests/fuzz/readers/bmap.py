@@ -1,4 +1,4 @@
-"""`deploy.flash.bmap`: block maps in XML, with the checksum that they carry over themselves."""
+"""`deploy.flash.image`: block maps in XML, with the checksum that they carry over themselves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hashlib
 from pieces import Picker, refusing, scratch, stretch
 
 from deploy.errors import DeployError
-from deploy.flash import bmap
+from deploy.flash import image
 
 _FILE = scratch("bmap") / "image.bmap"
 _SIZE = 8192
@@ -39,7 +39,7 @@ def fuzz(data: bytes) -> None:
     _FILE.write_bytes(content.replace(_SUM, own, 1))
     with refusing(DeployError):
         end = 0
-        for stretch_ in bmap.read(_FILE, _SIZE):
+        for stretch_ in image.read_map(_FILE, _SIZE):
             assert end <= stretch_.start < stretch_.stop <= _SIZE
             end = stretch_.stop
 

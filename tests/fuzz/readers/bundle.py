@@ -7,7 +7,7 @@ import struct
 
 from pieces import Picker, as_json, blocks, changed, refusing, stretch
 
-from deploy.board.releases import archive, manifest
+from deploy.board.releases import manifest, receive
 from deploy.errors import DeployError
 
 _RELEASE = {
@@ -56,7 +56,7 @@ def fuzz(data: bytes) -> None:
         content += header(name, size, picker.of((b"0", b"0", b"0", b"1", b"5", b"x")))
         content += picker.block()
     with refusing(DeployError):
-        for member in archive.members(io.BytesIO(content)):
+        for member in receive.members(io.BytesIO(content)):
             assert sum(map(len, member.chunks())) == member.size <= _MOST_BYTES
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pieces import Picker, as_json, changed, scratch, stretch
 
-from deploy.board import network
+from deploy.board import light
 from deploy.board.releases import choose, places
 from pi_firmware import release
 from pi_firmware.health import restarts
@@ -46,7 +46,7 @@ def fuzz(data: bytes) -> None:
     choose.size_fault(_AT, "1.2")
     restarts._read(_STATE)
     places.read(_STATE)
-    assert len(network.name_servers(_ROOT)) <= 3
+    assert len(light.name_servers(_ROOT)) <= 3
     release.of_environment({release.ENVIRONMENT: picker.block().decode("latin-1")})
 
 

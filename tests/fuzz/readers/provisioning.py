@@ -6,8 +6,7 @@ from pieces import Picker, refusing, stretch
 
 from deploy.board import settings
 from deploy.errors import DeployError
-from deploy.provisioning.model import Provisioning
-from deploy.provisioning.ssh_keys import check_authorized_key
+from deploy.provisioning.model import Provisioning, check_authorized_key
 from deploy.provisioning.text import parse, parse_wifi, render
 from deploy.provisioning.wpa import wpa_supplicant_conf
 
