@@ -214,12 +214,12 @@ def test_uninstalling_leaves_configuration_and_recordings_and_says_so(root: Path
     assert not any(path.is_file() or path.is_symlink() for path in root.rglob("*"))
 
 
-def test_a_command_of_somebody_else_s_is_left_alone(tmp_path: Path, checkout: Path) -> None:
-    other = tmp_path / "usr/local/bin/blimp"
-    other.parent.mkdir(parents=True)
+def test_a_command_of_somebody_else_s_is_left_alone(root: Path, checkout: Path) -> None:
+    other = root / "usr/local/bin/blimp"
+    other.unlink()
     other.write_text("#!/bin/sh\n")
-    assert "it is not ours" in install(tmp_path, checkout).stdout
-    service("uninstall", "--root", tmp_path)
+    assert "it is not ours" in install(root, checkout).stdout
+    service("uninstall", "--root", root)
     assert other.read_text() == "#!/bin/sh\n"
 
 

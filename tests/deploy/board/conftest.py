@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from board_cards import Person
+
+from deploy.provisioning import wpa
 
 
 @pytest.fixture
@@ -13,8 +16,9 @@ def person(tmp_path: Path) -> Person:
 
 
 @pytest.fixture
-def people(tmp_path: Path) -> Callable[[], Person]:
-    """One card after another, each again."""
+def people(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Person]:
+    """One card after another, each again; a password's key is reckoned once for all of them."""
+    monkeypatch.setattr(wpa, "psk", functools.cache(wpa.psk))
     count = 0
 
     def make() -> Person:

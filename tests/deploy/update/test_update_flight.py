@@ -110,9 +110,9 @@ def test_updates_of_a_payload_in_flight(flight: Flight, monkeypatch: pytest.Monk
 
     # One that runs and never gives a frame: back when its time is over.
     with monkeypatch.context() as patch:
-        patch.setattr(watch, "LIMIT_S", 4.0)
+        patch.setattr(watch, "LIMIT_S", 2.0)
         flight.update(firmware("0.3.0", MADE[NEW], __main__=HANGS))
-    reason = "0.3.0: no frames within 4 s (activating)"
+    reason = "0.3.0: no frames within 2 s (activating)"
     assert json.loads(flight.card.at.last.read_text())["reason"] == reason
     again = flight.listener.wait(
         "blimp-1", lambda s: s.health is not None and s.health.release_reason == reason, LIMIT_S
