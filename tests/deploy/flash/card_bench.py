@@ -68,35 +68,30 @@ class Bench:
 
 
 def run(
-    words: list[str], *, input: str = "", timeout_s: float = 60
+    words: list[str], *, input: str = "", program: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """Runs the flasher to its end."""
-    return subprocess.run(
-        words, cwd=REPOSITORY, input=input, capture_output=True, text=True, errors="replace",
-        timeout=timeout_s, check=False,
-    )  # fmt: skip
+    """Runs the flasher to its end: in this process, or with `program` as a person runs it."""
+    if program:
+        return subprocess.run(
+            words, cwd=REPOSITORY, input=input, capture_output=True, text=True, errors="replace",
+            timeout=60, check=False,
+        )  # fmt: skip
+    with (
+        contextlib.redirect_stderr(io.StringIO()) as stderr,
+        contextlib.redirect_stdout(io.StringIO()) as stdout,
+        unittest.mock.patch("sys.stdin", io.StringIO(input)),
+    ):
+        status = command.main(words[3:])
+    return subprocess.CompletedProcess(words, status, stdout.getvalue(), stderr.getvalue())
 
 
 def refused(words: list[str], said: str, *, input: str = "", program: bool = False) -> None:
-    """Asserts a refusal: status 2, one line that says so, no traceback.
-
-    In this process, which is ten times faster; with `program` as a person runs it.
-    """
-    if program:
-        done = run(words, input=input)
-        status, told = done.returncode, done.stderr
-    else:
-        with (
-            contextlib.redirect_stderr(io.StringIO()) as stderr,
-            contextlib.redirect_stdout(io.StringIO()),
-            unittest.mock.patch("sys.stdin", io.StringIO(input)),
-        ):
-            status = command.main(words[3:])
-        told = stderr.getvalue()
-    lines = told.strip().splitlines()
-    assert status == 2, (status, told)
-    assert lines[-1].startswith("deploy.flash: ") and said in lines[-1], told
-    assert "Traceback" not in told
+    """Asserts a refusal: status 2, one line that says so, no traceback."""
+    done = run(words, input=input, program=program)
+    lines = done.stderr.strip().splitlines()
+    assert done.returncode == 2, done
+    assert lines[-1].startswith("deploy.flash: ") and said in lines[-1], done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def tool(*words: str, input: bytes = b"") -> bytes:

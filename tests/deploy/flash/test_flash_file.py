@@ -1,4 +1,4 @@
-"""Flashing to a file, by the real program: equal content, customised, nothing else touched."""
+"""Flashing to a file: equal content, customised, nothing else touched."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from card_bench import BOOT_OFFSET, GAP_MIB, MEBI, Bench, make_image, refused, run, tool
 
+from deploy.flash import __main__ as command
 from deploy.provisioning.text import parse
 from deploy.provisioning.wpa import psk, wpa_supplicant_conf
 from ground_station.keys.authority import Authority
@@ -26,7 +27,7 @@ KEYS = (
 
 def test_the_card_holds_the_image_and_what_was_asked_for(bench: Bench, tmp_path: Path) -> None:
     old = bench.card.read_bytes()
-    done = run(bench.command("--ground", "10.1.2.3"))
+    done = run(bench.command("--ground", "10.1.2.3"), program=True)
     assert done.returncode == 0, done.stderr
     image, card = bench.image.read_bytes(), bench.card.read_bytes()
     assert card[:BOOT_OFFSET] == image[:BOOT_OFFSET]
@@ -251,7 +252,7 @@ def test_no_wifi_is_said_and_no_password_is_on_a_command_line(bench: Bench) -> N
         "--wifi-password-file, or run it on a terminal",
         program=True,
     )
-    assert "--wifi-password " not in run([*bench.command(), "--help"]).stdout
+    assert "--wifi-password " not in command._parser().format_help()
 
 
 def test_an_image_with_a_fat32_and_odd_names_works(bench: Bench) -> None:

@@ -274,7 +274,7 @@ def test_a_kill_in_the_middle_leaves_no_table(bench: Bench) -> None:
 def test_killed_at_random_moments_it_is_untouched_tableless_or_whole(bench: Bench) -> None:
     before = bench.card.read_bytes()
     start_s = time.monotonic()
-    assert run(bench.command()).returncode == 0
+    assert run(bench.command(), program=True).returncode == 0
     took_s = time.monotonic() - start_s
     whole = bench.card.read_bytes()
     table = whole[:BOOT_OFFSET]

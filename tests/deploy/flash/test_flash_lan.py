@@ -46,7 +46,7 @@ def card(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Card:
     data = tmp_path / "share"
     monkeypatch.setenv("XDG_DATA_HOME", str(data))
     for words in (["init"], ["ground", "main"], ["payload", "blimp-1"]):
-        done = run([BLIMP, "keys", *words])
+        done = run([BLIMP, "keys", *words], program=True)
         assert done.returncode == 0, done.stderr
     bench.keys = data / "blimp/keys"
     done = run(bench.command())

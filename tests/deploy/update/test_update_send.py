@@ -1,7 +1,9 @@
 """`python -m deploy.update` as one calls it, to a card behind an `ssh` that is a folder here, and
 behind a real sshd on loopback."""
 
+import contextlib
 import getpass
+import io
 import os
 import shutil
 import socket
@@ -12,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from card_stand import CHECKOUT, NEW, Card, contents, lay, release_json
@@ -19,6 +22,7 @@ from card_stand import CHECKOUT, NEW, Card, contents, lay, release_json
 from deploy.board.releases import receive
 from deploy.board.releases.choose import HEALTHY, Choice
 from deploy.errors import DeployError
+from deploy.update import __main__ as command
 from deploy.update import bundle as bundles
 from deploy.update import card as remote
 from ground_station.keys.authority import Authority
@@ -73,16 +77,21 @@ class Stand:
         (self.card.root / "systemctl.show").write_text(shown)
 
     def update(self, *more: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "deploy.update", "--payload", "blimp-1"]
-        given = ["--keys", self.keys, "--site", self.site, "--host", "192.0.2.1", *more]
-        return subprocess.run(
-            [*command, *map(str, given)],
-            cwd=CHECKOUT,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
+        """The command in this process, and what it says."""
+        given = ["--payload", "blimp-1", "--keys", self.keys, "--site", self.site]
+        words = ["update", *map(str, [*given, "--host", "192.0.2.1", *more])]
+        with (
+            contextlib.redirect_stderr(io.StringIO()) as stderr,
+            contextlib.redirect_stdout(io.StringIO()) as stdout,
+            mock.patch.dict(os.environ, self.environment),
+            mock.patch.object(sys, "argv", words),
+            mock.patch.object(remote, "_POLL_S", 0.1),
+        ):
+            try:
+                status = command.main()
+            except SystemExit as end:
+                status = int(str(end.code))
+        return subprocess.CompletedProcess(words, status, stdout.getvalue(), stderr.getvalue())
 
 
 def authority(folder: Path) -> Path:
