@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ground_station.replay.cases import judge
+from ground_station.replay.cases.case import Limits
 from ground_station.replay.cases.judge import Judged
-from ground_station.replay.cases.limits import Limits
 
 sys.path.append(str(Path(__file__).parents[1] / "replay"))
 

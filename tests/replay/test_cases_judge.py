@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 
 from ground_station.evaluation.figures import AT_LEAST, AT_MOST, Row, holds_at
 from ground_station.geometry.trajectory import Trajectory, write_tum
-from ground_station.replay.cases import accounting, frames, golden, judge, measure
-from ground_station.replay.cases.case import load_case
-from ground_station.replay.cases.limits import NAMES, Limits
+from ground_station.replay.cases import frames, judge, measure
+from ground_station.replay.cases.case import NAMES, Limits, load_case
 from ground_station.replay.cases.outcome import Outcome
-from ground_station.replay.cases.truth import Reference
+from ground_station.replay.cases.truth import Reference, accept, write_golden
 
 TRUTH = Reference(stand.truth(), "the truth")
 
@@ -185,13 +184,13 @@ def test_an_outage_from_which_nothing_came_back_fails_however_wide_the_bound() -
 @pytest.mark.parametrize(
     ("counts", "name"),
     [
-        ({"captured": 61}, accounting.CAPTURED),
-        ({"gated": 1}, accounting.CAPTURED),
-        ({"sent": 61, "captured": 61}, accounting.SENT),
-        ({"sent": 59, "captured": 59, "lost": -1}, accounting.SENT),
-        ({"received": 61, "sent": 61, "captured": 61}, accounting.RECEIVED),
-        ({"dropped": 1}, accounting.RECEIVED),
-        ({"localized": 59}, accounting.RECEIVED),
+        ({"captured": 61}, judge.CAPTURED),
+        ({"gated": 1}, judge.CAPTURED),
+        ({"sent": 61, "captured": 61}, judge.SENT),
+        ({"sent": 59, "captured": 59, "lost": -1}, judge.SENT),
+        ({"received": 61, "sent": 61, "captured": 61}, judge.RECEIVED),
+        ({"dropped": 1}, judge.RECEIVED),
+        ({"localized": 59}, judge.RECEIVED),
     ],
 )
 def test_a_frame_that_is_not_accounted_for_fails(counts: dict[str, int], name: str) -> None:
@@ -201,15 +200,15 @@ def test_a_frame_that_is_not_accounted_for_fails(counts: dict[str, int], name: s
 def test_a_frame_that_came_twice_fails_although_the_sums_come_out() -> None:
     made = [stand.row(k) for k in range(59)] + [stand.row(30)]
     rows = rows_of(stand.outcome(made))
-    assert rows[accounting.SENT].holds is False
-    assert "frame 30 was localized 2 times" in rows[accounting.SENT].told
-    told = rows_of(stand.outcome(stream={"access_units": 70}))[accounting.SENT].told
+    assert rows[judge.SENT].holds is False
+    assert "frame 30 was localized 2 times" in rows[judge.SENT].told
+    told = rows_of(stand.outcome(stream={"access_units": 70}))[judge.SENT].told
     assert told == "something of 70 frames came, 60 were sent"
 
 
 def test_counts_that_never_came_do_not_hold() -> None:
     rows = rows_of(stand.outcome(complete=False), coverage_min=0.0)
-    assert rows[accounting.CAPTURED].holds is False
+    assert rows[judge.CAPTURED].holds is False
     assert rows["coverage_min"].holds is False and "did not come" in rows["coverage_min"].told
 
 
@@ -260,7 +259,7 @@ def test_the_next_number_beyond_a_bound_misses_and_shows_so(bound: float) -> Non
 
 def accepted(outcome: Outcome, **terms: Any) -> Reference:
     usual = {"by": "the bench", "tolerance_m": 0.01, "tolerance_deg": 0.5, "missing_max": 0.1}
-    found = golden.accept(outcome, **(usual | terms))
+    found = accept(outcome, **(usual | terms))
     return Reference(found.poses, str(found), found)
 
 
@@ -340,7 +339,7 @@ def test_a_case_whose_run_was_never_accepted_fails_and_says_how(tmp_path: Path) 
     assert all("no run was accepted yet; blimp replay --accept" in r.told for r in judged.missed)
     reference = accepted(stand.outcome())
     assert reference.golden is not None
-    golden.write_golden(tmp_path / "c.golden.txt", reference.golden)
+    write_golden(tmp_path / "c.golden.txt", reference.golden)
     assert judge.judged(stand.outcome(), case, "process").passed
 
 

@@ -18,11 +18,12 @@ from hypothesis import strategies as st
 from ground_station.errors import InputError
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.recording.flight import trajectory_of
-from ground_station.replay.cases import golden, judge
+from ground_station.replay.cases import judge
 from ground_station.replay.cases.case import Keys, load_case
 from ground_station.replay.cases.commented import commented
 from ground_station.replay.cases.make import Asked, make_case
 from ground_station.replay.cases.source import check_case, examine
+from ground_station.replay.cases.truth import MISSING, accept, read_golden, write_golden
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import RecordingReader
@@ -267,13 +268,13 @@ def test_any_keys_read_back_as_they_were(
 
 def test_an_accepted_run_reads_back_and_any_tool_reads_its_poses(tmp_path: Path) -> None:
     run = stand.outcome(case="loop\u2028x", versions={"ground_station": "1, source ab"})
-    made = golden.accept(run, by="the bench", tolerance_m=0.05, tolerance_deg=1.0)
-    golden.write_golden(tmp_path / "g.txt", made)
-    read = golden.read_golden(tmp_path / "g.txt")
+    made = accept(run, by="the bench", tolerance_m=0.05, tolerance_deg=1.0)
+    write_golden(tmp_path / "g.txt", made)
+    read = read_golden(tmp_path / "g.txt")
     assert read.accepted == made.accepted and read.accepted.case == "loop?x"
     assert (read.poses.time_ns == run.estimate.time_ns).all()
     assert np.abs(read.poses.position_m - run.estimate.position_m).max() < 1e-9
-    assert read.accepted.missing_max == golden.MISSING
+    assert read.accepted.missing_max == MISSING
     first = (tmp_path / "g.txt").read_text().splitlines()[0]
     assert first.startswith("# A run that was accepted by the bench at 2")
 
@@ -292,7 +293,7 @@ def test_an_accepted_run_reads_back_and_any_tool_reads_its_poses(tmp_path: Path)
 def test_terms_that_nobody_can_mean_are_refused(terms: dict[str, Any], says: str) -> None:
     usual = {"by": "the bench", "tolerance_m": 0.05, "tolerance_deg": 1.0}
     with pytest.raises(BlimpError) as error:
-        golden.accept(stand.outcome(), **(usual | terms))
+        accept(stand.outcome(), **(usual | terms))
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
@@ -301,17 +302,17 @@ def test_a_run_without_poses_or_with_broken_ones_is_not_accepted() -> None:
     broken = stand.outcome([stand.row(0), stand.row(1, wTc=np.full((4, 4), np.inf))])
     for run, says in ((lost, "nothing to accept"), (broken, "1 poses are not finite")):
         with pytest.raises(InputError, match=says):
-            golden.accept(run, by="the bench", tolerance_m=1.0, tolerance_deg=1.0)
+            accept(run, by="the bench", tolerance_m=1.0, tolerance_deg=1.0)
 
 
 def test_a_trajectory_without_terms_is_no_accepted_run(tmp_path: Path) -> None:
     write_tum(tmp_path / "t.txt", stand.truth())
     with pytest.raises(InputError, match="not an accepted run"):
-        golden.read_golden(tmp_path / "t.txt")
+        read_golden(tmp_path / "t.txt")
     for line, says in (("#: a = [", "not valid TOML"), ('#: accepted_by = "x"', "tolerance_m")):
         (tmp_path / "t.txt").write_text(f"{line}\n5.0 1 2 1.5 0 0 0 1\n")
         with pytest.raises(BlimpError, match=says):
-            golden.read_golden(tmp_path / "t.txt")
+            read_golden(tmp_path / "t.txt")
 
 
 def test_the_sample_flight_becomes_a_case(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from ground_station.geometry.trajectory import read_tum
 from ground_station.map.floorplan import FloorPlan
 from ground_station.replay.cases import frames
+from ground_station.replay.cases.frames import first_difference
 from ground_station.replay.cases.outcome import (
     FRAMES,
     RESULT,
@@ -26,7 +27,6 @@ from ground_station.replay.cases.outcome import (
     read_outcome,
     write_outcome,
 )
-from ground_station.replay.cases.same import first_difference
 from ground_station.replay.resources import Watch
 from pi_firmware.wire.errors import BlimpError
 

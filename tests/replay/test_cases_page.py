@@ -20,9 +20,9 @@ from ground_station.geometry.trajectory import Trajectory
 from ground_station.map.floorplan import FloorPlan
 from ground_station.presentation.theme import DARK, LIGHT
 from ground_station.replay.cases import judge, page, pictures
+from ground_station.replay.cases.case import Limits
 from ground_station.replay.cases.compare import compare
 from ground_station.replay.cases.judge import Judged
-from ground_station.replay.cases.limits import Limits
 from ground_station.replay.cases.truth import Reference
 
 HOSTILE = "<script>alert(1)</script>'\" onload=x \x07\u202eevil\udcff"

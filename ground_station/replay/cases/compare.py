@@ -17,8 +17,9 @@ from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
 from ground_station.presentation.text import flat
-from ground_station.replay.cases import accounting, measure, same
-from ground_station.replay.cases.limits import BOUNDS
+from ground_station.replay.cases import frames, measure
+from ground_station.replay.cases.case import BOUNDS
+from ground_station.replay.cases.judge import balances
 from ground_station.replay.cases.measure import Errors, Figure
 from ground_station.replay.cases.outcome import Outcome
 from ground_station.replay.cases.truth import Reference
@@ -87,11 +88,11 @@ class Comparison:
 
     a: Outcome
     b: Outcome
-    pairs: same.Pairs
+    pairs: frames.Pairs
     time_ns: I64
     position_m: F64
     rotation_deg: F64
-    first: same.Difference
+    first: frames.Difference
     errors_a: Errors | None
     errors_b: Errors | None
     lines: list[Line]
@@ -121,14 +122,14 @@ class Comparison:
 def compare(a: Outcome, b: Outcome, allowed: Allowed | None = None) -> Comparison:
     """Compares run B with run A; raises `InputError` when no frame of one is in the other."""
     allowed = allowed or Allowed()
-    both = same.pairs(a.frames, b.frames)
+    both = frames.pairs(a.frames, b.frames)
     if len(a.frames) and len(b.frames) and not len(both.a):
         raise InputError(
             f"{b.folder or 'B'}: none of its {len(b.frames)} frames was captured at the time of one"
             f" of {a.folder or 'A'}: it is another flight"
         )
     position, rotation = _apart(a, b, both)
-    first = same.first_difference(a.frames, b.frames)
+    first = frames.first_difference(a.frames, b.frames)
     truth_a, truth_b = _truths(a, b)
     figures = [_figures(a, truth_a), _figures(b, truth_b)]
     lines = [
@@ -185,7 +186,7 @@ def _figures(outcome: Outcome, truth: Trajectory | None) -> dict[str, Figure]:
     return measure.figures(outcome, None if truth is None else Reference(truth, "the truth"))
 
 
-def _apart(a: Outcome, b: Outcome, both: same.Pairs) -> tuple[F64, F64]:
+def _apart(a: Outcome, b: Outcome, both: frames.Pairs) -> tuple[F64, F64]:
     """How far the poses of each pair are apart: metres (M,) and degrees (M,)."""
     apart_m = np.linalg.norm(a.frames.position_m[both.a] - b.frames.position_m[both.b], axis=1)
     apart_deg = np.full(len(both.a), np.nan)
@@ -250,7 +251,7 @@ def _differences(
 def _balances(a: Outcome, b: Outcome) -> list[Line]:
     """Sums of frames that come out in A must come out in B."""
     found = []
-    for one, other in zip(accounting.balances(a), accounting.balances(b), strict=True):
+    for one, other in zip(balances(a), balances(b), strict=True):
         if not other.holds:
             told = other.told or f"off by {other.value:g}"
             worse = float(bool(one.holds))
@@ -264,7 +265,7 @@ def _balances(a: Outcome, b: Outcome) -> list[Line]:
     return found
 
 
-def _unlike(both: same.Pairs, first: same.Difference, allowed: Allowed) -> Line:
+def _unlike(both: frames.Pairs, first: frames.Difference, allowed: Allowed) -> Line:
     limit = 0.0 if allowed.identical else None
     count = float(first.count)
     worse = count if allowed.identical else None
@@ -272,7 +273,7 @@ def _unlike(both: same.Pairs, first: same.Difference, allowed: Allowed) -> Line:
     return Line("frames that differ", None, count, "frames", worse, limit, told)
 
 
-def _moves(a: Outcome, b: Outcome, both: same.Pairs) -> Counter[tuple[str, str]]:
+def _moves(a: Outcome, b: Outcome, both: frames.Pairs) -> Counter[tuple[str, str]]:
     states = [
         (a.frames.state[i], b.frames.state[j])
         for i, j in zip(both.a.tolist(), both.b.tolist(), strict=True)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ground_station.evaluation import ate
 from ground_station.evaluation.figures import EXACTLY, Row
-from ground_station.replay.cases import accounting, measure, telemetry
-from ground_station.replay.cases.case import Case
-from ground_station.replay.cases.golden import Golden
-from ground_station.replay.cases.limits import BOUNDS, Limits
+from ground_station.replay.cases import measure
+from ground_station.replay.cases.case import BOUNDS, Case, Limits
+from ground_station.replay.cases.frames import first_difference
 from ground_station.replay.cases.measure import Figure
 from ground_station.replay.cases.outcome import Outcome
-from ground_station.replay.cases.same import first_difference
-from ground_station.replay.cases.truth import Reference, reference_of
+from ground_station.replay.cases.truth import Golden, Reference, reference_of
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -130,15 +130,12 @@ def _unasked(limits: Limits, figures: dict[str, Figure], outcome: Outcome) -> li
 
 
 def _conditions(outcome: Outcome) -> list[Row]:
-    found = accounting.balances(outcome)
+    found = balances(outcome)
     broken = outcome.frames.broken
     found.append(Row("poses not finite", float(broken), "poses", 0.0, broken == 0, EXACTLY))
     run = outcome.run
-    for kind, message, ranges in (
-        ("battery", run.battery, telemetry.BATTERY),
-        ("health", run.health, telemetry.HEALTH),
-    ):
-        why = telemetry.trouble(kind, message, ranges)
+    for kind, message in (("battery", run.battery), ("health", run.health)):
+        why = trouble(kind, message)
         found.append(Row(f"telemetry: {kind}", None, "", holds=not why, told=why))
     if run.refused is not None:
         found.append(
@@ -181,3 +178,116 @@ def _identical(outcome: Outcome, again: Outcome | None) -> Row:
         difference = first_difference(outcome.frames, again.frames)
         count, told = float(difference.count), difference.told
     return Row("identical", count, "differing frames", 0.0, count == 0.0, EXACTLY, told)
+
+
+CAPTURED = "captured = gated + sent + discarded"
+SENT = "sent = received + lost"
+RECEIVED = "received = localized + not localized + dropped"
+
+
+def balances(outcome: Outcome) -> list[Row]:
+    """The three sums, and by how many frames each does not come out.
+
+    Each side is counted by another: the payload, the receiver, the localizer.
+    """
+    return [_captured(outcome), _sent(outcome), _received(outcome)]
+
+
+def _row(name: str, off: int, told: str) -> Row:
+    """`told` is what speaks against a sum, even one that comes out."""
+    return Row(name, float(off), "frames off", 0.0, off == 0 and not told, EXACTLY, told)
+
+
+def _captured(outcome: Outcome) -> Row:
+    a = outcome.run.accounts
+    off = a.captured - (a.gated + a.sent + a.discarded)
+    told = "" if outcome.run.complete else "the payload's final counts did not come"
+    negative = [name for name in ("captured", "gated", "sent", "discarded") if getattr(a, name) < 0]
+    if negative:
+        told = f"{negative[0]} is {getattr(a, negative[0])}"
+    return _row(CAPTURED, off, told)
+
+
+def _sent(outcome: Outcome) -> Row:
+    """`lost` is reckoned as what is missing: so it must not be less than none, no frame may have
+    come twice, and no more of them than were sent."""
+    a, frames = outcome.run.accounts, outcome.frames
+    off = a.sent - (a.received + a.lost)
+    told = ""
+    numbers, times = np.unique(frames.sequence, return_counts=True)
+    units = outcome.run.stream.get("access_units")
+    if a.lost < 0:
+        told = f"{-a.lost} more were received than sent"
+    elif (times > 1).any():
+        told = f"frame {int(numbers[times > 1][0])} was localized {int(times.max())} times"
+    elif isinstance(units, int) and units > a.sent:
+        told = f"something of {units} frames came, {a.sent} were sent"
+    return _row(SENT, off, told)
+
+
+def _received(outcome: Outcome) -> Row:
+    a, frames = outcome.run.accounts, outcome.frames
+    localized = int(frames.localized.sum())
+    off = a.received - (len(frames) + a.dropped)
+    told = ""
+    if a.localized != localized:
+        told = f"{a.localized} are counted as localized, {localized} frames have a pose"
+    elif a.dropped < 0:
+        told = f"dropped is {a.dropped}"
+    return _row(RECEIVED, off, told)
+
+
+_BATTERY = {
+    "voltage": (1.0, 60.0),
+    "percentage": (0.0, 1.0),
+    "current": (-100.0, 100.0),
+    "charge": (0.0, 1000.0),
+    "capacity": (0.0, 1000.0),
+    "temperature": (-60.0, 120.0),
+    "time_left_s": (0.0, 1e6),
+    "read_errors": (0.0, math.inf),
+    "refused": (0.0, math.inf),
+}
+"""What a cell of any blimp can have; V, share, A, Ah, °C, s."""
+_HEALTH = {
+    "uptime_s": (0.0, math.inf),
+    "captured": (0.0, math.inf),
+    "gated": (0.0, math.inf),
+    "sent": (0.0, math.inf),
+    "discarded": (0.0, math.inf),
+    "rate_hz": (0.0, 1000.0),
+    "bitrate_kbps": (0.0, 1e6),
+    "lost": (0.0, 1.0),
+    "round_trip_s": (0.0, 3600.0),
+    "temperature_C": (-60.0, 150.0),
+    "cpu": (0.0, 1.0),
+    "memory_MB": (0.0, 1e6),
+    "memory_free_MB": (0.0, 1e7),
+    "disk_free_MB": (0.0, 1e9),
+    "wifi_signal_dBm": (-130.0, 30.0),
+    "wifi_quality": (0.0, 1.0),
+}
+_TELEMETRY = {"battery": ("voltage", _BATTERY), "health": ("uptime_s", _HEALTH)}
+"""Of each kind of message what it must have beside its time, and the ranges of its values."""
+
+
+def trouble(kind: str, message: dict[str, Any] | None) -> str:
+    """What is wrong with a message of a kind, in words; "" when nothing is."""
+    needed, ranges = _TELEMETRY[kind]
+    if message is None:
+        return f"no {kind} message came"
+    for name in (needed, "time_ns"):
+        if message.get(name) is None:
+            return f"{name} is missing"
+    for name, value in message.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"{name} is {value}"
+    for name, (low, high) in ranges.items():
+        value = message.get(name)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return f"{name} is {str(value)[:40]!r}, not a number"
+        if not low <= value <= high:
+            return f"{name} is {str(value)[:24]}; allowed: {low:g} to {high:g}"
+    return ""

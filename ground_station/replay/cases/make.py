@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from dataclasses import asdict, dataclass, field
@@ -9,24 +10,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError, Message
 
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
+from ground_station.evaluation.figures import AT_LEAST, digits
 from ground_station.files import check_outputs, write_text
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
-from ground_station.replay.cases.case import GOLDEN, NONE, RECORDING, SURVEY, Keys, Truth
+from ground_station.recording.frames import CAMERA_TABLE
+from ground_station.replay.cases.case import (
+    BOUNDS,
+    GOLDEN,
+    NONE,
+    RECORDING,
+    SURVEY,
+    Keys,
+    Limits,
+    Truth,
+)
 from ground_station.replay.cases.commented import commented
-from ground_station.replay.cases.extract import extract
-from ground_station.replay.cases.measure import figures
+from ground_station.replay.cases.measure import Figure, figures
 from ground_station.replay.cases.outcome import Outcome
-from ground_station.replay.cases.propose import propose
 from ground_station.replay.cases.source import Source, check_start, examine, missing, payloads_of
 from ground_station.replay.cases.truth import Reference
-from pi_firmware.wire import config
+from pi_firmware.wire import config, files
+from pi_firmware.wire.config import range_of
 from pi_firmware.wire.errors import BlimpError
-from pi_firmware.wire.recording import TRUTH_TOPIC, VIDEO_TOPIC, RecordingReader
+from pi_firmware.wire.recording import (
+    CALIBRATION_TOPIC,
+    ESTIMATE_TOPIC,
+    FRAME_INFO_TOPIC,
+    TRUTH_TOPIC,
+    VIDEO_TOPIC,
+    RecordingReader,
+    RecordingWriter,
+)
 from pi_firmware.wire.text import printable
 
 GOLDEN_SUFFIX = ".golden.txt"
@@ -220,3 +243,96 @@ def _remarks(source: Source) -> dict[str, str]:
 
 def _relative(path: Path, case: Path) -> str:
     return Path(os.path.relpath(path.resolve(), case.resolve().parent)).as_posix()
+
+
+MARGINS = {
+    "coverage_min": (0.0, 0.05),
+    "tracking_min": (0.0, 0.05),
+    "lost_max": (0.0, 0.02),
+    "position_rmse_m_max": (0.5, 0.005),
+    "rotation_rmse_deg_max": (0.5, 0.05),
+    "position_max_m": (0.5, 0.02),
+    "latency_p50_ms_max": (1.0, 10.0),
+    "latency_p99_ms_max": (1.0, 50.0),
+    "recovery_s_max": (0.5, 0.5),
+    "payload_memory_MB_max": (0.25, 0.0),
+    "ground_memory_MB_max": (0.25, 0.0),
+    "payload_cpu_max": (0.5, 0.0),
+}
+"""What is left between a measured value and its bound: a share of it, and a fixed part.
+
+The cell's voltage has none: what is healthy is no matter of one run."""
+
+
+def propose(figures: dict[str, Figure]) -> tuple[dict[str, float], dict[str, str]]:
+    """Bounds of what was measured, by name, and for each a remark that says how it came about."""
+    bounds: dict[str, float] = {}
+    remarks: dict[str, str] = {}
+    for name, figure_name, _, sense in BOUNDS:
+        value = figures[figure_name].value
+        if name not in MARGINS or value is None or not math.isfinite(value):
+            continue
+        share, fixed = MARGINS[name]
+        room = share * abs(value) + fixed
+        bound = value - room if sense == AT_LEAST else value + room
+        outward = _outward(max(0.0, bound), down=sense == AT_LEAST)
+        bounds[name] = min(outward, range_of(Limits, name)[1])
+        parts = [f"{share:.0%} of it"] * (share > 0) + [f"{fixed:g}"] * (fixed > 0)
+        remarks[f"bounds.{name}"] = (
+            f"Measured {digits(value, None)}; the margin is {' and '.join(parts)}."
+        )
+    return bounds, remarks
+
+
+def _outward(value: float, *, down: bool) -> float:
+    """Rounded to two digits, away from what was measured."""
+    if value == 0:
+        return 0.0
+    scale = 10.0 ** (math.floor(math.log10(abs(value))) - 1)
+    whole = math.floor(value / scale) if down else math.ceil(value / scale)
+    return float(f"{whole * scale:.6g}")
+
+
+_KINDS: dict[str, type[Message]] = {
+    VIDEO_TOPIC: CompressedVideo,
+    CALIBRATION_TOPIC: CameraCalibration,
+    TRUTH_TOPIC: PoseInFrame,
+    ESTIMATE_TOPIC: PoseInFrame,
+}
+_TABLES = (CAMERA_TABLE, "simulation")
+_FRAME_SCHEMA = "blimp.Frame"
+
+
+def extract(source: str | Path, prefix: str, path: str | Path) -> int:
+    """Copies the video, camera and poses behind a payload's `prefix` to their own topics.
+
+    Written beside and renamed; what a cut recording has is copied. Returns the number of frames.
+    Raises `InputError` when there are none.
+    """
+    source, path = Path(source), Path(path)
+    reader = RecordingReader(source)
+    wanted = {prefix + topic: topic for topic in (*_KINDS, FRAME_INFO_TOPIC)}
+    frames = 0
+    try:
+        with files.replacing(path) as part:
+            with RecordingWriter(part) as writer:
+                for channel, record in reader.messages(set(wanted)):
+                    _copy(writer, wanted[channel.topic], record.log_time, record.data)
+                    frames += wanted[channel.topic] == VIDEO_TOPIC
+                for name in _TABLES:
+                    if reader.metadata.get(name):
+                        writer.write_metadata(name, reader.metadata[name])
+            if not frames:
+                raise InputError(f"{source}: no video on {prefix}{VIDEO_TOPIC}")
+    except DecodeError:
+        raise InputError(f"{source}: a message is not what its topic says") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    return frames
+
+
+def _copy(writer: RecordingWriter, topic: str, log_ns: int, data: bytes) -> None:
+    if topic == FRAME_INFO_TOPIC:
+        writer.write_json_text(topic, log_ns, data, schema_name=_FRAME_SCHEMA)
+    else:
+        writer.write_protobuf(topic, log_ns, _KINDS[topic].FromString(data))

@@ -9,8 +9,8 @@ from pieces import Picker, as_json, changed, refusing, scratch, stretch
 
 from ground_station.replay.cases.case import load_case
 from ground_station.replay.cases.frames import COLUMNS, read_csv
-from ground_station.replay.cases.golden import MARK, read_golden
 from ground_station.replay.cases.outcome import FRAMES, RESULT, SCHEMA, read_outcome
+from ground_station.replay.cases.truth import MARK, read_golden
 from pi_firmware.wire.errors import BlimpError
 
 _FOLDER = scratch("cases")
