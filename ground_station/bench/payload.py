@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `GroundStationError` with one line."""
     import sys
 
-    from ground_station.bench import figures
+    from ground_station.bench import flight
     from ground_station.bench.machine import machine
     from ground_station.errors import check_options
     from ground_station.files import check_outputs, write_json
@@ -51,10 +51,10 @@ def run(args: argparse.Namespace) -> int:
     result: dict[str, Any] = {"machine": machine()}
     if "start" in args.parts:
         progress("start")
-        result["start"] = figures.start(args.repetitions)
+        result["start"] = flight.start(args.repetitions)
     if "stream" in args.parts:
         progress("stream")
-        result["stream"] = figures.stream(args.seconds)
+        result["stream"] = flight.stream(args.seconds)
     print("\n".join(report(result)))
     if args.json:
         write_json(args.json, result)

@@ -1,16 +1,19 @@
-"""What happens to a flight's frames on their way: thinned, shrunk, blurred, lost, covered."""
+"""What happens to a flight's frames on their way, and to the landmarks of the map they meet."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from ground_station.arrays import U8, Bools
+from ground_station.arrays import U8, Bools, Indices
 from ground_station.experiments.declaration import Alteration
 from ground_station.geometry.camera import Camera
+from ground_station.map.descriptors import Descriptors
+from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.recording.frames import Frame
 from pi_firmware.wire import annexb
 
@@ -94,3 +97,34 @@ def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> Bools:
         whole = complete and (whole or annexb.is_idr(unit))
         result.append(whole)
     return np.array(result, dtype=bool)
+
+
+def drawn(map_: Map, share: float, seed: int) -> Map:
+    """The map with that share of its landmarks; by one seed, a smaller share is in a larger one."""
+    total = len(map_.landmarks)
+    order = np.random.default_rng(seed).permutation(total)
+    return subset(map_, np.sort(order[: round(share * total)]))
+
+
+def subset(map_: Map, kept: Indices) -> Map:
+    """The map with some of its landmarks (N,), in order, their modes, and all of its keyframes."""
+    lm, kf = map_.landmarks, map_.keyframes
+    names = [field.name for field in dataclasses.fields(Landmarks)]
+    rows = {name: getattr(lm, name)[kept] for name in names if name != "descriptor"}
+    descriptor = lm.descriptor
+    rows["descriptor"] = (
+        descriptor.rows(kept) if isinstance(descriptor, Descriptors) else descriptor[kept]
+    )
+    place = np.full(len(lm), -1, np.int64)
+    place[kept] = np.arange(len(kept))
+    landmark = place[kf.landmark]
+    left = landmark >= 0
+    keyframes = dataclasses.replace(
+        kf,
+        offset=np.concatenate([[0], np.cumsum(left)])[kf.offset],
+        landmark=landmark[left].astype(np.int32),
+        pixel_px=kf.pixel_px[left],
+    )
+    modes = map_.modes.among(place >= 0) if map_.modes is not None else None
+    info = MapInfo(**vars(map_.info))
+    return Map(info, Landmarks(**rows), keyframes, map_.folder, modes)

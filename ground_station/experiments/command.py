@@ -53,10 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.bench.machine import machine
     from ground_station.errors import InputError, check_options
     from ground_station.experiments import (
-        claims,
         declaration,
         plan,
-        quick,
         readme,
         report,
         schedule,
@@ -82,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         for line in missing:
             print(f"blimp experiments: left out: {line}", file=sys.stderr, flush=True)
     if args.quick:
-        declared = quick.shortened(declared)
+        declared = declaration.shortened(declared)
     toml = args.sample / "mapping.toml"
     mapping = load_settings(toml if toml.is_file() else None)
     # The order of sums over several threads is left to chance, and maps of few or doubtful matches
@@ -106,6 +104,6 @@ def run(args: argparse.Namespace) -> int:
     print(tables.verdict(document))
     for claim in document["claims"]:
         if claim["kept"] is not False:  # the others stand in the verdict
-            print(claims.line(claim))
+            print(summary.claim_line(claim))
     print(f"{args.out / 'report.html'}\n{args.out / 'results.json'}\n{args.out / 'results.md'}")
     return 0 if report.good(document) else 1

@@ -1,7 +1,11 @@
-"""From experiments to jobs: each flight, map and run once, with what it needs and depends on."""
+"""From experiments to jobs: each flight, map and run once, with what it needs and depends on.
+
+On the program a result depends by a hash of rooms' code that comments do not change.
+"""
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import json
@@ -19,7 +23,6 @@ from ground_station.experiments.declaration import (
     changed,
 )
 from ground_station.experiments.flights import stem
-from ground_station.experiments.program import code_sha256
 from ground_station.features import extractors
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.mapping.settings import MappingSettings
@@ -187,3 +190,52 @@ def _real(flight: FlightDeclaration, data: Path) -> str:
         whole.update(path.read_bytes())
     whole.update(f"{flight.range}\0{flight.rate_hz}".encode())
     return whole.hexdigest()
+
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+ROOMS = {
+    "flight": ("experiments/flights.py", "simulator", "geometry"),
+    "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
+            "geometry", "recording"),
+    "run": ("experiments/measure.py", "experiments/alone.py", "experiments/alter.py",
+            "experiments/maps.py", "experiments/material.py",
+            "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
+            "map/accuracy.py", "map/uncertainty.py",
+            "features", "geometry", "recording"),
+}  # fmt: skip
+"""By kind of result, what makes it, below this package."""
+
+
+@functools.cache
+def code_sha256(kind: str) -> str:
+    """Of the code that makes results of that kind: its syntax trees and TOML files, by name."""
+    whole = hashlib.sha256()
+    for room in ROOMS[kind]:
+        path = _ROOT / room
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for file in files:
+            if file.suffix == ".py":
+                whole.update(f"{file.relative_to(_ROOT)}\0{_meaning(file.read_text())}\n".encode())
+            elif file.suffix == ".toml":
+                whole.update(f"{file.relative_to(_ROOT)}\0".encode() + file.read_bytes())
+    return whole.hexdigest()
+
+
+def _meaning(source: str) -> str:
+    """A module without comments, layout and docstrings."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            # Attributes' docs are bare strings, too.
+            node.body = [s for s in body if not _is_text(s)]  # type: ignore[attr-defined]
+    return ast.dump(tree)
+
+
+def _is_text(statement: ast.AST) -> bool:
+    return (
+        isinstance(statement, ast.Expr)
+        and isinstance(statement.value, ast.Constant)
+        and isinstance(statement.value.value, str)
+    )

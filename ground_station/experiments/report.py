@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ground_station.experiments import claims, pictures, tables
-from ground_station.experiments.quick import FLIGHT_S, IMAGES
+from ground_station.experiments import pictures, tables
+from ground_station.experiments.declaration import FLIGHT_S, IMAGES
+from ground_station.experiments.summary import claim_line
 from ground_station.files import write_json, write_text
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.presentation.pages import Shown, shown, write_page
@@ -53,7 +54,7 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
         title="The experiments of the thesis, flown again",
         verdict=tables.verdict(document),
         good=good(document),
-        claims=[claims.line(claim) for claim in document["claims"]],
+        claims=[claim_line(claim) for claim in document["claims"]],
         document=document,
         experiments=experiments,
         printed=PRINTED,
@@ -65,7 +66,7 @@ def markdown(document: dict[str, Any]) -> str:
     """All tables, after the verdict."""
     quick = f" {QUICK}" if document["quick"] else ""
     parts = [tables.verdict(document), document["conditions"] + quick, PRINTED]
-    parts += ["\n".join(f"- {claims.line(claim)}" for claim in document["claims"])]
+    parts += ["\n".join(f"- {claim_line(claim)}" for claim in document["claims"])]
     for experiment in document["experiments"]:
         title = f"### {experiment['title']}"
         question = experiment["question"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ground_station.experiments import claims
-from ground_station.experiments.summary import AS_GOOD
+from ground_station.experiments.summary import AS_GOOD, claim_line
 from ground_station.presentation.text import columns
 
 NONE = "–"
@@ -124,7 +123,7 @@ def verdict(document: dict[str, Any]) -> str:
             f"more than {100 * AS_GOOD:g} %): {'; '.join(document['worse'])}."
         )
     alone = [f"{others} more rows have one preset only."] if others else []
-    broken = [claims.line(one) for one in document["claims"] if one["kept"] is False]
+    broken = [claim_line(one) for one in document["claims"] if one["kept"] is False]
     return " ".join([said, *alone, *_wrong(document), *_covariance(document), *broken])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_station.experiments import declaration, maps, quick
+from ground_station.experiments import declaration, maps
 from ground_station.experiments.declaration import FlightDeclaration
 from ground_station.experiments.plan import FlightJob
 from ground_station.experiments.store import Store
@@ -44,9 +44,9 @@ def test_a_building_is_mapped_on_foot_and_registered_by_clicks_of_its_own() -> N
         assert (walk.scene, walk.plan, walk.clicked) == (case.flight.scene, "walk", 6)
         assert case.flight.clicked == 0 and walk.lens_error * case.flight.lens_error < 0
     assert {c.map for c in of["buildings-fast"]} < {c.map for c in of["buildings"]}
-    short = {e.name: e.cases for e in quick.shortened(declared).experiments}
+    short = {e.name: e.cases for e in declaration.shortened(declared).experiments}
     assert len(short["buildings"]) == 1 and short["buildings"][0].map == of["buildings"][0].map
-    assert short["fast"][0].map.images == quick.IMAGES
+    assert short["fast"][0].map.images == declaration.IMAGES
 
 
 def test_a_walk_that_was_cut_before_its_points_were_written_is_walked_again(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import kept_runs
 import pytest
 
-from ground_station.experiments import claims, declaration, report, summary, tables
+from ground_station.experiments import declaration, report, summary, tables
 from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
 from pi_firmware.wire.errors import ConfigError
@@ -57,7 +57,7 @@ def document(tmp_path, claim, sunset, noon=None):
 def test_a_claim_is_kept_or_not_by_its_row(tmp_path, claim, kept, told):
     found = document(tmp_path, claim, [kept_runs.run(SUNSET)] * 2)
     (one,) = found["claims"]
-    assert one["kept"] is kept and told in claims.line(one)
+    assert one["kept"] is kept and told in summary.claim_line(one)
     assert report.good(found) is kept
     assert (told in tables.verdict(found)) is (not kept)
     assert told in report.markdown(found)
@@ -94,7 +94,7 @@ def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
     found = {"recovery_s": 0.4}
     runs = [kept_runs.run(SUNSET) | found, kept_runs.run(SUNSET)]
     (one,) = document(tmp_path, claim, runs)["claims"]
-    assert one["kept"] is False and "no figure in some run" in claims.line(one)
+    assert one["kept"] is False and "no figure in some run" in summary.claim_line(one)
     runs[1] |= found
     assert document(tmp_path, claim, runs)["claims"][0]["kept"] is True
 
@@ -102,7 +102,7 @@ def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
 def test_what_was_not_measured_is_neither_kept_nor_broken(tmp_path):
     good, failed = kept_runs.run(NOON), {"failed": "no two images overlap"}
     (one,) = document(tmp_path, POSITION, [good, failed])["claims"]
-    assert one["kept"] is None and claims.line(one).endswith("not measured.")
+    assert one["kept"] is None and summary.claim_line(one).endswith("not measured.")
     (one,) = document(tmp_path, RATIO, [good, good], noon=[failed, good])["claims"]
     assert one["kept"] is None
 
@@ -111,7 +111,7 @@ def test_claims_of_experiments_that_are_not_wanted_are_left_out():
     declared = declaration.load(declaration.SHIPPED, ["illumination"])
     assert {claim.row for claim in declared.claims} > {"illumination.sunset"}
     experiments = [{"name": "motion", "cases": []}]
-    assert claims.judge(declared.claims, experiments) == []
+    assert summary.judge_claims(declared.claims, experiments) == []
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from ground_station.errors import InputError
-from ground_station.experiments import declaration, plan, program
-from ground_station.experiments.declaration import FlightDeclaration
+from ground_station.experiments import declaration, plan
+from ground_station.experiments.declaration import FLIGHT_S, IMAGES, FlightDeclaration, shortened
 from ground_station.experiments.maps import evenly
 from ground_station.experiments.plan import FlightJob, MapJob, RunJob
-from ground_station.experiments.quick import FLIGHT_S, IMAGES, shortened
 from ground_station.mapping.settings import MappingSettings
 
 TEXT = """
@@ -98,13 +97,11 @@ def test_real_pictures_that_are_not_there_are_refused_by_name(declared, tmp_path
 
 
 def test_comments_and_docstrings_do_not_make_another_program():
-    plain = program._meaning("def f(a):\n    return a + 1\n")
-    told = program._meaning(
-        '"""Room."""\n\n\ndef f(a):\n    """Adds."""\n    return a + 1  # why\n'
-    )
-    other = program._meaning("def f(a):\n    return a + 2\n")
+    plain = plan._meaning("def f(a):\n    return a + 1\n")
+    told = plan._meaning('"""Room."""\n\n\ndef f(a):\n    """Adds."""\n    return a + 1  # why\n')
+    other = plan._meaning("def f(a):\n    return a + 2\n")
     assert plain == told != other
-    assert len({program.code_sha256(kind) for kind in program.ROOMS}) == 3
+    assert len({plan.code_sha256(kind) for kind in plan.ROOMS}) == 3
 
 
 @pytest.mark.parametrize("total", [600, 500, 250, 138, 137])
@@ -118,8 +115,8 @@ def test_a_map_has_the_images_asked_for_from_the_first_to_the_last(total):
 
 
 def test_rooms_of_the_program_are_there():
-    for room in {room for rooms in program.ROOMS.values() for room in rooms}:
-        assert (program._ROOT / room).exists(), room
+    for room in {room for rooms in plan.ROOMS.values() for room in rooms}:
+        assert (plan._ROOT / room).exists(), room
 
 
 def test_quick_has_one_seed_short_flights_and_maps_of_which_nothing_is_flown_in_vain(declared):

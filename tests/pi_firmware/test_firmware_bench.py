@@ -7,7 +7,7 @@ import json
 import pytest
 
 from ground_station import cli
-from ground_station.bench import figures, flight
+from ground_station.bench import flight
 
 
 def test_import_times_are_summed_by_package() -> None:
@@ -18,7 +18,7 @@ def test_import_times_are_summed_by_package() -> None:
         "import time:       500 |        500 |     json.decoder\n"
         "a line of the program's own\n"
     )
-    modules, packages = figures.imports(text)
+    modules, packages = flight.imports(text)
     assert modules == pytest.approx({"numpy._core": 2e-3, "numpy": 1e-3, "json.decoder": 5e-4})
     assert packages == pytest.approx({"numpy": 3e-3, "the standard library": 5e-4})
 
