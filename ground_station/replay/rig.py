@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,11 +24,12 @@ class FirmwareError(GroundStationError):
 class FirmwareProcess:
     """`python -m pi_firmware` with a configuration of ours; a context manager that ends it.
 
-    Its standard error is written beside the configuration.
+    What it says is written beside the configuration. `prefix` are words before the command,
+    of a program that becomes it.
     """
 
-    def __init__(self, config: dict[str, Any], folder: Path) -> None:
-        self._config, self._folder = config, folder
+    def __init__(self, config: dict[str, Any], folder: Path, prefix: Sequence[str] = ()) -> None:
+        self._config, self._folder, self._prefix = config, folder, prefix
         self._log = folder / "firmware.log"
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -37,10 +38,10 @@ class FirmwareProcess:
         path.write_bytes(tomli_w.dumps(self._config).encode())
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "pi_firmware", "--config", str(path)],
+                [*self._prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)],
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=log,
+                stdout=log,
+                stderr=subprocess.STDOUT,
             )
         return self
 

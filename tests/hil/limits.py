@@ -19,11 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from limits_axes import AXES, Axis, Conditions, chosen
-from limits_search import BORNE, Found, search
+from limits_axes import AXES, BORNE, Axis, Conditions, Found, chosen, search
 from limits_stand import Flight, Measured, TrialError, measure
-from limits_store import Store, read
-from limits_table import QUIET_CORES, accept, render
+from limits_store import QUIET_CORES, Store, accept, read, render
 from limits_throttle import method
 from soaking.arguments import Parser
 

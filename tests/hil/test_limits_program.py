@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import limits
-import limits_table
+import limits_store
 import pytest
 from limits_axes import AXES, Conditions, chosen
 from limits_stand import Flight, Measured, TrialError
-from limits_table import BLOCK, accept, render
+from limits_store import BLOCK, accept, render
 
 from ground_station.errors import GroundStationError
 from pi_firmware.settings import Settings
@@ -140,10 +140,10 @@ def test_a_readme_without_the_markers_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_the_table_in_the_readme_is_that_of_the_accepted_run() -> None:
-    table = BLOCK.read(limits_table.README.read_text())
-    assert (table is not None) == limits_table.ACCEPTED.exists()
+    table = BLOCK.read(limits_store.README.read_text())
+    assert (table is not None) == limits_store.ACCEPTED.exists()
     if table is not None:
-        assert table == render(document(limits_table.ACCEPTED))
+        assert table == render(document(limits_store.ACCEPTED))
 
 
 def test_a_share_just_below_the_bound_is_not_rounded_up_to_it() -> None:

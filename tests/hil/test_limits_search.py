@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
-from limits_search import BORNE, Found, Tried, search
+from limits_axes import BORNE, Found, Tried, search
 
 
 class System:

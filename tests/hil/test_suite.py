@@ -3,56 +3,64 @@
 from __future__ import annotations
 
 import json
-import random
 import socket
-import subprocess
-import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import pytest
+import suite
 from links.namespace import netem
 from links.proxy import ProxyLink
 from payloads import small
 
-from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.recording.flight import camera_of
 from ground_station.replay.cases.case import Link, load_case
-from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader, RecordingWriter
+from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader
 
-SUITE = Path(__file__).with_name("suite.py")
-CASES = SUITE.with_name("cases")
+CASES = Path(__file__).with_name("cases")
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
 
 
-def hil(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SUITE), *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+@dataclass(frozen=True)
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def hil(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
+    """Runs the program, in this process."""
+
+    def run(*words: object) -> Done:
+        with monkeypatch.context() as patch:
+            patch.setattr(suite.signal, "signal", lambda *_: None)  # the test runner's own stay
+            return Done(suite.main([str(word) for word in words]), *capsys.readouterr())
+
+    return run
 
 
 def write(folder: Path, name: str, bounds: str, more: str = "", recording: object = "") -> Path:
-    """A case of four seconds at 5 Hz, which a busy machine can keep up with."""
+    """A case of two seconds at 5 Hz, stepped, so that a busy machine drops no frame."""
     path = folder / f"{name}.toml"
     path.write_text(
         f'title = "{name}"\nrecording = "{recording or SAMPLE / "flight.mcap"}"\n'
-        f'map = "{SAMPLE}"\nrate_hz = 5.0\nstart_s = 2.0\nduration_s = 4.0\n'
-        f'{more}\n[truth]\nkind = "recording"\n[bounds]\n{bounds}\n'
+        f'map = "{SAMPLE}"\nrate_hz = 5.0\nstart_s = 2.0\nduration_s = 2.0\n'
+        f'stepped = true\n{more}\n[truth]\nkind = "recording"\n[bounds]\n{bounds}\n'
     )
     return path
 
 
-def test_cases_are_flown_judged_and_shown(tmp_path: Path) -> None:
-    """One that holds, over a link that does something; one that misses a bound: status 1.
-
-    Stepped, so that a busy machine drops no frame.
-    """
+def test_cases_are_flown_judged_and_shown(tmp_path: Path, hil: Callable[..., Done]) -> None:
+    """One that holds, over a link that does something; one that misses a bound: status 1."""
     out = tmp_path / "out"
-    link = 'stepped = true\n[link]\nkind = "proxy"\nseed = 9\nduplicate = 0.1\n'
+    link = '[link]\nkind = "proxy"\nseed = 9\nduplicate = 0.1\n'
     good = write(tmp_path, "good", "position_max_m = 0.5\nlost_max = 0.0", link)
-    missed = write(tmp_path, "missed", "position_max_m = 1e-6\nlost_max = 0.0", "stepped = true")
+    missed = write(tmp_path, "missed", "position_max_m = 1e-6\nlost_max = 0.0")
     done = hil(good, missed, "--out", out)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "MISSED position_max_m" in done.stdout
@@ -62,7 +70,7 @@ def test_cases_are_flown_judged_and_shown(tmp_path: Path) -> None:
     assert not told["passed"]
     run = told["cases"][0]["outcome"]
     counts, accounts = run["link_counts"], run["accounts"]
-    assert accounts["captured"] == 20
+    assert accounts["captured"] == 10
     assert counts["received"] == counts["passed"] and counts["lost"] == 0 < counts["duplicated"]
     # The last packet's copy may come when all is counted.
     copies = run["stream"]["packets"] - counts["passed"]
@@ -79,7 +87,7 @@ def test_cases_are_flown_judged_and_shown(tmp_path: Path) -> None:
 
 
 def test_a_cut_recording_is_flown_to_its_last_whole_chunk_and_said_to_be_cut(
-    tmp_path: Path,
+    tmp_path: Path, hil: Callable[..., Done]
 ) -> None:
     cut = tmp_path / "cut.mcap"
     whole = (SAMPLE / "flight.mcap").read_bytes()
@@ -91,35 +99,7 @@ def test_a_cut_recording_is_flown_to_its_last_whole_chunk_and_said_to_be_cut(
     told = json.loads((tmp_path / "out/suite.json").read_text())
     captured = told["cases"][0]["outcome"]["accounts"]["captured"]
     times = [sample.time_ns for sample in RecordingReader(cut).video()]
-    assert 0 < captured <= (times[-1] - times[0]) / 1e9 * 5 - 2 * 5 + 1 < 20
-
-
-def test_a_recording_cut_anywhere_is_readable_to_its_last_whole_chunk(tmp_path: Path) -> None:
-    """At 100 random bytes: what a chunk that ends before the cut holds is there, and no more."""
-    source = tmp_path / "whole.mcap"
-    draw = random.Random(11)
-    sizes = [draw.randrange(200, 3000) for _ in range(400)]
-    with RecordingWriter(source, chunk_bytes=8192) as writer:
-        for k, size in enumerate(sizes):
-            writer.write_video(k + 1, draw.randbytes(size))
-    from mcap.reader import make_reader
-
-    with source.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None and len(summary.chunk_indexes) > 50
-    ends = [
-        (index.chunk_start_offset + index.chunk_length, index.message_end_time)
-        for index in summary.chunk_indexes
-    ]
-    data, cut = source.read_bytes(), tmp_path / "cut.mcap"
-    for _ in range(100):
-        at = draw.randrange(ends[0][0], ends[-1][0])
-        cut.write_bytes(data[:at])
-        reader = RecordingReader(cut)
-        found = [sample.time_ns for sample in reader.video()]
-        last = max(time_ns for end, time_ns in ends if end <= at)
-        assert found[:last] == list(range(1, last + 1)), f"cut at {at}"
-        assert reader.cut and reader.cut_reason
+    assert 0 < captured <= (times[-1] - times[0]) / 1e9 * 5 - 2 * 5 + 1 < 10
 
 
 @pytest.mark.parametrize(
@@ -132,13 +112,17 @@ def test_a_recording_cut_anywhere_is_readable_to_its_last_whole_chunk(tmp_path: 
         (["--against", "out/same", "--out", "out/same"], "is --out, too"),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(words: list[str], told: str) -> None:
+def test_bad_input_is_one_line_and_status_2(
+    words: list[str], told: str, hil: Callable[..., Done]
+) -> None:
     done = hil(*words)
     assert done.returncode == 2 and told in done.stderr
     assert done.stderr.startswith("hil: ") and done.stderr.count("\n") == 1
 
 
-def test_a_bad_case_is_refused_before_any_is_flown(tmp_path: Path) -> None:
+def test_a_bad_case_is_refused_before_any_is_flown(
+    tmp_path: Path, hil: Callable[..., Done]
+) -> None:
     good = write(tmp_path, "good", "lost_max = 0.0")
     bad = write(tmp_path, "bad", "lost_max = 1.5")
     done = hil(good, bad, "--out", tmp_path / "out")
@@ -181,16 +165,6 @@ def test_a_small_recording_is_the_same_flight_through_a_coarser_grid(tmp_path: P
     assert len(times) > 5 and set(times) <= taken
     assert np.diff(times) / 1e9 == pytest.approx(0.2, abs=0.02)
     assert {pose.time_ns for pose in reader.poses(TRUTH_TOPIC)} <= set(times)
-
-
-def test_a_coarser_grid_sees_the_same_rays_at_the_same_places() -> None:
-    camera = THESIS_CAMERA
-    coarse = small.scaled(camera, camera.width_px // 2, camera.height_px // 2)
-    # The mean of the pixels 0 and 1 is at 0.5, which is the coarse grid's 0.
-    picture = np.arange(16, dtype=np.float32).reshape(4, 4)
-    half = cv2.resize(picture, (2, 2), interpolation=cv2.INTER_AREA)
-    assert half[0, 0] == pytest.approx(picture[:2, :2].mean())
-    assert coarse.cx_px == pytest.approx((camera.cx_px - 0.5) / 2)
 
 
 def test_outages_are_told_by_the_wall_clock_once_they_have_begun() -> None:

@@ -10,7 +10,6 @@ import contextlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -18,20 +17,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import tomli_w
 from links.proxy import told
 
 from ground_station.errors import GroundStationError
 from ground_station.keys.authority import Authority
 from ground_station.replay.cases.case import Link
 from ground_station.replay.cases.outcome import Outage
-from ground_station.replay.rig import LOOPBACK, Rig
+from ground_station.replay.rig import LOOPBACK, FirmwareProcess, Rig
 from ground_station.service.settings import TelemetrySettings, VideoSettings
 
 _TOOLS = ("ip", "tc", "unshare", "nsenter")
 _LIMIT_S = 30.0
 _PACKET_BYTES = 1400
-_END_S = 10.0
 _LOADED_S = 240.0
 
 
@@ -49,7 +46,6 @@ class NamespaceLink:
         self._stack = contextlib.ExitStack()
         self._outages: list[Outage] = []
         self._flying = threading.Event()
-        self._firmware: _Firmware | None = None
 
     def lacks(self) -> str:
         """Why it cannot be flown here, in words; "" when it can."""
@@ -130,18 +126,15 @@ class NamespaceLink:
         return list(self._outages)
 
     @contextlib.contextmanager
-    def _fly(self, config: dict[str, Any], folder: Path) -> Iterator[_Firmware]:
+    def _fly(self, config: dict[str, Any], folder: Path) -> Iterator[FirmwareProcess]:
         config = {
             **config,
             "link": {**config["link"], "host": f"{self._address}1"},
             "telemetry": {**config["telemetry"], "certificates": str(self._payload)},
         }
-        firmware = _Firmware(config, folder, self._host.prefix)
-        try:
-            firmware.wait_loaded()
+        with FirmwareProcess(config, folder, self._host.prefix) as firmware:
+            _wait_loaded(firmware, folder / "firmware.log")
             yield firmware
-        finally:
-            firmware.end()
 
     def _pull(self, ended: threading.Event) -> None:
         """Pulls the cable at the case's times from the first frame on."""
@@ -190,51 +183,14 @@ class Holder:
         self._process.communicate()
 
 
-class _Firmware:
-    """`python -m pi_firmware` behind a prefix; `Running` of a stand."""
-
-    def __init__(self, config: dict[str, Any], folder: Path, prefix: tuple[str, ...]) -> None:
-        path, self._log = folder / "payload.toml", folder / "firmware.log"
-        path.write_bytes(tomli_w.dumps(config).encode())
-        with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                [*prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-            )  # fmt: skip
-
-    def wait_loaded(self) -> None:
-        """Waits for its first words; raises `NamespaceError` when it fails or takes too long."""
-        until_s = time.monotonic() + _LOADED_S
-        while not self._log.read_bytes().startswith(b"payload "):
-            self.check()
-            if not self.running() or time.monotonic() > until_s:
-                raise NamespaceError(f"the firmware did not start within {_LOADED_S:g} s")
-            time.sleep(0.05)
-
-    def check(self) -> None:
-        """Raises `NamespaceError` with the firmware's last line when it ended with an error."""
-        if status := self._process.poll():
-            lines = self._log.read_text(errors="replace").strip().splitlines()
-            said = lines[-1] if lines else "nothing"
-            raise NamespaceError(f"the firmware ended with status {status}: {said[:300]}")
-
-    def running(self) -> bool:
-        """Whether the process is alive."""
-        return self._process.poll() is None
-
-    def pid(self) -> int | None:
-        """Its id: nsenter becomes it."""
-        return self._process.pid
-
-    def end(self) -> None:
-        """Ends it in order, or else at once."""
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+def _wait_loaded(firmware: FirmwareProcess, log: Path) -> None:
+    """Waits for its first words; raises a `GroundStationError` when it fails or takes too long."""
+    until_s = time.monotonic() + _LOADED_S
+    while not log.read_bytes().startswith(b"payload "):
+        firmware.check()
+        if not firmware.running() or time.monotonic() > until_s:
+            raise NamespaceError(f"the firmware did not start within {_LOADED_S:g} s")
+        time.sleep(0.05)
 
 
 def netem(link: Link) -> list[str] | str:

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ground_station.errors import InputError
-from ground_station.geometry.camera import Camera
+from ground_station.experiments.alter import scaled_camera
 from ground_station.progress import Progress
 from ground_station.recording.encoding import H264Encoder
 from ground_station.recording.flight import FlightRecording, camera_of
@@ -63,7 +63,13 @@ def make(recording: Path, out: Path, size: Size = Size()) -> None:
     camera = camera_of(reader)
     if camera is None:
         raise InputError(f"{recording}: it carries no camera calibration")
-    coarse = scaled(camera, size.width_px, size.height_px)
+    # The same lens on a grid of fewer pixels.
+    coarse = scaled_camera(camera, size.width_px / camera.width_px)
+    if (coarse.width_px, coarse.height_px) != (size.width_px, size.height_px):
+        raise InputError(
+            f"{camera.width_px}x{camera.height_px} px do not become"
+            f" {size.width_px}x{size.height_px}: the shape is another, or it is larger"
+        )
     encoder = H264Encoder(size.width_px, size.height_px, size.rate_hz, crf=_CRF)
     grid, times = RateGrid(size.rate_hz), list[int]()
     with RecordingWriter(out) as writer, Progress("small recording", None) as progress:
@@ -97,25 +103,6 @@ def make(recording: Path, out: Path, size: Size = Size()) -> None:
                 writer.write_pose(
                     pose.time_ns, pose.position_m, pose.quaternion_xyzw, topic=TRUTH_TOPIC
                 )
-
-
-def scaled(camera: Camera, width_px: int, height_px: int) -> Camera:
-    """The same lens on a grid of fewer pixels; the centre of the first is (0, 0) on both."""
-    x, y = width_px / camera.width_px, height_px / camera.height_px
-    if x > 1 or abs(x / y - 1) > 0.01:
-        raise InputError(
-            f"{camera.width_px}x{camera.height_px} px do not become {width_px}x{height_px}:"
-            " the shape is another, or it is larger"
-        )
-    return replace(
-        camera,
-        width_px=width_px,
-        height_px=height_px,
-        fx_px=camera.fx_px * x,
-        fy_px=camera.fy_px * y,
-        cx_px=(camera.cx_px + 0.5) * x - 0.5,
-        cy_px=(camera.cy_px + 0.5) * y - 0.5,
-    )
 
 
 if __name__ == "__main__":
