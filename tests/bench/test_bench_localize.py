@@ -18,7 +18,7 @@ ATRIUM = Path(__file__).parents[2] / "maps/atrium"
 def run(tmp_path_factory):
     """What the command printed and wrote; a process of its own has the threads a user's has."""
     out = tmp_path_factory.mktemp("bench") / "bench.json"
-    arguments = ["--frames", "4", "--repetitions", "20", "--landmarks", "10000", "200000"]
+    arguments = ["--frames", "4", "--repetitions", "5", "--landmarks", "10000", "200000"]
     blimp = Path(sys.executable).with_name("blimp")
     done = subprocess.run(
         [blimp, "bench", "localize", "--map", ATRIUM, *arguments, "--seed", "44", "--json", out],
@@ -46,7 +46,7 @@ def test_a_larger_map_shows_no_more_of_itself(run):
     assert large["in_view"] == pytest.approx(small["in_view"], rel=0.2) and small["in_view"] > 200
     assert dense["landmarks"] == 200_000 and dense["density"] == 10
     assert dense["in_view"] > 7 * large["in_view"]
-    assert small["localized"] == large["localized"] == dense["localized"] == 20
+    assert small["localized"] == large["localized"] == dense["localized"] == 5
 
 
 def test_a_large_map_stays_small_in_memory(run):

@@ -311,15 +311,3 @@ def test_what_is_wrong_is_one_line_and_status_2(
         status = cli.main(["evaluate", *map(str, arguments)])
         errors = capsys.readouterr().err
         assert status == 2 and errors.count("\n") == 1 and says in errors, errors
-
-
-def test_help_shows_an_example_and_loads_nothing_heavy() -> None:
-    code = (
-        "import argparse, sys; from ground_station.evaluation import command;"
-        "p = argparse.ArgumentParser(); command.add_arguments(p); print(p.format_help());"
-        "print([m for m in ('numpy', 'matplotlib', 'cv2', 'scipy') if m in sys.modules])"
-    )
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    ).stdout
-    assert "blimp evaluate out/est.txt" in printed and printed.endswith("[]\n")

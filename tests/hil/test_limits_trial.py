@@ -125,7 +125,7 @@ def cpu_s(pid: int) -> float:
     return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
-def used(pid: int, seconds: float = 1.5) -> float:
+def used(pid: int, seconds: float = 0.8) -> float:
     """Cores that a process uses now."""
     began_s, before_s = time.monotonic(), cpu_s(pid)
     time.sleep(seconds)
@@ -195,8 +195,8 @@ def test_what_a_process_has_started_and_will_start_is_held_back_with_it(
             later = int(family.stdout.readline())
             assert tree(family.pid, (other,)) == {family.pid, child, later}
             assert all(held(pid) for pid in (family.pid, child, later))
-            assert not held(other, limit_s=0.5)
-        assert not held(child, later, limit_s=0.5)
+            assert not held(other, limit_s=0.2)
+        assert not held(child, later, limit_s=0.2)
         print(file=family.stdin, flush=True)
 
 

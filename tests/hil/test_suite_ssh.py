@@ -10,13 +10,13 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import suite
 from loopback_sshd import LIMIT_S, SSHD, LoopbackSshd
 from payloads import board
 from payloads.ssh import Plain, SshPayload
@@ -25,7 +25,6 @@ from payloads.target import SshError, Target
 from ground_station.errors import InputError
 
 CHECKOUT = Path(__file__).parents[2]
-SUITE = Path(__file__).with_name("suite.py")
 SAMPLE = CHECKOUT / "maps" / "atrium"
 
 needs_sshd = pytest.mark.skipif(
@@ -126,22 +125,22 @@ def firmware_of(text: str) -> list[int]:
 
 
 @needs_sshd
-def test_the_suite_flies_over_ssh(sshd: LoopbackSshd, tmp_path: Path) -> None:
+def test_the_suite_flies_over_ssh(
+    sshd: LoopbackSshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     case = tmp_path / "short.toml"
     case.write_text(
         f'title = "over SSH"\nrecording = "{SAMPLE / "flight.mcap"}"\nmap = "{SAMPLE}"\n'
         "rate_hz = 5.0\nstart_s = 2.0\nduration_s = 2.0\n"
         "[bounds]\nlost_max = 0.0\n"
     )
-    done = subprocess.run(
-        [sys.executable, SUITE, case, "--payload", f"ssh:{sshd.user}@127.0.0.1:{sshd.port}",
-         "--identity", sshd.identity, "--known-hosts", sshd.known_hosts, "--ssh-config",
-         sshd.folder / "ssh_config", "--folder", CHECKOUT, "--python", sys.executable,
-         "--out", tmp_path / "out"],
-        capture_output=True, text=True, timeout=600, check=False,
-        env={**os.environ, "HOME": str(tmp_path)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(suite.signal, "signal", lambda *_: None)  # the test runner's own stay
+    words = [case, "--payload", f"ssh:{sshd.user}@127.0.0.1:{sshd.port}", "--identity",
+             sshd.identity, "--known-hosts", sshd.known_hosts, "--ssh-config",
+             sshd.folder / "ssh_config", "--folder", CHECKOUT, "--python", sys.executable,
+             "--out", tmp_path / "out"]  # fmt: skip
+    assert suite.main([str(word) for word in words]) == 0
     assert "frames: 10 captured" in (tmp_path / "out/short/firmware.log").read_text()
     told = json.loads((tmp_path / "out/suite.json").read_text())
     assert told["passed"] and "no card" in told["payload"]
