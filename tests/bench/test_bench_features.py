@@ -13,7 +13,7 @@ import pytest
 from ground_station.bench.features import command, homographies
 from ground_station.bench.features.homographies import Pair, Score, score
 from ground_station.errors import InputError
-from ground_station.feature_models.homographic import Found, project
+from ground_station.feature_models.homographic import Found
 from ground_station.features import extractors
 from ground_station.features.extractor import Features
 
@@ -94,12 +94,6 @@ def test_a_wrong_truth_is_told_by_all_measures():
     )
     assert found.found.accuracy < 0.05
     assert found.corners_px == pytest.approx(12, rel=0.2)
-
-
-def test_projection_is_opencvs():
-    points = np.random.default_rng(0).uniform(0, 640, (20, 2))
-    expected = cv2.perspectiveTransform(points[None], WARP)[0]
-    assert np.allclose(project(WARP, points), expected)
 
 
 def test_means_are_over_pairs_and_by_scene():

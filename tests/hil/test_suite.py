@@ -56,14 +56,21 @@ def write(folder: Path, name: str, bounds: str, more: str = "", recording: objec
 
 
 def test_cases_are_flown_judged_and_shown(tmp_path: Path, hil: Callable[..., Done]) -> None:
-    """One that holds, over a link that does something; one that misses a bound: status 1."""
+    """One that holds, over a link that does something; one that misses a bound: status 1.
+
+    That one's recording is cut: it is flown to its last whole chunk and said to be cut.
+    """
     out = tmp_path / "out"
     link = '[link]\nkind = "proxy"\nseed = 9\nduplicate = 0.1\n'
     good = write(tmp_path, "good", "position_max_m = 0.5\nlost_max = 0.0", link)
-    missed = write(tmp_path, "missed", "position_max_m = 1e-6\nlost_max = 0.0")
+    cut = tmp_path / "cut.mcap"
+    whole = (SAMPLE / "flight.mcap").read_bytes()
+    cut.write_bytes(whole[: len(whole) // 8])
+    bounds = "position_max_m = 1e-6\nlost_max = 0.0"
+    missed = write(tmp_path, "missed", bounds, recording=cut)
     done = hil(good, missed, "--out", out)
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "MISSED position_max_m" in done.stdout
+    assert "MISSED position_max_m" in done.stdout and "cut.mcap was cut (" in done.stdout
     assert "injected: proxy, seed 9: duplicate=0.1" in done.stdout
     told = json.loads((out / "suite.json").read_text())
     assert [case["passed"] for case in told["cases"]] == [True, False], done.stdout
@@ -75,6 +82,9 @@ def test_cases_are_flown_judged_and_shown(tmp_path: Path, hil: Callable[..., Don
     # The last packet's copy may come when all is counted.
     copies = run["stream"]["packets"] - counts["passed"]
     assert counts["duplicated"] - 1 <= copies <= counts["duplicated"]
+    captured = told["cases"][1]["outcome"]["accounts"]["captured"]
+    times = [sample.time_ns for sample in RecordingReader(cut).video()]
+    assert 0 < captured <= (times[-1] - times[0]) / 1e9 * 5 - 2 * 5 + 1 < 10
     root = ElementTree.parse(out / "junit.xml").getroot()
     assert root.get("failures") == "1" and root.get("errors") == "0"
     failed = [test for test in root.iter("testcase") if test.find("failure") is not None]
@@ -84,22 +94,6 @@ def test_cases_are_flown_judged_and_shown(tmp_path: Path, hil: Callable[..., Don
     assert "good" in (out / "index.html").read_text()
     for name in ("result.json", "frames.csv", "estimate.txt", "firmware.log"):
         assert (out / "good" / name).is_file()
-
-
-def test_a_cut_recording_is_flown_to_its_last_whole_chunk_and_said_to_be_cut(
-    tmp_path: Path, hil: Callable[..., Done]
-) -> None:
-    cut = tmp_path / "cut.mcap"
-    whole = (SAMPLE / "flight.mcap").read_bytes()
-    cut.write_bytes(whole[: len(whole) // 8])
-    case = write(tmp_path, "cut", "lost_max = 0.0", recording=cut)
-    done = hil(case, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "cut.mcap was cut (" in done.stdout
-    told = json.loads((tmp_path / "out/suite.json").read_text())
-    captured = told["cases"][0]["outcome"]["accounts"]["captured"]
-    times = [sample.time_ns for sample in RecordingReader(cut).video()]
-    assert 0 < captured <= (times[-1] - times[0]) / 1e9 * 5 - 2 * 5 + 1 < 10
 
 
 @pytest.mark.parametrize(
