@@ -64,11 +64,6 @@ def test_the_table_fits_its_width_and_has_colour_only_where_asked() -> None:
     assert text(found, colour=True, width=70).count("\x1b[0m") == 3
 
 
-def test_this_environment_is_as_locked() -> None:
-    assert software.python().level == OK
-    assert software.packages(ROOT).level == OK
-
-
 def test_another_version_and_a_missing_package_are_named(tmp_path: Path) -> None:
     project = '[project]\ndependencies = ["tqdm", "certainly-not-there"]\n'
     (tmp_path / "pyproject.toml").write_text(project)
@@ -111,11 +106,6 @@ def test_the_lock_s_part_that_is_installed_has_no_development_tools() -> None:
     assert run.stdout.count("--hash=sha256:") > len(names)
     # Entries for other Pythons stay, as the installation may have another than this one.
     assert run.stdout.count("\nnumpy==") > 1
-
-
-def test_the_encoder_works_here() -> None:
-    found = list(software.video())
-    assert [f.level for f in found] == [OK, OK], found
 
 
 def test_a_port_that_is_held_names_its_holder() -> None:

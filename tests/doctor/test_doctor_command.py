@@ -5,10 +5,14 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
-from ground_station.doctor import ROOT, running
-from ground_station.doctor.findings import OK, PROBLEM
+import pytest
+
+from ground_station import cli
+from ground_station.doctor import ROOT, command, running, software
+from ground_station.doctor.findings import OK, PROBLEM, Check
 from ground_station.service.settings import StationSettings, TelemetrySettings
 from pi_firmware.wire import keys, telemetry
 
@@ -44,9 +48,9 @@ max_file_MB = 1
 
 
 def doctor(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "ground_station.cli", "doctor", *map(str, arguments)]
+    words = [sys.executable, "-m", "ground_station.cli", "doctor", *map(str, arguments)]
     return subprocess.run(
-        command,
+        words,
         cwd=cwd,
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "HOME": str(cwd)},
         capture_output=True,
@@ -62,39 +66,58 @@ def test_a_machine_that_is_well(tmp_path: Path) -> None:
     problems = [f for f in document["findings"] if f["level"] == PROBLEM]
     assert (run.returncode, problems, run.stderr) == (0, [], "")
     assert document["counts"][PROBLEM] == 0
-    names = [finding["name"] for finding in document["findings"]]
-    for name in ("python", "packages", "encoder", "map", "clock", "disk", "firewall", "payloads"):
-        assert name in names
+    levels = {finding["name"]: finding["level"] for finding in document["findings"]}
+    assert levels.keys() >= {"map", "clock", "disk", "firewall", "payloads"}
+    # As the lock says, and able to encode and decode.
+    assert all(levels[name] == OK for name in ("python", "packages", "gstreamer", "encoder"))
     assert all(finding["fix"] for finding in document["findings"] if finding["level"] != OK)
     assert "\x1b" not in run.stdout
     assert not (tmp_path / "recordings").exists()
 
 
-def test_a_problem_is_status_1_and_says_how_to_mend_it(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+@pytest.fixture
+def here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """Runs the command in this process, of the machine's own checks only the quickest one."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setattr(command, "of_machine", lambda: [Check("python", software.python)])
+
+    def run(*arguments: object) -> tuple[int, str]:
+        return cli.main(["doctor", *map(str, arguments)]), capsys.readouterr().out
+
+    return run
+
+
+def test_a_problem_is_status_1_and_says_how_to_mend_it(
+    tmp_path: Path, here: Callable[..., tuple[int, str]]
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
         held.bind(("127.0.0.1", 0))
         port = held.getsockname()[1]
-        run = doctor("--config", config, "--set", f"video.port={port}", cwd=tmp_path)
-    assert run.returncode == 1
-    lines = run.stdout.splitlines()
+        status, said = here("--config", configuration(tmp_path), "--set", f"video.port={port}")
+    assert status == 1
+    lines = said.splitlines()
     at = next(i for i, line in enumerate(lines) if line.startswith(f"port {port}/udp"))
     assert "problem" in lines[at]
     assert any("->" in line for line in lines[at + 1 : at + 4])
 
 
-def test_a_configuration_that_is_refused_is_the_first_finding(tmp_path: Path) -> None:
-    run = doctor("--config", configuration(tmp_path, "nmae = 'hall'"), cwd=tmp_path)
-    assert run.returncode == 1
-    assert "nmae" in run.stdout.splitlines()[0] + run.stdout.splitlines()[1]
-    assert "Traceback" not in run.stdout + run.stderr
-    assert "python" in run.stdout and "port " not in run.stdout
+def test_a_configuration_that_is_refused_is_the_first_finding(
+    tmp_path: Path, here: Callable[..., tuple[int, str]]
+) -> None:
+    status, said = here("--config", configuration(tmp_path, "nmae = 'hall'"))
+    assert status == 1 and "nmae" in "".join(said.splitlines()[:2])
+    assert "python" in said and "port " not in said
 
 
-def test_a_network_without_certificates_is_the_first_finding(tmp_path: Path) -> None:
-    run = doctor("--lan", "--config", configuration(tmp_path), cwd=tmp_path)
-    assert run.returncode == 1
-    assert "blimp keys ground main" in " ".join(run.stdout.split())
+def test_a_network_without_certificates_is_the_first_finding(
+    tmp_path: Path, here: Callable[..., tuple[int, str]]
+) -> None:
+    status, said = here("--lan", "--config", configuration(tmp_path))
+    assert status == 1 and "blimp keys ground main" in " ".join(said.split())
 
 
 def station(port: int) -> StationSettings:

@@ -131,14 +131,6 @@ def test_a_run_that_was_disturbed_or_cut_short_is_not_accepted(tmp_path: Path) -
     assert path.read_text() == before and not kept.exists()
 
 
-def test_a_readme_without_the_markers_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "README.md"
-    path.write_text("no table\n")
-    with pytest.raises(GroundStationError, match="has no line"):
-        accept(measured(tmp_path / "limits.json"), path, tmp_path / "accepted.json")
-    assert path.read_text() == "no table\n" and not (tmp_path / "accepted.json").exists()
-
-
 def test_the_table_in_the_readme_is_that_of_the_accepted_run() -> None:
     table = BLOCK.read(limits_store.README.read_text())
     assert (table is not None) == limits_store.ACCEPTED.exists()
