@@ -55,7 +55,6 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.experiments import (
         declaration,
         plan,
-        readme,
         report,
         schedule,
         summary,
@@ -97,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, document)
     if args.accept:
-        readme.accept(document, args.accept, declaration.SHIPPED.with_name(readme.NAME))
+        report.accept(document, args.accept, declaration.SHIPPED.with_name(report.ACCEPTED))
     for experiment in document["experiments"]:
         print(tables.text(experiment), end="\n\n")
     print(document["conditions"])

@@ -198,7 +198,7 @@ ROOMS = {
     "flight": ("experiments/flights.py", "simulator", "geometry"),
     "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
             "geometry", "recording"),
-    "run": ("experiments/measure.py", "experiments/alone.py", "experiments/alter.py",
+    "run": ("experiments/measure.py", "experiments/alter.py",
             "experiments/maps.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
             "map/accuracy.py", "map/uncertainty.py",
