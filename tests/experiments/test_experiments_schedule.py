@@ -75,14 +75,6 @@ def dies(job, folder: Path, data: Path) -> None:
     note(job, folder, data)
 
 
-def dies_once(job, folder: Path, data: Path) -> None:
-    before = folder / "died"
-    if isinstance(job, RunJob) and job.seed == 1 and not before.exists():
-        before.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    note(job, folder, data)
-
-
 def slow(job, folder: Path, data: Path) -> None:
     if isinstance(job, RunJob):
         (folder / f"begun-{job.key}").touch()
@@ -117,15 +109,13 @@ def test_what_a_person_can_mend_is_raised_and_the_rest_kept(tmp_path):
     assert sorted(done(tmp_path)) == ["f", "m", "r0", "r1", "r2"]
 
 
-def test_a_process_that_dies_once_costs_nothing_and_twice_its_own_job(tmp_path):
-    once, twice = tmp_path / "once", tmp_path / "twice"
-    once.mkdir()
-    twice.mkdir()
-    carry_out(a_plan(), Store(once), once, 2, dies_once)
-    assert sorted(done(once)) == ["f", "m", "r0", "r1", "r2"]
-    carry_out(a_plan(), Store(twice), twice, 1, dies)
-    assert sorted(done(twice)) == ["f", "m", "r0", "r2"]
-    assert Store(twice).read("r1") == {
+def test_a_process_that_dies_costs_its_neighbours_nothing_and_at_the_second_try_its_own_job(
+    tmp_path,
+):
+    carry_out(a_plan(), Store(tmp_path), tmp_path, 2, dies)
+    # Of one that had just ended the result may be lost with the pool: it is done again.
+    assert sorted(set(done(tmp_path))) == ["f", "m", "r0", "r2"]
+    assert Store(tmp_path).read("r1") == {
         "failed": "its process ended 2 times",
         "accident": True,
     }

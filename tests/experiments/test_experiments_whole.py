@@ -21,7 +21,7 @@ seed = 3
 [default.map.flight]
 plan = "loop"
 duration_s = 7.0
-rate_hz = 3.0
+rate_hz = 2.0
 [experiment.path]
 level = "covered for, s"
 [experiment.path.case."0"]
@@ -80,8 +80,6 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
         assert one["localized"] == other["localized"]
         assert one["position_m"] == pytest.approx(other["position_m"], abs=1e-4)
         assert one["rotation_deg"] == pytest.approx(other["rotation_deg"], abs=1e-3)
-    _, said = run(flown, capfd)
-    assert "experiments, jobs: 0 in" in said  # all is there
 
 
 def _runs(document):
