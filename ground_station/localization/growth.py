@@ -25,9 +25,8 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.lens import Lens
 from ground_station.localization.localizer import Localizer
-from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings, load_preset
-from ground_station.localization.visibility import LandmarkIndex
+from ground_station.localization.visibility import LandmarkIndex, project
 from ground_station.map import store
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo

@@ -22,16 +22,16 @@ from ground_station.localization.blur import gradient_energy, sharpness
 from ground_station.localization.estimate import Counts, PoseEstimate, State, no_observations
 from ground_station.localization.estimator import Estimator, make_estimator
 from ground_station.localization.following import Followed
-from ground_station.localization.judge import Judge
-from ground_station.localization.kinematics import Kinematics, Solution
-from ground_station.localization.lens import against_map, considered
-from ground_station.localization.matching import Described, Matcher, describe
-from ground_station.localization.publishing import (
+from ground_station.localization.judge import (
+    Judge,
     covariance_in_map,
     covariance_in_world,
     evidence_of,
     publish,
 )
+from ground_station.localization.kinematics import Kinematics, Solution
+from ground_station.localization.lens import against_map, considered
+from ground_station.localization.matching import Described, Matcher, describe
 from ground_station.localization.settings import LocalizerSettings, in_units
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker

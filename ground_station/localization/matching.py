@@ -16,14 +16,26 @@ from ground_station.geometry.lens import Lens
 from ground_station.localization.association import Associations, associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
-from ground_station.localization.chance import count_beyond_chance
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
-from ground_station.localization.projection import project
 from ground_station.localization.settings import WIDTH_PX, LocalizerSettings
 from ground_station.localization.verification import APART, Support, Witness
-from ground_station.localization.visibility import Covisibility, LandmarkIndex
+from ground_station.localization.visibility import Covisibility, LandmarkIndex, project
 from ground_station.map.modes import described
 from ground_station.map.store import Map
+
+
+def count_beyond_chance(
+    distance: npt.NDArray[np.floating], by_chance: npt.NDArray[np.floating], share: float
+) -> int:
+    """How many of N pairs, the nearest first, chance can have made at most a `share` of.
+
+    `distance` (N,), ascending, are of the descriptors of each pair; `by_chance` (M,), in any order,
+    of the pairs that as many tries found of what is not there.
+    """
+    wrong = np.searchsorted(np.sort(by_chance), distance, side="right")
+    kept = np.flatnonzero(wrong <= share * np.arange(1, len(distance) + 1))
+    return int(kept[-1]) + 1 if len(kept) else 0
+
 
 _DESCRIBED_PX = 10
 """A SIFT descriptor looks further than this around its key point, but with little weight."""

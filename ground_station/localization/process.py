@@ -243,7 +243,7 @@ def _swing_noise(settings: MotionSettings, density: Density, dt_s: float, basis:
 
 
 def _rotation_again(wTc: F64) -> F64:
-    # Products of products grow their rounding error: see motion.constant_velocity. A step of Newton
-    # and Schulz's iteration for the polar factor (Higham 1986) squares what is wrong.
+    # Products of products grow their rounding error, as in `estimator.constant_velocity`. A step of
+    # Newton and Schulz's iteration for the polar factor (Higham 1986) squares what is wrong.
     R = wTc[:3, :3]
     return poses.pose(R @ (1.5 * np.eye(3) - 0.5 * R.T @ R), wTc[:3, 3])

@@ -11,8 +11,8 @@ from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import Lens
-from ground_station.localization.projection import project
 from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
+from ground_station.localization.visibility import project
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.resizing import misfit
-from ground_station.recording.encoding import H264Encoder
 from ground_station.recording.frames import CAMERA_TABLE, FrameSource
+from ground_station.recording.h264 import H264Encoder
 from pi_firmware.wire import files
 from pi_firmware.wire.recording import RecordingWriter
 

@@ -19,7 +19,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.progress import stop_noted
-from ground_station.recording.encoding import H264Encoder
+from ground_station.recording.h264 import H264Encoder
 from ground_station.simulator import dynamics, handheld, people, scenes
 from ground_station.simulator.imaging import (
     AutoExposure,

@@ -13,8 +13,8 @@ from ground_station.arrays import Bools
 from ground_station.recording.h264 import grey
 from ground_station.stream import damage
 from ground_station.stream.counters import Counters
+from ground_station.stream.damage import ParameterSets, SliceHeader, parameter_sets, slice_header
 from ground_station.stream.rtp import MAX_JUMP, AccessUnit
-from ground_station.stream.slices import ParameterSets, SliceHeader, parameter_sets, slice_header
 from pi_firmware.wire import annexb, sei
 
 _OF_IDR = {annexb.NAL_SPS, annexb.NAL_PPS, annexb.NAL_IDR}

@@ -19,6 +19,9 @@ _FU_START, _FU_END = 0x80, 0x40
 MAX_JUMP = 3000
 """A sequence number further ahead than this is a new stream, not a loss (RFC 3550, A.1)."""
 MAX_ACCESS_UNIT_BYTES = 4 << 20
+_DEPTH = 32
+"""Later packets for which a missing one is waited for."""
+_LONGEST_WAIT_NS = 30_000_000
 _LEAST_WAIT_NS = 5_000_000
 """What is missing is waited for so long at least: the packets of one frame come within less."""
 _CORRECTED_NS = 1_000_000_000
@@ -91,23 +94,16 @@ class Reorderer:
     """Puts packets of one stream in order and decides when a missing one is lost.
 
     While `retransmission` helps, that is when it cannot come any more. Otherwise it is waited for
-    until `depth` later ones are here, or `wait_ns` have passed, and less where those that are
-    missing turn out to be lost and not overtaken; while corrections come, which follow their frame,
-    only those of later frames count.
+    until 32 later ones are here, or 30 ms have passed, and less where those that are missing turn
+    out to be lost and not overtaken; while corrections come, which follow their frame, only those
+    of later frames count.
     """
 
-    def __init__(
-        self,
-        counters: Counters,
-        *,
-        depth: int = 32,
-        wait_ns: int = 30_000_000,
-        retransmission: Retransmission | None = None,
-    ) -> None:
+    def __init__(self, counters: Counters) -> None:
         self._counters = counters
-        self._depth = depth
-        self._wait_ns = self._longest_wait_ns = wait_ns
-        self.retransmission = retransmission or Retransmission(counters)
+        self._wait_ns = _LONGEST_WAIT_NS
+        self.retransmission = Retransmission(counters)
+        """What is missing, and when that is to be asked for."""
         self._expected: int | None = None
         self._held: dict[int, Packet] = {}
         self._next = 0
@@ -142,14 +138,14 @@ class Reorderer:
         elif ahead > MAX_JUMP or packet.sequence in self._held:
             self._counters.packets_late += not packet.corrected  # given up on, or here already
             if packet.sequence not in self._held:
-                self._wait_ns = self._longest_wait_ns
+                self._wait_ns = _LONGEST_WAIT_NS
         else:
             self._counters.packets_corrected += packet.corrected
             self._note(packet)
             self._held[packet.sequence] = packet
-            patient = self.retransmission.helps or len(self._held) <= self._depth
+            patient = self.retransmission.helps or len(self._held) <= _DEPTH
             if not patient:
-                patient = len(self._later(packet.arrival_ns)) <= self._depth
+                patient = len(self._later(packet.arrival_ns)) <= _DEPTH
             yield from self._release(patient=patient)
 
     def expire(self, now_ns: int) -> Iterator[tuple[Packet, int]]:

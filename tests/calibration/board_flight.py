@@ -8,7 +8,7 @@ import numpy as np
 from board_views import BoardCamera, Waypoints
 
 from ground_station.arrays import F64
-from ground_station.recording.encoding import H264Encoder
+from ground_station.recording.h264 import H264Encoder
 from pi_firmware.wire.recording import RecordingWriter
 
 START_NS = 1_700_000_000_000_000_000

@@ -18,7 +18,7 @@ import pytest
 
 from ground_station.keys.authority import Authority
 from ground_station.keys.certificates import Pair, make_certificate
-from ground_station.stream.commands import ask
+from ground_station.stream.command import ask
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.refusal import refusal

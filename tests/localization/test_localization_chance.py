@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ground_station.localization.chance import count_beyond_chance
+from ground_station.localization.matching import count_beyond_chance
 
 
 def test_pairs_are_kept_until_chance_made_too_many_of_them():

@@ -15,9 +15,9 @@ from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.estimator import make_estimator
 from ground_station.localization.following import Followed, better, catch_up
+from ground_station.localization.judge import covariance_in_map, covariance_in_world
 from ground_station.localization.kinematics import no_solution
 from ground_station.localization.matching import Matcher, describe
-from ground_station.localization.publishing import covariance_in_map, covariance_in_world
 from ground_station.localization.relocalization import Relocalization
 from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
 from ground_station.localization.tracking import Keyframe

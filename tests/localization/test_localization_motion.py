@@ -11,8 +11,8 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.localization import process
+from ground_station.localization.estimator import constant_velocity
 from ground_station.localization.kinematics import Kinematics
-from ground_station.localization.motion import constant_velocity
 from ground_station.localization.settings import MotionSettings
 from ground_station.simulator import dynamics
 from ground_station.simulator.motion import Motion, Mount

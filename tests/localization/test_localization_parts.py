@@ -14,14 +14,14 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.geometry.lens import Lens
-from ground_station.localization.motion import MotionModel, constant_velocity
-from ground_station.localization.projection import project
+from ground_station.localization.estimator import MotionModel, constant_velocity
 from ground_station.localization.settings import (
     LocalizerSettings,
     MotionSettings,
     ProjectionSettings,
     load_preset,
 )
+from ground_station.localization.visibility import project
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 

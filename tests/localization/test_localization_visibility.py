@@ -9,9 +9,8 @@ import pytest
 
 from ground_station.geometry import poses
 from ground_station.geometry.lens import Lens
-from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.localization.visibility import Covisibility, LandmarkIndex
+from ground_station.localization.visibility import Covisibility, LandmarkIndex, project
 from ground_station.map.store import Keyframes, Landmarks
 
 

@@ -18,7 +18,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from tapped import LIMIT_S, Tap, start
 
-from ground_station.stream import commands
+from ground_station.stream import command as commands
 from ground_station.stream.counters import Counters
 from ground_station.stream.decoder import Decoder
 from ground_station.stream.rtp import AccessUnit, Depacketizer

@@ -12,7 +12,7 @@ import pytest
 from flying import ALL_FRAMES, Flying, numbers
 from vehicle import Vehicle
 
-from ground_station.stream import commands
+from ground_station.stream import command as commands
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import settings
 from pi_firmware.payload import Payload

@@ -13,7 +13,7 @@ import pytest
 
 from ground_station.cli import main
 from ground_station.keys.authority import Authority
-from ground_station.stream.commands import ask
+from ground_station.stream.command import ask
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import Session, open_session

@@ -13,10 +13,9 @@ from numbered_flight import HEIGHT_PX, WIDTH_PX, capture_ns, encoded, packets, s
 from ground_station.arrays import U8
 from ground_station.recording.h264 import grey
 from ground_station.stream import damage, rtp
-from ground_station.stream.assembly import Assembly, ReceivedFrame
+from ground_station.stream.assembly import Assembly, ReceivedFrame, Stamps
 from ground_station.stream.counters import Counters
-from ground_station.stream.slices import parameter_sets, slice_header, with_frame_num
-from ground_station.stream.stamps import Stamps
+from ground_station.stream.damage import parameter_sets, slice_header, with_frame_num
 from pi_firmware.wire import annexb, sei
 
 FRAMES = 40

@@ -212,7 +212,7 @@ def test_the_newest_round_trip_is_told_and_not_the_shortest(
     listener: TelemetryListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A link that gets slow is told slow although the clock's offset stays the tight one."""
-    from ground_station.stream import clock
+    from ground_station.stream import telemetry
     from pi_firmware.wire.clock_offset import RoundTrip
 
     delays_ns = [2_000_000, 700_000_000, 300_000_000]
@@ -231,10 +231,10 @@ def test_the_newest_round_trip_is_told_and_not_the_shortest(
         now_ns[0] += delay_ns
         return RoundTrip(sent_ns, sent_ns + delay_ns // 2, sent_ns + delay_ns // 2, now_ns[0])
 
-    monkeypatch.setattr(clock, "ask", ask)
-    monkeypatch.setattr(clock, "_PERIOD_S", 0.01)
+    monkeypatch.setattr(telemetry, "ask", ask)
+    monkeypatch.setattr(telemetry, "_PERIOD_S", 0.01)
     follower_made = threading.Event()
-    follower = clock.ClockFollower(listener.session.zenoh, lambda: ["one"], lambda: now_ns[0])
+    follower = telemetry.ClockFollower(listener.session.zenoh, lambda: ["one"], lambda: now_ns[0])
     follower_made.set()
     assert asked_enough.wait(LIMIT_S)
     follower.close()
@@ -246,14 +246,14 @@ def test_the_newest_round_trip_is_told_and_not_the_shortest(
 def test_a_question_without_an_answer_took_at_least_so_long(
     listener: TelemetryListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ground_station.stream import clock
+    from ground_station.stream import telemetry
 
     def ask(session: Any, key: str, now: Any) -> None:
-        time.sleep(clock.ASK_TIMEOUT_S)
+        time.sleep(telemetry.ASK_TIMEOUT_S)
 
-    monkeypatch.setattr(clock, "ASK_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(clock, "ask", ask)
-    follower = clock.ClockFollower(listener.session.zenoh, lambda: ["one"], time.time_ns)
+    monkeypatch.setattr(telemetry, "ASK_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(telemetry, "ask", ask)
+    follower = telemetry.ClockFollower(listener.session.zenoh, lambda: ["one"], time.time_ns)
     deadline = time.monotonic() + LIMIT_S
     while follower.round_trip_s("one") is None and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -10,8 +10,12 @@ from typing import Any
 
 import pytest
 
-from ground_station.stream.clock import ClockFollower
-from ground_station.stream.telemetry import FrameCounts, PayloadState, TelemetryListener
+from ground_station.stream.telemetry import (
+    ClockFollower,
+    FrameCounts,
+    PayloadState,
+    TelemetryListener,
+)
 from pi_firmware.settings import TelemetrySettings
 from pi_firmware.telemetry import Telemetry
 from pi_firmware.wire import keys, messages
@@ -167,8 +171,8 @@ def test_who_is_gone_makes_room_for_who_comes(listener: TelemetryListener) -> No
 
 
 def test_clocks_of_those_that_are_gone_are_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ground_station.stream.clock._PERIOD_S", 0.001)
-    monkeypatch.setattr("ground_station.stream.clock._KEPT", 4)
+    monkeypatch.setattr("ground_station.stream.telemetry._PERIOD_S", 0.001)
+    monkeypatch.setattr("ground_station.stream.telemetry._KEPT_CLOCKS", 4)
     names = iter(f"blimp-{number}" for number in range(20))
     with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
         session = listener.session.zenoh

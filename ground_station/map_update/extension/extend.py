@@ -16,9 +16,8 @@ from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.lens import Lens
-from ground_station.localization.projection import project
 from ground_station.localization.settings import LocalizerSettings, ProjectionSettings, load_preset
-from ground_station.localization.visibility import LandmarkIndex
+from ground_station.localization.visibility import LandmarkIndex, project
 from ground_station.map import colmap, store
 from ground_station.map.folder import (
     carry_floorplan,

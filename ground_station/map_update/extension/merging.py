@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, I64
 from ground_station.geometry.lens import Lens
-from ground_station.localization.projection import project
 from ground_station.localization.settings import ProjectionSettings
-from ground_station.localization.visibility import LandmarkIndex
+from ground_station.localization.visibility import LandmarkIndex, project
 from ground_station.map.model import Model
 from ground_station.map.modes import described
 from ground_station.map.store import Map

@@ -30,7 +30,7 @@ from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.intake.roster import NAMELESS, Roster
 from ground_station.service.settings import StationSettings
-from ground_station.stream import commands
+from ground_station.stream import command
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.feedback import Awaited, Feedback, Video
 from ground_station.stream.multi_stream import MultiStreamReceiver
@@ -347,7 +347,7 @@ class Intake:
 
         def ask(payload_id: str) -> None:
             with contextlib.suppress(Exception):
-                commands.ask(self._listener.session, payload_id, "idr", timeout_s=_IDR_S)
+                command.ask(self._listener.session, payload_id, "idr", timeout_s=_IDR_S)
 
         for payload_id in self._listener.living():
             if self._roster.get(payload_id) is not None:
@@ -357,8 +357,8 @@ class Intake:
 def _command(request: Mapping[str, Any], session: Session) -> dict[str, Any]:
     payload_id, name = request.get("payload"), request.get("name")
     arguments = request.get("arguments") or {}
-    if not isinstance(payload_id, str) or name not in commands.NAMES:
-        raise InputError(f"command {str(name)[:40]!r}; allowed: {', '.join(commands.NAMES)}")
+    if not isinstance(payload_id, str) or name not in command.NAMES:
+        raise InputError(f"command {str(name)[:40]!r}; allowed: {', '.join(command.NAMES)}")
     check_payload_id(payload_id)
     if not isinstance(arguments, dict) or not all(
         isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
@@ -366,5 +366,5 @@ def _command(request: Mapping[str, Any], session: Session) -> dict[str, Any]:
     ):
         raise InputError(f"command {name!r}: its arguments must be finite numbers by name")
     numbers = {str(key): float(value) for key, value in arguments.items()}
-    answered = commands.ask(session, payload_id, name, numbers, _ANSWER_S)
+    answered = command.ask(session, payload_id, name, numbers, _ANSWER_S)
     return {"done": answered.done, "reason": answered.reason, "values": dict(answered.values)}

@@ -13,7 +13,7 @@ from intake_stand import eventually
 from payload_process import PayloadProcess
 from short_certificates import certify
 
-from ground_station.stream.commands import ask
+from ground_station.stream.command import ask
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.errors import TelemetryError

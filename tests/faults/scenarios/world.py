@@ -20,7 +20,7 @@ from payload_process import PayloadProcess
 from shims import Shim
 from standing import Process, Service
 
-from ground_station.stream.commands import ask
+from ground_station.stream.command import ask
 from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.srtp import KEY_FILE, read_key
 from pi_firmware.wire.telemetry import Session, open_session

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from ground_station.recording.encoding import H264Encoder
+from ground_station.recording.h264 import H264Encoder
 from pi_firmware.wire import annexb, sei
 
 

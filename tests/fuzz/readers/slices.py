@@ -1,10 +1,10 @@
-"""`ground_station.stream.slices`: parameter sets, and slice headers that are renumbered."""
+"""`ground_station.stream.damage`: parameter sets, and slice headers that are renumbered."""
 
 from __future__ import annotations
 
 from pieces import Picker, blocks, stretch
 
-from ground_station.stream.slices import parameter_sets, slice_header, with_frame_num
+from ground_station.stream.damage import parameter_sets, slice_header, with_frame_num
 from pi_firmware.wire import annexb
 from readers import h264
 

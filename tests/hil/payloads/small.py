@@ -19,9 +19,9 @@ import numpy as np
 from ground_station.errors import InputError
 from ground_station.experiments.alter import scaled_camera
 from ground_station.progress import Progress
-from ground_station.recording.encoding import H264Encoder
 from ground_station.recording.flight import FlightRecording, camera_of
 from ground_station.recording.frames import CAMERA_TABLE
+from ground_station.recording.h264 import H264Encoder
 from pi_firmware.sources.schemes.replay import RateGrid
 from pi_firmware.wire.errors import BlimpError
 from pi_firmware.wire.recording import TRUTH_TOPIC, RecordingReader, RecordingWriter

@@ -14,7 +14,7 @@ from panning import CAMERA, Place
 from ground_station.errors import CameraError, InputError
 from ground_station.mapping.construction.inputs import Inputs, open_inputs
 from ground_station.mapping.settings import KeyframeSettings, MappingSettings
-from ground_station.recording.encoding import H264Encoder
+from ground_station.recording.h264 import H264Encoder
 from pi_firmware.wire.recording import RecordingWriter
 
 FRAMES = 36
