@@ -603,7 +603,7 @@ def test_nothing_runs_over_its_edge(crowded: Watched, size: str) -> None:
     assert out_of_sight == []
 
 
-def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
+def test_views_colours_and_the_order_of_values_are_chosen_and_remembered(
     shown: Watched, station: FlownStation
 ) -> None:
     ground, light = "getComputedStyle(document.body).backgroundColor", "rgb(233, 237, 240)"
@@ -612,20 +612,7 @@ def test_a_view_is_enlarged_and_colours_are_chosen_and_both_are_remembered(
     assert shown.page.get_attribute(".plan", "data-place") == "side"
     shown.page.click("#help-open")
     shown.page.click('[data-scheme="dark"]')
-    another = shown.page.context.new_page()
-    another.goto(station.url)
-    another.wait_for_selector('.video[data-place="main"]')
-    assert another.evaluate(ground) == shown.page.evaluate(ground) != light
-    another.close()
-    shown.page.click('[data-scheme=""]')
-    assert shown.page.evaluate(ground) == light
     shown.page.keyboard.press("Escape")
-    shown.page.click('.plan [data-do="swap"]')
-
-
-def test_values_are_put_in_another_order_by_hand_and_keys_and_stay_so(
-    shown: Watched, station: FlownStation
-) -> None:
     order = "[...document.querySelectorAll('.rail > [id]')].map((card) => card.id).join(' ')"
     tops = (
         "[...document.querySelectorAll('.rail > [id]')].map((card) =>"
@@ -637,7 +624,8 @@ def test_values_are_put_in_another_order_by_hand_and_keys_and_stay_so(
     assert shown.page.evaluate(order) == "battery timing radio board"
     another = shown.page.context.new_page()
     another.goto(station.url)
-    another.wait_for_selector('#link[data-phase="open"]')
+    another.wait_for_selector('.video[data-place="main"]')
+    assert another.evaluate(ground) == shown.page.evaluate(ground) != light
     assert another.evaluate(order) == "battery timing radio board" and another.evaluate(tops)
     another.set_viewport_size({"width": 390, "height": 844})
     assert another.evaluate(tops)
@@ -652,6 +640,11 @@ def test_values_are_put_in_another_order_by_hand_and_keys_and_stay_so(
     for _ in range(2):
         shown.page.click('#timing [data-do="up"]')
     assert shown.page.evaluate(order) == "battery radio board timing"
+    shown.page.click("#help-open")
+    shown.page.click('[data-scheme=""]')
+    assert shown.page.evaluate(ground) == light
+    shown.page.keyboard.press("Escape")
+    shown.page.click('.plan [data-do="swap"]')
 
 
 def test_who_is_signed_out_is_asked_for_the_token(browser: Any, tmp_path: Path) -> None:

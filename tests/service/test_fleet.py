@@ -29,7 +29,7 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
-from ground_station.service.fleet import maps
+from ground_station.service.fleet import fleet, maps
 from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.fleet.shelf import Elsewhere
 from ground_station.service.fleet.whereabouts import FRESH_S
@@ -93,8 +93,9 @@ class Station:
 
 
 @pytest.fixture
-def stations(tmp_path: Path) -> Iterator[Any]:
+def stations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Makes stations of one authority, which live to the test's end."""
+    monkeypatch.setattr(fleet, "_LOOK_S", 0.5)
     authority = Authority.create(tmp_path / "keys")
     for name in ("hall", "attic", "yard"):
         authority.add("ground", name)

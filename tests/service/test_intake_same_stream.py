@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from intake_stand import Stand, eventually
 
 from ground_station.arrays import Bools
 from ground_station.service.intake import payloads
@@ -19,24 +17,6 @@ from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from ground_station.stream.counters import Counters
 from pi_firmware.wire import messages
-
-
-def test_a_session_with_the_ssrc_of_the_one_before_counts_from_its_own_beginning(
-    tmp_path: Path,
-) -> None:
-    fixed = ("link.ssrc=77", "camera.rate_hz=10")
-    with Stand(tmp_path) as stand:
-        for _ in range(2):
-            before = len(stand.heard.of("blimp-1"))
-            payload = stand.payload("blimp-1", *fixed)
-            eventually(lambda before=before: len(stand.heard.of("blimp-1")) > before + 20)
-            ended = payload.end()
-            ended.assert_in_order()
-            account = stand.settled("blimp-1", ended.counts).frames
-            shown = len(stand.heard.of("blimp-1")) - before
-            assert account["received"] == shown
-            assert account["sent"] == shown + account["withheld"] + account["lost"]
-        assert {note.ssrc for note, _ in stand.heard.of("blimp-1")} == {77}
 
 
 def test_its_first_frames_lost_it_is_told_by_its_word(monkeypatch: pytest.MonkeyPatch) -> None:

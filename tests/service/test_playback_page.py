@@ -25,18 +25,28 @@ def port(folder: Path) -> Iterator[int]:
         yield port
 
 
-@pytest.fixture
-def page(browser: Any, port: int) -> Iterator[Any]:
+@pytest.fixture(scope="module")
+def opened(browser: Any, port: int) -> Iterator[Any]:
     """The dashboard, with all that it complains of."""
     page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
     page.set_default_timeout(LIMIT_MS)
     problems: list[str] = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.goto(f"http://127.0.0.1:{port}/")
-    page.wait_for_selector('#link[data-phase="open"]')
     yield page
     page.context.close()
     assert problems == []
+
+
+@pytest.fixture
+def page(opened: Any) -> Any:
+    """It shows what is live."""
+    opened.keyboard.press("Escape")
+    if opened.locator("#tape").is_visible():
+        opened.locator("#tape").get_by_role("button", name="Back to live").click()
+    opened.wait_for_selector('#link[data-phase="open"]')
+    until(opened, "document.querySelector('#tape').hidden")
+    return opened
 
 
 def until(page: Any, expression: str) -> None:
@@ -117,15 +127,18 @@ def test_one_that_lies_at_another_station_is_played_from_there(page: Any) -> Non
     file = {"file": "there.mcap", "size_MB": 1.0, "modified_ns": 9e18, "started_ns": 9e18}
     file |= {"duration_s": 9.0, "maps": [], "lacks": None, "after": "", "active": False}
     page.route("**/api/stations/attic/recordings", lambda route: route.fulfill(json=[file]))
-    page.evaluate(
-        "import('/static/js/store.js').then(({ Store }) => {"
-        " Store.prototype.otherStations = () => ['attic']; })"
+    stations = (
+        "(names) => import('/static/js/store.js').then(({ Store }) => {"
+        " [Store.prototype.otherStations, window.own] = [names ? () => names : window.own,"
+        " Store.prototype.otherStations]; })"
     )
+    page.evaluate(stations, ["attic"])
     with page.expect_websocket() as opened:
         play(page, "there.mcap")
     assert opened.value.url.endswith("/api/stations/attic/recordings/there.mcap/play")
     until(page, "document.querySelector('#link').dataset.phase === 'open'")
     assert "no station 'attic' flies beside this one" in page.text_content("#outcome")
+    page.evaluate(stations, None)
 
 
 def test_one_that_cannot_be_played_is_said_and_the_live_page_is_back(

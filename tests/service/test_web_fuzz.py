@@ -43,7 +43,7 @@ def api(tmp_path_factory):
 
 def fuzz(operation, mode, answered: Counter[str]) -> None:
     @settings(
-        max_examples=25,
+        max_examples=10,
         deadline=None,
         derandomize=True,
         database=None,

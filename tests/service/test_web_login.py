@@ -9,23 +9,31 @@ from ground_station.service.bus import Bus, Router
 from ground_station.service.settings import write_run
 
 
-@pytest.fixture
-def locked(tmp_path):
-    """The port of a process that asks for a token, and what the intake is asked."""
-    token = station.write_token(tmp_path)
-    write_run(tmp_path, station.run_of(tmp_path, token_file=str(token)))
-    router = Router(tmp_path)
+@pytest.fixture(scope="module")
+def process(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("locked")
+    token = station.write_token(folder)
+    write_run(folder, station.run_of(folder, token_file=str(token)))
+    router = Router(folder)
     asked: list[dict] = []
-    with Bus(tmp_path, "test") as bus, station.web_process(tmp_path) as (_, port):
+    with Bus(folder, "test") as bus, station.web_process(folder) as (_, port):
         bus.serve("intake", lambda request: asked.append(dict(request)) or {})
         yield port, asked
     router.close()
 
 
+@pytest.fixture
+def locked(process):
+    """The port of a process that asks for a token, and what the intake is asked."""
+    process[1].clear()
+    return process
+
+
 def test_a_browser_logs_in_reads_and_asks(browser, locked):
     port, asked = locked
     here = f"http://127.0.0.1:{port}"
-    page = browser.new_page()
+    context = browser.new_context()
+    page = context.new_page()
     try:
         page.goto(f"{here}/")
         assert page.url == f"{here}/login"
@@ -51,7 +59,7 @@ def test_a_browser_logs_in_reads_and_asks(browser, locked):
         )
         assert first.startswith('{"type":"hello"')
     finally:
-        page.close()
+        context.close()
 
 
 def test_a_page_of_another_site_gets_nothing(browser, locked):
