@@ -67,8 +67,9 @@ Alarms = Mapping[str, Standing]
 def judge(state: Mapping[str, Any], now_ns: int, before: Alarms) -> dict[str, Standing]:
     """The alarms that stand now, by id.
 
-    `state` is the document of GET /api/state with its events, `now_ns` the wall clock, `before` what this function
-    returned last. A clock that is set back makes no alarm stand longer than `HOLD_S` from then on.
+    `state` is the document of GET /api/state with its events, `now_ns` the wall clock, `before`
+    what this function returned last. A clock that is set back makes no alarm stand longer than
+    `HOLD_S` from then on.
     """
     result: dict[str, Standing] = {}
     for alarm in _found(state, now_ns, frozenset(before)):
@@ -119,11 +120,8 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
 
 
 def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    alive_s, frame_s, estimate_s = (
-        view["alive_s"],
-        view["age_s"]["frame"],
-        view["age_s"]["estimate"],
-    )
+    alive_s, age_s = view["alive_s"], view["age_s"]
+    frame_s, estimate_s = age_s["frame"], age_s["estimate"]
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
     if not frames_come and (other := view["payload"]["station"]):
         text = f"flies with station '{other}', which gets its video"

@@ -34,9 +34,9 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
+from ground_station.service.ending import RateLimitedLog
+from ground_station.service.foxglove.payload import json_topic
 from ground_station.service.foxglove.process import PAYLOADS, Inbox, RateLimitedHandler
-from ground_station.service.foxglove.topics import json_topic
-from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from pi_firmware.wire import messages
 
 RAMP = np.tile(np.linspace(0, 255, 640).astype(np.uint8), (480, 1))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.intake.roster import GRACE_S, NAMELESS_S, Roster
+from ground_station.service.intake.roster import GRACE_S, NAMELESS_S, Announced, Roster
 from ground_station.service.settings import PayloadSettings, RecordingSettings
 
 LONG_S = 2 * NAMELESS_S

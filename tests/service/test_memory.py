@@ -7,10 +7,10 @@ import pytest
 
 HEAPS = """
 import ctypes, sys, threading
-from ground_station.service import heaps
+from ground_station.service import ending
 
 if sys.argv[1] == "few":
-    heaps.few()
+    ending.few_heaps()
 here = threading.Barrier(8)
 
 def hold():
@@ -43,10 +43,10 @@ def test_its_threads_share_two_heaps() -> None:
 
 LARGE = """
 import ctypes, sys
-from ground_station.service import heaps
+from ground_station.service import ending
 
 if sys.argv[1] == "apart":
-    heaps.large_apart()
+    ending.large_blocks_apart()
 libc = ctypes.CDLL(None)
 
 class Info(ctypes.Structure):

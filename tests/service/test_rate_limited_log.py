@@ -1,6 +1,6 @@
 """What repeats is not said each time."""
 
-from ground_station.service.localizing.rate_limited_log import RateLimitedLog
+from ground_station.service.ending import RateLimitedLog
 
 
 def test_what_repeats_is_said_once_a_minute_with_its_count() -> None:

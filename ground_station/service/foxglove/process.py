@@ -30,11 +30,10 @@ from ground_station.service.bus_messages import (
     RecordingMessage,
 )
 from ground_station.service.cameras import camera_of
+from ground_station.service.ending import RateLimitedLog
 from ground_station.service.foxglove import documents, drawing, world
-from ground_station.service.foxglove.payload import Payload
-from ground_station.service.foxglove.topics import Make, Topic, json_topic
+from ground_station.service.foxglove.payload import Make, Payload, Topic, json_topic
 from ground_station.service.foxglove.world import World
-from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.settings import FoxgloveSettings, StationSettings
 from pi_firmware.wire.errors import BlimpError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id

@@ -6,11 +6,11 @@ import sys
 import threading
 from pathlib import Path
 
-from ground_station.service import bus_messages, heaps
+from ground_station.service import bus_messages
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EstimateMessage, EventMessage, LeaveMessage
 from ground_station.service.cameras import camera_of
-from ground_station.service.ending import ending, status_of
+from ground_station.service.ending import ending, few_heaps, status_of
 from ground_station.service.intake import resuming
 from ground_station.service.intake.process import Intake
 from ground_station.service.settings import load_run
@@ -20,7 +20,7 @@ _STEP_S = 0.1
 
 def serve(run_folder: str) -> int:
     """Runs until it is told to end; raises a `BlimpError` with one line when it cannot."""
-    heaps.few()
+    few_heaps()
     stop = ending(None)  # a recording ends in its own time
     import cv2
 

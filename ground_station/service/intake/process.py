@@ -25,10 +25,9 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.ending import CannotGoOn
 from ground_station.service.intake import poses
-from ground_station.service.intake.announced import Announced
 from ground_station.service.intake.payloads import Payload, Say
 from ground_station.service.intake.recording import GroundRecorder
-from ground_station.service.intake.roster import NAMELESS, Roster
+from ground_station.service.intake.roster import NAMELESS, Announced, Roster
 from ground_station.service.settings import StationSettings
 from ground_station.stream import command
 from ground_station.stream.assembly import ReceivedFrame

@@ -7,7 +7,7 @@ import sys
 import traceback
 from pathlib import Path
 
-from ground_station.service.ending import ending, status_of
+from ground_station.service.ending import ending, large_blocks_apart, status_of
 from pi_firmware.wire.errors import BlimpError
 
 
@@ -16,13 +16,13 @@ def serve(run_folder: str, payload_id: str) -> int:
     stop = ending()
     import cv2
 
-    from ground_station.service import heaps, processes, settings
+    from ground_station.service import processes, settings
     from ground_station.service.bus import Bus
     from ground_station.service.localizing.process import RESTART, Localizing
     from pi_firmware.wire.keys import check_payload_id
 
     cv2.setNumThreads(1)
-    heaps.large_apart()
+    large_blocks_apart()
     folder, name = Path(run_folder), f"{processes.LOCALIZER}/{check_payload_id(payload_id)}"
     try:
         run = settings.load_run(folder)

@@ -25,10 +25,10 @@ from ground_station.map import store
 from ground_station.service import bus_messages, pictures
 from ground_station.service.bus import Bus
 from ground_station.service.bus_messages import EventMessage, FrameMessage
+from ground_station.service.ending import RateLimitedLog
 from ground_station.service.localizing import derive
 from ground_station.service.localizing.derive import Accounts
 from ground_station.service.localizing.maps import Loader, Loading
-from ground_station.service.localizing.rate_limited_log import RateLimitedLog
 from ground_station.service.settings import Run
 from pi_firmware.wire import files
 from pi_firmware.wire.errors import BlimpError

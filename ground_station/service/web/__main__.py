@@ -9,7 +9,7 @@ import signal
 import sys
 from pathlib import Path
 
-from ground_station.service.ending import CannotGoOn, status_of
+from ground_station.service.ending import CannotGoOn, RateLimitedLog, status_of
 
 _BEAT_S = 0.5
 _EXPOSED = (
@@ -32,7 +32,6 @@ def _print(_: str, text: str) -> None:
 async def _serve(folder: Path) -> None:
     from ground_station.service import processes
     from ground_station.service.bus import Bus
-    from ground_station.service.localizing.rate_limited_log import RateLimitedLog
     from ground_station.service.settings import load_run
     from ground_station.service.web.access import is_loopback, read_token
     from ground_station.service.web.app import build

@@ -33,11 +33,11 @@ from ground_station.service.web import (
     playback,
     problems,
     recordings,
-    state,
 )
 from ground_station.service.web.access import Access
 from ground_station.service.web.guard import Guard
 from ground_station.service.web.metrics import Metrics
+from ground_station.service.web.metrics import router as router_of_state
 from ground_station.service.web.problems import NotFound
 from ground_station.service.web.snapshot import Snapshot
 from ground_station.service.web.video import Video
@@ -157,7 +157,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     recorded = recordings.Recordings(
         Path(settings.recording.folder), lambda: _active_file(snapshot)
     )
-    app.include_router(state.router(snapshot, metrics))
+    app.include_router(router_of_state(snapshot, metrics))
     app.include_router(maps.router(shelf))
     app.include_router(control.router(control.Control(hub, snapshot), shelf, fleet))
     app.include_router(recordings.router(recorded))

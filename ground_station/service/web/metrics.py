@@ -1,4 +1,4 @@
-"""The station in Prometheus's terms: counters and gauges of its notes, histograms of its latencies.
+"""The station's state over HTTP, and in Prometheus's terms: its notes and its latencies.
 
 Names follow Prometheus's conventions (base units, `_total` for counters). What notes tell is read
 at each scrape; labels are bounded as the snapshot is.
@@ -6,11 +6,13 @@ at each scrape; labels are bounded as the snapshot is.
 
 from __future__ import annotations
 
+import json
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from fastapi import APIRouter, Response
 from prometheus_client import CollectorRegistry, Histogram, disable_created_metrics
 from prometheus_client import Counter as PlainCounter
 from prometheus_client.core import (
@@ -25,9 +27,9 @@ from prometheus_client.registry import Collector
 
 from ground_station.localization.estimate import State
 from ground_station.service.bus_messages import EstimateMessage
+from ground_station.service.web.models import Health, StateModel
 from ground_station.service.web.snapshot import Snapshot
 
-CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 _SECONDS = (
     0.005, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0,
 )  # fmt: skip
@@ -233,3 +235,31 @@ def _of_processes(processes: list[Mapping[str, Any]]) -> Iterator[Metric]:
         silent.add_metric(name, process["age_s"])
         restarts.add_metric(name, process["restarts"])
     yield from (memory, cpu, silent, restarts)
+
+
+def router(snapshot: Snapshot, metrics: Metrics) -> APIRouter:
+    """What is told of the station over HTTP."""
+    result = APIRouter(tags=["state"])
+
+    @result.get("/api/state", response_model=StateModel)
+    def state() -> Any:
+        """The whole station, now."""
+        # Written as it is: the model describes it, and 2,000 points need no check one by one.
+        text = json.dumps(snapshot.document(), separators=(",", ":"), allow_nan=False)
+        return Response(text, media_type="application/json")
+
+    @result.get(
+        "/metrics",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {}}}},
+    )
+    def all_metrics() -> Response:
+        """Prometheus's text format."""
+        return Response(metrics.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+    @result.get("/healthz", response_model=Health)
+    def healthz() -> Any:
+        """That this process serves; without a token, and without a word on the station."""
+        return {"status": "ok"}
+
+    return result
