@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ground_station.mapping.construction.consistency import plausible_frames
+from ground_station.mapping.construction.solver import plausible_frames
 
 STEP_NS = 800_000_000
 

@@ -14,7 +14,7 @@ from ground_station.geometry.alignment import Alignment, align
 from ground_station.map import colmap
 from ground_station.mapping.construction.dask_option import open_workers
 from ground_station.mapping.construction.images import Images
-from ground_station.mapping.construction.parts import joining, solving, uniting
+from ground_station.mapping.construction.parts import joining, reconstruction, solving
 from ground_station.mapping.construction.parts.cutting import inside, overlapping
 from ground_station.mapping.construction.parts.reconstruction import reconstruct
 from ground_station.mapping.construction.parts.solving import Solved
@@ -25,7 +25,7 @@ from ground_station.mapping.settings import MappingSettings, SfmSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.simulator.campus import CAMERA, campus
 
-SETTINGS = MappingSettings(sfm=SfmSettings(part_images=50))
+SETTINGS = MappingSettings(sfm=SfmSettings(part_images=30))
 
 
 def _chain(images, reach=4):
@@ -169,7 +169,7 @@ def _united(scene, runs, pairs):
     names = [str(k) for k in range(len(wTc))]
     images = Images(names, np.arange(len(wTc)), [], pixels)
     cores = [np.array(run) for run in runs]
-    return uniting.unite(parts, cores, PLACES[:1] * len(runs), images, pairs, CAMERA)
+    return reconstruction.unite(parts, cores, PLACES[:1] * len(runs), images, pairs, CAMERA)
 
 
 def test_a_landmark_of_two_parts_is_one_with_all_its_observations():
@@ -197,12 +197,15 @@ def test_a_pair_of_images_that_no_part_has_both_of_unites_what_stands_where_it_s
     assert seen_by_both({(29, 30): view}) == len(first)
 
 
+IMAGES = 70
+
+
 @pytest.fixture(scope="module")
 def hall():
-    """A simulated campus of 110 images: images, pairs, true poses."""
-    made = campus(110, 2)
+    """A simulated campus of 70 images: images, pairs, true poses."""
+    made = campus(IMAGES, 2)
     features = list(made.features())
-    names = [f"{k:03d}" for k in range(110)]
+    names = [f"{k:03d}" for k in range(IMAGES)]
     pixels = [CAMERA.undistort_to_pinhole(each.keypoints_px) for each in features]
     images = Images(names, made.time_ns, features, pixels)
     return images, match(images, CAMERA, SETTINGS, 2), made.wTc
@@ -216,9 +219,9 @@ def _error_m(model, wTc):
 def test_in_parts_a_campus_is_whole_and_as_true_as_in_one(hall, tmp_path, monkeypatch):
     images, pairs, wTc = hall
     made = reconstruct(images, pairs, CAMERA, SETTINGS, 2, tmp_path / "parts", Threads(2))
-    assert made.sizes == [110] and "in 4 parts, 4 of them joined" in made.notes[0]
+    assert made.sizes == [IMAGES] and "in 4 parts, 4 of them joined" in made.notes[0]
     in_parts = adjust_and_filter(made.reconstruction, SETTINGS.sfm, 2)
-    one = dataclasses.replace(SETTINGS, sfm=SfmSettings(part_images=110))
+    one = dataclasses.replace(SETTINGS, sfm=SfmSettings(part_images=IMAGES))
     (tmp_path / "one").mkdir()
     whole = reconstruct(images, pairs, CAMERA, one, 2, tmp_path / "one", Threads(2))
     assert not whole.notes
@@ -234,7 +237,7 @@ def test_in_parts_a_campus_is_whole_and_as_true_as_in_one(hall, tmp_path, monkey
     # A build that was killed now does not make its parts again.
     monkeypatch.setattr(solving, "_solved", lambda *_: pytest.fail("made again"))
     again = reconstruct(images, pairs, CAMERA, SETTINGS, 2, tmp_path / "parts", Threads(2))
-    assert again.sizes == [110]
+    assert again.sizes == [IMAGES]
     monkeypatch.undo()
     (tmp_path / "parts/parts/0001.npz").write_bytes(b"half")
     mended = reconstruct(images, pairs, CAMERA, SETTINGS, 2, tmp_path / "parts", Threads(2))
@@ -243,8 +246,8 @@ def test_in_parts_a_campus_is_whole_and_as_true_as_in_one(hall, tmp_path, monkey
 
 
 def test_workers_that_read_no_files_of_ours_make_the_same_parts(hall, tmp_path):
-    few = {pair: view for pair, view in hall[1].items() if max(pair) < 54}
-    first = solving.given(np.arange(54), hall[0], few)
+    few = {pair: view for pair, view in hall[1].items() if max(pair) < 34}
+    first = solving.given(np.arange(34), hall[0], few)
     images = Images(first.names, first.time_ns, [], first.pinhole_px)
     pairs = first.pairs
     expected = reconstruct(images, pairs, CAMERA, SETTINGS, 1, tmp_path / "a", Threads(1))
