@@ -33,7 +33,7 @@ NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Camera axes in the world's, looking along +y."""
 
 
-def _flight(turns: bool, seed: int, images: int = 24, points: int = 500):
+def _flight(turns: bool, seed: int, images: int = 18, points: int = 300):
     """True poses and points: through a corridor, turning and swaying, or straight on."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-2.0, 2.0, -1.3], [2.0, 16.0, 1.3], (points, 3))
@@ -136,7 +136,7 @@ def _judged(known: LensPrior, turns: bool = True, seed: int = 1, true: Camera = 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_lens_is_found_within_what_is_said_of_it(seed):
     wrong = _off(CAMERA, 1.04, distorted=False)
-    images, model = _views(CAMERA, *_flight(True, seed), seed)
+    images, model = _views(CAMERA, *_flight(True, seed, images=24, points=500), seed)
     model = _adjusted_with(wrong, images, model)
     known = LensPrior(wrong, "guess", 0.2)
     found = adjust(lens._as_seen(model, images, wrong, 0.0), wrong, lens.prior_of(known, wrong))
@@ -201,12 +201,14 @@ def test_a_lens_that_goes_to_and_fro_stands_if_that_is_little(monkeypatch, swing
     """Each model has other points: a lens may never settle within its deviations."""
 
     def swinging(model, camera, prior):
-        found = adjust(model, camera, prior)
         if camera.fx_px == known.camera.fx_px:
-            return found
+            first.append(adjust(model, camera, prior))
+            return first[-1]
+        found = first[0]
         side = 1 - swings if camera.fx_px > CAMERA.fx_px else 1 + swings
         return replace(found, camera=_off(CAMERA, side), covariance=1e-4 * found.covariance)
 
+    first = []
     known = LensPrior(_off(CAMERA, 1.03), "file", 0.02)
     monkeypatch.setattr(lens, "adjust", swinging)
     monkeypatch.setattr(lens, "_SETTLED", 0.0)
@@ -249,7 +251,7 @@ def test_a_lens_that_half_of_the_images_denies_is_kept_and_that_is_said(monkeypa
 
 def test_a_rolling_shutter_is_not_taken_for_a_lens():
     rolling = replace(CAMERA, readout_s=0.03)
-    images, model = _views(rolling, *_flight(True, 1), 1)
+    images, model = _views(rolling, *_flight(True, 1, images=24), 1)
     model = _adjusted_with(CAMERA, images, model)
     prior = lens.prior_of(LensPrior(CAMERA, "file", 0.0), CAMERA)
     found = adjust(lens._as_seen(model, images, CAMERA, 0.0), CAMERA, prior)
@@ -401,7 +403,8 @@ def _described(images: Images, model: Model) -> Images:
     return replace(images, features=features)
 
 
-def test_a_rough_lens_is_found_from_a_guess_a_third_off():
+def test_a_rough_lens_is_found_from_a_guess_a_third_off(monkeypatch):
+    monkeypatch.setattr(lens, "_PAIRS", 5)
     images, model = _views(CAMERA, *_flight(True, 2), 2)
     guess = replace(Camera(), fx_px=670.0, fy_px=670.0, cx_px=319.5, cy_px=239.5)
     found = lens.rough_lens(_described(images, model), LensPrior(guess, "guess", 0.3), 0.8)
