@@ -9,9 +9,8 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.calibration import lens, selection, verdict
-from ground_station.calibration.detection import BoardFinder
+from ground_station.calibration.detection import BoardFinder, Gathered
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.gather import Gathered
 from ground_station.calibration.lens import Fit, Points
 from ground_station.calibration.readout import Readout, readout_of
 from ground_station.calibration.selection import CORNERS

@@ -13,7 +13,7 @@ from ground_station.files import check_outputs
 
 if TYPE_CHECKING:
     from ground_station.calibration.board import Board
-    from ground_station.calibration.gather import Gathered
+    from ground_station.calibration.detection import Gathered
     from ground_station.recording.frames import FrameSource
 
 _EPILOG = """\
@@ -140,8 +140,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     from ground_station.calibration import results
     from ground_station.calibration.board import load_board, parse_measured
     from ground_station.calibration.calibrate import MAX_VIEWS, calibrate
-    from ground_station.calibration.detection import BoardFinder
-    from ground_station.calibration.gather import gather
+    from ground_station.calibration.detection import BoardFinder, gather
     from ground_station.files import write_json
 
     if args.board is None:

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from ground_station.arrays import F64
 from ground_station.calibration import selection
 from ground_station.calibration.board import Board
-from ground_station.calibration.detection import BoardFinder, other_board
+from ground_station.calibration.detection import BoardFinder, Gathered, other_board
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.gather import Gathered
 from ground_station.calibration.lens import Fit
 from ground_station.calibration.views import View
 

@@ -34,8 +34,7 @@ from ground_station.localization.kinematics import Kinematics
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.relocalization import match_all
 from ground_station.localization.settings import LocalizerSettings
-from ground_station.map.colmap import colmap_camera
-from ground_station.map.colmap_cameras import HALF_PIXEL
+from ground_station.map.colmap import HALF_PIXEL, colmap_camera
 from ground_station.map.store import Map
 
 _ALONE_EVERY = 5

@@ -201,7 +201,7 @@ ROOMS = {
     "run": ("experiments/measure.py", "experiments/alter.py",
             "experiments/maps.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
-            "map/accuracy.py", "map/uncertainty.py",
+            "map/uncertainty.py",
             "features", "geometry", "recording"),
 }  # fmt: skip
 """By kind of result, what makes it, below this package."""

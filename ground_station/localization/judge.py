@@ -13,7 +13,7 @@ from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.relocalization import spread
 from ground_station.localization.settings import CovarianceSettings, StateSettings
-from ground_station.map.accuracy import Accuracy
+from ground_station.map.uncertainty import Accuracy
 
 
 def covariance_in_map(

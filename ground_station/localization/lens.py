@@ -8,8 +8,8 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
-from ground_station.map.accuracy import accuracy
 from ground_station.map.store import Map, MapInfo
+from ground_station.map.uncertainty import accuracy
 
 _SAME = 1e-6
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")

@@ -35,8 +35,8 @@ from ground_station.localization.matching import Described, Matcher, describe
 from ground_station.localization.settings import LocalizerSettings, in_units
 from ground_station.localization.tracking import Keyframe
 from ground_station.localization.worker import Worker
-from ground_station.map.accuracy import accuracy
 from ground_station.map.store import Map, check_features
+from ground_station.map.uncertainty import accuracy
 
 _USUAL_DEPTH_M = 5.0
 """How far off the landmarks of a map without units are taken to be: it says how fast is fast."""

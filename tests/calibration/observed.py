@@ -8,8 +8,7 @@ import numpy.typing as npt
 from board_views import Waypoints, project_rolling
 
 from ground_station.calibration.board import Board
-from ground_station.calibration.detection import BoardObservation
-from ground_station.calibration.gather import Gathered
+from ground_station.calibration.detection import BoardObservation, Gathered
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
 BOARD = Board()

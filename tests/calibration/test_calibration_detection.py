@@ -10,9 +10,14 @@ from board_views import BoardCamera, Pictured, Waypoints, pose_of, scaled
 
 from ground_station.arrays import U8
 from ground_station.calibration.board import Board
-from ground_station.calibration.detection import BoardFinder, BoardObservation, other_board
+from ground_station.calibration.detection import (
+    BoardFinder,
+    BoardObservation,
+    Gathered,
+    gather,
+    other_board,
+)
 from ground_station.calibration.errors import CalibrationError
-from ground_station.calibration.gather import Gathered, gather
 from ground_station.calibration.verdict import check_seen
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.recording.frames import Frame

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ground_station.arrays import F64, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.inspection.visibility import View
+from ground_station.inspection.prediction import View
 from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
 
 SIDE_M = 6.0

@@ -14,8 +14,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.lens import Lens
 from ground_station.inspection.localizability import localizability
-from ground_station.inspection.prediction import MOST, NEEDED, SIGMA_PX, Predictor
-from ground_station.inspection.visibility import View, Visibility
+from ground_station.inspection.prediction import MOST, NEEDED, SIGMA_PX, Predictor, View, Visibility
 from ground_station.localization.settings import load_preset
 from ground_station.map.floorplan import FloorPlan
 from ground_station.map.levelling import levelled

@@ -21,7 +21,7 @@ from ground_station.localization.matching import Matcher, describe
 from ground_station.localization.relocalization import Relocalization
 from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
 from ground_station.localization.tracking import Keyframe
-from ground_station.map.accuracy import Accuracy
+from ground_station.map.uncertainty import Accuracy
 
 HERE = np.array([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
 

@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.map.accuracy import Accuracy, accuracy
 from ground_station.map.store import MapInfo
-from ground_station.map.uncertainty import Uncertainty
+from ground_station.map.uncertainty import Accuracy, Uncertainty, accuracy
 
 POSE = poses.pose(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([6.0, -2.0, 1.5]))
 SIGMA = np.array([1e-3, 2e-3, 5e-4, 4e-3, 6e-3, 2e-3, 1e-3])

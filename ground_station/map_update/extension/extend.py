@@ -31,11 +31,16 @@ from ground_station.map.model import model_of
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.refined import FRAME_TIME, Refined
 from ground_station.map.store import Map
-from ground_station.map_update.extension.anchoring import Anchoring
-from ground_station.map_update.extension.frames import Frames, Picked, describe, pick, thinned
-from ground_station.map_update.extension.joining import Grown, join
+from ground_station.map_update.extension.frames import (
+    Anchoring,
+    Frames,
+    Picked,
+    describe,
+    pick,
+    thinned,
+)
+from ground_station.map_update.extension.joining import Grown, join, new_looks
 from ground_station.map_update.extension.localizing import LocatedFlight, localize
-from ground_station.map_update.extension.looks import new_looks
 from ground_station.map_update.extension.merging import merge, observation_descriptors
 from ground_station.map_update.extension.structure import LOOSE_PX, Structure, weak_points
 from ground_station.map_update.extension.tracks import joined, match_frames, pairs_to_match

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_station.arrays import F64, I64
+from ground_station.arrays import F64, I64, Indices
 from ground_station.errors import MapError
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
+from ground_station.localization import matching
+from ground_station.localization.attempt import Conditions, Stopwatch
+from ground_station.localization.kinematics import Kinematics
+from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map, check_features
 from ground_station.map_update.extension.localizing import LocatedFlight
 from ground_station.mapping.construction.images import extract_features, extractor_of
@@ -192,3 +196,35 @@ def _in_map(features: Features, camera: Camera, of_map: Camera) -> tuple[Feature
     pixel_px, keep = by_lens(features.keypoints_px, camera, of_map)
     keep &= np.isfinite(features.descriptors).all(axis=1)
     return features.where(keep), pixel_px[keep]
+
+
+_RADIUS_PX = 8.0
+"""A landmark is looked for so near to where a localized frame's pose projects it."""
+_ALL = 10_000
+
+
+class Anchoring:
+    """The localizer's own matching, of all of a frame's features."""
+
+    def __init__(
+        self,
+        map_: Map,
+        flights: Sequence[LocatedFlight],
+        frames: Frames,
+        settings: LocalizerSettings,
+    ) -> None:
+        settings = replace(settings, pose=replace(settings.pose, max_observations=_ALL))
+        self._matchers = [
+            matching.Matcher(map_, flight.camera, settings, flight.distance_scale)
+            for flight in flights
+        ]
+        self._frames = frames
+
+    def of(self, k: int, wTc: F64, twist: F64) -> tuple[Indices, Indices]:
+        """Features (N,) of frame k at wTc (4, 4) with a twist (6,), and their landmarks (N,)."""
+        frames = self._frames
+        matcher = self._matchers[int(frames.flight[k])]
+        seen = matching.describe(frames.features[k], matcher.camera, Conditions())
+        expected = Kinematics(int(frames.time_ns[k]), wTc, twist, np.zeros((12, 12)))
+        matches = matcher.match(seen, expected, _RADIUS_PX, Stopwatch())
+        return matches.feature, matches.landmark

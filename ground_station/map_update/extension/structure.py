@@ -18,10 +18,8 @@ from ground_station.localization.settings import RecoverySettings
 from ground_station.map import landmarks
 from ground_station.map.model import Model
 from ground_station.map.store import Map
-from ground_station.map_update.extension.anchoring import Anchoring
-from ground_station.map_update.extension.frames import Frames
-from ground_station.map_update.extension.tracks import Tracks
-from ground_station.map_update.extension.triangulation import triangulate
+from ground_station.map_update.extension.frames import Anchoring, Frames
+from ground_station.map_update.extension.tracks import Tracks, triangulate
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.adjustment import adjust_among_fixed

@@ -1,4 +1,4 @@
-"""Features of several frames that are the same thing: matches, joined to tracks."""
+"""Features of several frames that are the same thing: tracks of matches, and their points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from ground_station.arrays import I32, I64, Indices
+from ground_station.arrays import F64, I32, I64, Bools, Indices
+from ground_station.map import landmarks
+from ground_station.map.model import Model
 from ground_station.map.store import MapInfo
 from ground_station.map_update.extension.frames import Frames
 from ground_station.mapping.construction.pairs import Pair
@@ -17,6 +19,7 @@ from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.verification import alike, rules_of, verify_pair
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.sfm.models import without_observations
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
@@ -112,3 +115,50 @@ def joined(offset: I64, verified: Sequence[tuple[Pair, I32]]) -> Tracks:
         track.ravel()[order].astype(np.int64),
         len(names),
     )
+
+
+_LEAST_CONDITION = 1e-6
+"""Rays whose normal equations are worse conditioned are parallel."""
+
+
+def nearest_to_rays(model: Model) -> F64:
+    """Where each point's rays come nearest to each other (M, 3); NaN where they are parallel.
+
+    The point of least squared distance from all its rays (the midpoint of two, for two).
+    """
+    count = len(model.point_id)
+    fx, fy, cx, cy = model.pinhole
+    flat = (model.pixel_px - [cx, cy]) / [fx, fy]
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    rays = np.einsum("oij,oj->oi", model.wTc[model.image, :3, :3], rays)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    centre = model.wTc[model.image, :3, 3]
+    A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(A, model.point, across)
+    np.add.at(b, model.point, np.einsum("oij,oj->oi", across, centre))
+    size = np.linalg.eigvalsh(A)
+    found = size[:, 0] > _LEAST_CONDITION * np.maximum(size[:, 2], 1e-12)
+    position = np.full((count, 3), np.nan)
+    position[found] = np.linalg.solve(A[found], b[found][..., None])[..., 0]
+    return position
+
+
+def triangulate(model: Model, gate_px: float, min_angle_deg: float) -> tuple[Model, Bools]:
+    """The model with positions from its observations, and which points (M,) are well determined.
+
+    Twice, the second time without the observations that miss the first positions by more than
+    `gate_px`; well determined is what two observations agree on with a large enough angle between
+    them."""
+    first = replace(model, position=nearest_to_rays(model))
+    inner = without_observations(first, ~_agreeing(first, gate_px))
+    result = replace(model, position=nearest_to_rays(inner))
+    agreeing = without_observations(result, ~_agreeing(result, gate_px))
+    good = np.bincount(agreeing.point, minlength=len(result.position)) >= 2
+    good &= landmarks.largest_angles_deg(agreeing) >= min_angle_deg
+    return result, np.asarray(good & np.isfinite(result.position).all(axis=1))
+
+
+def _agreeing(model: Model, gate_px: float) -> Bools:
+    residual = np.linalg.norm(landmarks.residuals_px(model), axis=1)
+    return np.asarray(residual <= gate_px)  # NaN is not

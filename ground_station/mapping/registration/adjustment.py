@@ -18,7 +18,7 @@ from ground_station.arrays import F64, I64, Bools
 from ground_station.errors import GeometryError, MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map.uncertainty import Uncertainty, jacobian
-from ground_station.mapping.registration.similarity import check_spread
+from ground_station.mapping.registration.registration import check_spread
 
 _ITERATIONS = 100
 _CONVERGED = 1e-10

@@ -16,11 +16,13 @@ from ground_station.map.uncertainty import Uncertainty
 from ground_station.mapping.registration.adjustment import moved
 from ground_station.mapping.registration.observations import (
     PointObservations,
+    numbers,
+    read_rows,
     sigma_px,
     triangulate_observations,
+    word,
 )
 from ground_station.mapping.registration.registration import Registration
-from ground_station.mapping.registration.rows import numbers, read_rows, word
 
 COLUMNS = ("distance", "end", "image", "u_px", "v_px", "length_m")
 _SIGMA_M = 0.01

@@ -18,13 +18,11 @@ from ground_station.mapping.registration.adjustment import (
 )
 from ground_station.mapping.registration.picks import MIN_WIDTH, Picks, at_present
 from ground_station.mapping.registration.registration import (
+    GATE_DEVIATION,
     Registration,
+    check_spread,
     listed,
     similarity_report,
-)
-from ground_station.mapping.registration.similarity import (
-    GATE_DEVIATION,
-    check_spread,
 )
 from ground_station.mapping.registration.upright import upright_rotation
 

@@ -24,11 +24,13 @@ from ground_station.mapping.registration.pose_similarity import (
     robust_rotation,
     similarity_on_a_line,
 )
-from ground_station.mapping.registration.registration import Registration, rms, similarity_report
-from ground_station.mapping.registration.similarity import (
+from ground_station.mapping.registration.registration import (
     MIN_POINTS,
+    Registration,
     check_spread,
+    rms,
     robust_similarity,
+    similarity_report,
 )
 
 _MAX_DIFF_NS = 10_000_000

@@ -16,7 +16,7 @@ from ground_station.geometry.alignment import align
 from ground_station.map.store import Landmarks
 from ground_station.mapping.registration.adjustment import Upright
 from ground_station.mapping.registration.plan import PlanScale
-from ground_station.mapping.registration.similarity import MIN_POINTS, check_spread
+from ground_station.mapping.registration.registration import MIN_POINTS, check_spread
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.arrays import F64, Bools
 from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment
-from ground_station.mapping.registration.similarity import GATE_DEVIATION, MIN_POINTS
+from ground_station.mapping.registration.registration import GATE_DEVIATION, MIN_POINTS
 
 _CANDIDATES = 2000
 _ITERATIONS = 100

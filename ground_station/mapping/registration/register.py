@@ -31,15 +31,13 @@ from ground_station.mapping.registration.observations import (
 )
 from ground_station.mapping.registration.picks import Picks
 from ground_station.mapping.registration.registration import (
+    MIN_POINTS,
+    MIN_WIDTH,
     Registration,
     listed,
     rms,
-    similarity_report,
-)
-from ground_station.mapping.registration.similarity import (
-    MIN_POINTS,
-    MIN_WIDTH,
     robust_similarity,
+    similarity_report,
 )
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap
-from ground_station.map.colmap import pycolmap
-from ground_station.map.colmap_cameras import HALF_PIXEL
+from ground_station.map.colmap import HALF_PIXEL, pycolmap
 from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
 

@@ -14,8 +14,7 @@ from ground_station.errors import CameraError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files
-from ground_station.map.colmap import pycolmap
-from ground_station.map.colmap_cameras import camera_of
+from ground_station.map.colmap import camera_of, pycolmap
 from pi_firmware.wire.errors import ConfigError
 
 

@@ -16,7 +16,7 @@ import pycolmap
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, landmarks
-from ground_station.map.colmap_cameras import described
+from ground_station.map.colmap import described
 
 MAX_FEATURES = 2000
 """Of an image: about what a build of ours takes, too."""

@@ -10,8 +10,7 @@ from ground_station.geometry import poses
 from ground_station.map import landmarks, store
 from ground_station.map.model import Model
 from ground_station.map_update.extension.extend import never_seen
-from ground_station.map_update.extension.tracks import joined
-from ground_station.map_update.extension.triangulation import triangulate
+from ground_station.map_update.extension.tracks import joined, triangulate
 from ground_station.mapping.sfm.adjustment import adjust_among_fixed
 
 

@@ -11,7 +11,7 @@ from ground_station.errors import MapError
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.map.uncertainty import Uncertainty, describe, region
 from ground_station.mapping.registration.adjustment import Upright, adjust
-from ground_station.mapping.registration.similarity import robust_similarity
+from ground_station.mapping.registration.registration import robust_similarity
 
 NOISE_M = 0.05
 DRAWS = 500

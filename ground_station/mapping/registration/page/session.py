@@ -20,8 +20,13 @@ from ground_station.map.uncertainty import describe
 from ground_station.mapping.registration import picks as files
 from ground_station.mapping.registration import upright as vertical
 from ground_station.mapping.registration.distances import Distances
-from ground_station.mapping.registration.page.clusters import Offer, anchors_at, offer_at
-from ground_station.mapping.registration.page.proposal import shown, wall_picks
+from ground_station.mapping.registration.page.clusters import (
+    Offer,
+    anchors_at,
+    offer_at,
+    shown,
+    wall_picks,
+)
 from ground_station.mapping.registration.picks import Pick, Picks
 from ground_station.mapping.registration.plan import Plan, keep_plan
 from ground_station.mapping.registration.register import find_similarity, register_map
