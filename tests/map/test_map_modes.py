@@ -12,8 +12,6 @@ from ground_station.errors import MapError
 from ground_station.map import store
 from ground_station.map.descriptors import Descriptors, joined, quantised
 from ground_station.map.modes import MOST, Modes, described, with_modes
-from ground_station.mapping.settings import SHIPPED, MappingSettings
-from pi_firmware.wire import config
 
 
 def _rows(count, dimension=32, signed=False, seed=0):
@@ -104,14 +102,6 @@ def test_a_mode_that_is_not_a_number_is_refused(built, tmp_path):
         store.load(tmp_path)
 
 
-def test_a_cut_file_is_refused(built, tmp_path):
-    store.save_tables(tmp_path, _with(built, Modes(np.array([1], np.int32), _rows(1))))
-    path = tmp_path / "landmarks.safetensors"
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(MapError, match=r"landmarks\.safetensors"):
-        store.load(tmp_path)
-
-
 def test_modes_are_found_by_their_landmarks():
     modes = Modes(np.array([2, 5, 5, 9], np.int32), _rows(4))
     rows, place = modes.of(np.array([5, 0, 9, 2, 5]))
@@ -146,8 +136,3 @@ def test_bytes_stay_as_they_are_when_rows_are_added(signed):
     assert modes.landmark.tolist() == [0, 1, 4, 4, 4, 6, 7, 9]
     assert np.array_equal(modes.descriptor.values[[1, 2, 3, 5, 6]], kept.values)
     assert np.allclose(modes.descriptor[4], more[0], atol=0.02)
-
-
-def test_the_shipped_file_documents_the_settings_of_extending():
-    table = MappingSettings().extend
-    assert config.read(SHIPPED)["extend"] == dataclasses.asdict(table) and table.max_modes <= MOST

@@ -206,15 +206,18 @@ def refused(folder: Path, path: Path, capsys: pytest.CaptureFixture[str]) -> str
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_foreign_or_damaged_trajectory_is_refused(folder, flights, tmp_path, capsys, name):
+def test_a_foreign_or_damaged_trajectory_is_refused(flights, name):
     make, words = FOREIGN[name]
-    write_tum(tmp_path / "t.txt", make(flights))
-    said = refused(folder, tmp_path / "t.txt", capsys)
+    with pytest.raises(BlimpError) as caught:
+        by_trajectory(flights.map, make(flights), 0)
+    said = str(caught.value)
     assert "\n" not in said and "within" not in said.replace("pose within", "")
     assert re.search(words, said), said
 
 
-def test_numbers_that_are_none_are_refused(folder, flights, tmp_path, capsys):
+def test_the_command_refuses_and_changes_nothing(folder, flights, tmp_path, capsys):
+    write_tum(tmp_path / "t.txt", flights.other)
+    assert "another flight" in refused(folder, tmp_path / "t.txt", capsys)
     write_tum(tmp_path / "t.txt", flights.dense())
     lines = (tmp_path / "t.txt").read_text().splitlines()
     lines[40] = " ".join([lines[40].split()[0], *["nan"] * 7])

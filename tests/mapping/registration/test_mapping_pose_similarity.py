@@ -174,8 +174,9 @@ def test_wrong_poses_are_left_out_position_and_orientation_each_for_itself():
     assert any(note.startswith("3 orientations left out") for note in found.notes)
 
 
-@pytest.mark.parametrize("degrees", [2.0, 5.0, 25.0, 120.0, 180.0])
-@pytest.mark.parametrize("sideways_m", [0.3, 1.0])
+@pytest.mark.parametrize(
+    ("degrees", "sideways_m"), [(2.0, 0.3), (5.0, 1.0), (25.0, 0.3), (120.0, 1.0), (180.0, 0.3)]
+)
 def test_a_vehicles_own_axes_are_recognised_and_positions_alone_decide(degrees, sideways_m):
     wTc, truth = walk(40, sideways_m), random_similarity(9)
     trajectory = trajectory_of(wTc, 0.01, 0.2, 5, turned_by(degrees))
@@ -203,7 +204,7 @@ def test_an_offset_that_scatter_explains_is_none():
     """Nearly straight and noisy: the positions know the roll to some degrees only."""
     wTc = walk(12, 0.06)
     used, alone, joint = 0, [], []
-    for seed in range(40):
+    for seed in range(12):
         truth = random_similarity(seed)
         map_, trajectory = model_of(wTc, truth), trajectory_of(wTc, 0.02, 0.3, seed)
         found = by_trajectory(map_, trajectory, 0)
@@ -211,7 +212,7 @@ def test_an_offset_that_scatter_explains_is_none():
         alone.append(off_deg(positions_only(map_, trajectory), truth))
         joint.append(off_deg(found.fit, truth))
     assert np.median(alone) > 3.0
-    assert used >= 38 and np.median(joint) < 0.3
+    assert used >= 11 and np.median(joint) < 0.3
 
 
 def test_a_small_offset_is_no_other_frame():
@@ -291,10 +292,9 @@ def test_a_maps_pose_that_is_no_rigid_motion_is_refused_by_name(rotation):
         by_trajectory(map_, trajectory_of(walk()), 0)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_numbers_by_chance_are_refused_with_one_line(seed):
-    rng = np.random.default_rng(seed)
-    rotation = Rotation.random(30, random_state=seed).as_matrix()
+def test_numbers_by_chance_are_refused_with_one_line():
+    rng = np.random.default_rng(0)
+    rotation = Rotation.random(30, random_state=0).as_matrix()
     chance = poses.pose(rotation, rng.normal(size=(30, 3)))
     trajectory = Trajectory.from_poses(np.arange(30) * STEP_NS, chance)
     with pytest.raises(BlimpError) as caught:
