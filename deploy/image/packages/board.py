@@ -100,7 +100,6 @@ class Board:
 
     Attributes:
         name: as in `BOARD=`.
-        title: for a person.
         architecture: Debian's name of it.
         machine: what `uname -m` says there; the tag of its releases.
         suite: Debian's release.
@@ -115,7 +114,6 @@ class Board:
     """
 
     name: Text
-    title: Text
     architecture: Text
     machine: Text
     suite: Text
@@ -170,22 +168,15 @@ def load_board(name: str | Path) -> Board:
 
 
 def with_archives(board: Board, changes: Mapping[str, Mapping[str, str]]) -> Board:
-    """The board with archives at other places.
+    """The board with archives at other places: `url` and `keyring`, by the archive's name.
 
-    Args:
-        changes: by the archive's name, any of `url`, `keyring` and `origin`.
-
-    Raises:
-        DeployError: the board has no archive of that name, or the archive no such property.
+    Raises `DeployError` when the board has no archive of that name.
     """
     names = [archive.name for archive in board.archives]
-    for name, change in changes.items():
+    for name in changes:
         if name not in names:
             there = f"there are {', '.join(names)}" if names else "it has none"
             raise DeployError(f"board {board.name} has no archive {name!r}: {there}")
-        for key in change:
-            if key not in ("url", "keyring", "origin"):
-                raise DeployError(f"archive {name}: {key!r} is none of url, keyring, origin")
     archives = tuple(
         dataclasses.replace(archive, **dict[str, Any](changes.get(archive.name, {})))
         for archive in board.archives
