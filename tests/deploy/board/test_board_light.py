@@ -14,7 +14,6 @@ from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Link, StatusLed, Te
 from deploy.board.releases.places import Places
 from deploy.board.releases.service import Seen
 from deploy.board.status import Fault
-from deploy.errors import DeployError
 
 GOOD = {"state": provision.IN_FORCE, "payload_id": "blimp-1", "wifi": True}
 STREAMS = Seen(active=True, said="active")
@@ -117,11 +116,6 @@ def test_the_first_start_of_the_firmware_may_take_longer() -> None:
     assert judge.fault(first, PATIENCE_S)[0] is None
     assert judge.fault(again, PATIENCE_S)[0] is status.NO_VIDEO
     assert judge.fault(first, light.START_S)[0] is status.NO_VIDEO
-
-
-def test_every_fault_has_its_own_number_of_blinks() -> None:
-    assert [fault.blinks for fault in status.ALL] == [2, 3, 4, 5, 6]
-    assert all(fault.fix.endswith(".") for fault in status.ALL)
 
 
 class Written(FastDisk):
@@ -296,8 +290,3 @@ def test_name_servers_are_those_of_the_networks_and_nothing_else(person: Person)
     light.resolve(card)
     assert card.resolver.stat().st_ino == before.st_ino
     assert card.resolver.stat().st_mtime_ns == before.st_mtime_ns
-
-
-def test_a_status_on_no_partition_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DeployError, match="not there"):
-        status.write(light.Card(tmp_path), FastDisk(), b"")

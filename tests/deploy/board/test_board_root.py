@@ -232,8 +232,3 @@ def test_users_have_fixed_numbers_and_no_password(tmp_path: Path) -> None:
         for line in (tmp_path / "etc/group").read_text().splitlines()
     }
     assert all("blimp" in members[name] for name in ("video", "render", "dialout", "i2c"))
-
-
-def test_every_file_is_a_file_or_a_link_and_none_is_large() -> None:
-    for path in TREE.rglob("*"):
-        assert path.is_symlink() or path.is_dir() or path.stat().st_size < 8192, path

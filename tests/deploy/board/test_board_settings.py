@@ -89,7 +89,3 @@ def test_what_is_no_toml_is_one_line(text: bytes) -> None:
         settings.read(text, "payload.toml")
     said = str(error.value)
     assert said.startswith("payload.toml: ") and " not " in said and "\n" not in said
-
-
-def test_a_mark_of_windows_editors_is_not_in_the_way() -> None:
-    assert settings.read(b"\xef\xbb\xbfa = 1\r\n", "x") == {"a": 1}

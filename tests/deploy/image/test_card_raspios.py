@@ -95,13 +95,6 @@ def test_the_root_keeps_the_bases_files_and_takes_ours(reader, checkout):
     assert not reader.exists("etc/ssh/ssh_host_ed25519_key")
 
 
-def test_nobody_has_a_password_and_the_bases_user_is_gone(reader):
-    passwd, shadow = reader.rows("etc/passwd"), reader.rows("etc/shadow")
-    assert set(passwd) == set(shadow) and "somebody" not in passwd
-    assert all(row[1] == "*" for row in shadow.values())
-    assert reader.stat("etc/shadow")["mode"] == "0640"
-
-
 def test_the_base_is_named_in_the_manifest_and_was_not_changed(image, base):
     document = json.loads(card.beside(image, ".manifest.json").read_text())
     assert document["base"] == {"name": "raspios.img", "sha256": sparse.sha256(base)}

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from card_parts import CAPABILITY
 
-from deploy.errors import DeployError
 from deploy.image.packages import base
 from deploy.image.packages.base import leave_out
 from deploy.image.packages.board import Group
@@ -139,16 +138,6 @@ def test_owners_set_bits_capabilities_and_second_names_are_kept(root: Path, tmp_
         assert (entry.uid, entry.gid, entry.mode) == (3, 44, 0o4755)
         assert entry.xattrs == (("security.capability", CAPABILITY),)
         assert entry.content.read() == b"program"
-
-
-def test_a_layer_that_is_cut_is_told(root: Path, tmp_path: Path):
-    before = base.snapshot(root, _nothing)
-    _write(root, {"etc/new": "new" * 1000})
-    base.write(root, before, base.snapshot(root, _nothing), tmp_path / "layer.tar")
-    whole = (tmp_path / "layer.tar").read_bytes()
-    (tmp_path / "layer.tar").write_bytes(whole[:2500])
-    with pytest.raises(DeployError, match=r"no readable tar|cut"):
-        Tree.from_tar(tmp_path / "layer.tar").read("etc/new")
 
 
 def test_only_what_is_new_is_left_out(root: Path):

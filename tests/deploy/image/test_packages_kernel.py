@@ -154,11 +154,6 @@ def test_what_a_package_lacks_is_said_and_leaves_nothing(
     assert [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")] == []
 
 
-def test_a_board_of_a_base_image_has_no_kernel_of_its_own(tmp_path: Path) -> None:
-    with pytest.raises(DeployError, match="board zerow: its kernel comes with its base image"):
-        unpack_kernel(load_board("zerow"), tmp_path)
-
-
 def test_modules_bring_their_dependencies_hard_and_soft(tmp_path: Path) -> None:
     (tmp_path / "modules.dep").write_text(
         "fs/ext4.ko.xz: fs/jbd2.ko.xz lib/crc16.ko.xz\nfs/jbd2.ko.xz:\nlib/crc16.ko.xz:\n"

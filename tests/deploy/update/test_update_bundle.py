@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from card_stand import NEW, NOW, OLD, contents, tar_of
+from card_stand import NEW, contents, tar_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -215,20 +215,3 @@ def _any_key(folder: Path) -> Path:
     from card_stand import make_key
 
     return make_key(folder / "key")
-
-
-@pytest.mark.parametrize(("new", "replaces", "refused"), [
-    (NEW, "", False), (OLD, "", True), (OLD, NOW, False), (OLD, NEW, True), (OLD, OLD, True),
-])  # fmt: skip
-def test_older_ones_are_refused_unless_the_list_names_the_version_that_runs(
-    new: str, replaces: str, refused: bool
-) -> None:
-    def release(version: str) -> Release:
-        return manifest.read_release(json.loads(contents(version)["release.json"]), "x")
-
-    given = manifest.Manifest(release(new), replaces, ())
-    if refused:
-        with pytest.raises(DeployError, match="is older than"):
-            manifest.check_against(given, release(NOW), release(NOW))
-    else:
-        manifest.check_against(given, release(NOW), release(NOW))
