@@ -15,9 +15,8 @@ from deploy.flash import customise, disks, image, keys, wishes, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
 from deploy.flash.disks import Disk, Machine
-from deploy.flash.wishes import WifiOptions
 from deploy.flash.write import Target
-from deploy.provisioning.model import Provisioning, Wifi
+from deploy.provisioning.model import Provisioning
 
 _INTERRUPTED = 130  # as a shell says it: 128 and SIGINT's number
 _EXAMPLE = """example:
@@ -163,19 +162,10 @@ def _content(options: argparse.Namespace, existing: Provisioning | None) -> Cont
         certificates = folder / "payload" / payload
         there = certificates if held or certificates.is_dir() else None
         customise.check_payload_toml(options.payload_toml, settings, planned, there)
-    wifi = _wifi(options)
+    wifi = wishes.read_wifi(options)
     country = options.country if wifi is None else None
     provisioning = wishes.merge(existing, payload, wifi, country=country, **before)
     return Content(provisioning, held, settings)
-
-
-def _wifi(options: argparse.Namespace) -> Wifi | None:
-    return wishes.read_wifi(
-        WifiOptions(
-            options.wifi_ssid, options.wifi, options.wifi_password_file, options.country,
-            options.wifi_security, options.wifi_hidden, options.no_wifi,
-        )
-    )  # fmt: skip
 
 
 def _ssh_keys(

@@ -56,9 +56,7 @@ class BootPartition:
     def files(self, folder: str) -> list[str]:
         """The paths of all files and folders in a folder; empty when it is not there."""
         try:
-            listed = self._run("mdir", "-b", "-a", "-/", self._path(folder)).decode(
-                errors="replace"
-            )
+            listed = self._run("mdir", "-b", "-a", "-/", f"::/{folder}").decode(errors="replace")
         except DeployError as error:
             if "not found" in str(error):
                 return []
@@ -73,30 +71,26 @@ class BootPartition:
 
     def read(self, path: str) -> bytes:
         """A file's bytes."""
-        return self._run("mtype", self._path(path))
+        return self._run("mtype", f"::/{path}")
 
     def write(self, path: str, data: bytes) -> None:
         """Writes a file again; its folder must be there."""
-        self._run("mcopy", "-o", "-D", "o", "-", self._path(path), data=data)
+        self._run("mcopy", "-o", "-D", "o", "-", f"::/{path}", data=data)
 
     def make_folder(self, path: str) -> None:
         """Makes a folder that is not there yet."""
-        self._run("mmd", "-D", "s", self._path(path))
+        self._run("mmd", "-D", "s", f"::/{path}")
 
     def remove(self, path: str) -> None:
         """Removes a file."""
-        self._run("mdel", self._path(path))
+        self._run("mdel", f"::/{path}")
 
     def free_bytes(self) -> int:
         """What is free for files, bytes."""
-        match = _FREE.search(self._run("mdir", self._path("")))
+        match = _FREE.search(self._run("mdir", "::/"))
         if match is None:
             raise DeployError(f"{self.shown}: its boot partition is damaged")
         return int(match[1].replace(b" ", b""))
-
-    @staticmethod
-    def _path(path: str) -> str:
-        return f"::/{path}"
 
     def _run(self, tool: str, *words: str, data: bytes | None = None) -> bytes:
         # After the options comes the image, then what is done.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import getpass
 import os
 import pwd
 import stat
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.errors import DeployError, printable
@@ -18,49 +18,38 @@ from deploy.provisioning.text import parse_wifi
 MAX_FILE_BYTES = 64 * 1024
 
 
-@dataclass(frozen=True)
-class WifiOptions:
-    """Wi-Fi as the options name it; None: not named, so it stays as it is."""
+def read_wifi(options: argparse.Namespace) -> Wifi | None:
+    """The network that the command's options name; None: none, so that it stays as it is.
 
-    ssid: str | None = None
-    file: Path | None = None
-    password_file: Path | None = None
-    country: str | None = None
-    security: str | None = None
-    hidden: bool = False
-    none: bool = False
-
-
-def read_wifi(options: WifiOptions) -> Wifi | None:
-    """The network asked for; None without one. Raises `DeployError` with one line.
-
-    The password is asked for on the terminal where no file holds it: on a command line every user
-    of the machine could read it.
+    Raises `DeployError` with one line. The password is asked for on the terminal where no file
+    holds it: on a command line every user of the machine could read it.
     """
-    if [options.ssid is not None, options.file is not None, options.none].count(True) > 1:
+    if [options.wifi_ssid is not None, options.wifi is not None, options.no_wifi].count(True) > 1:
         raise DeployError("expected one of --wifi-ssid, --wifi and --no-wifi")
-    if options.ssid is None and (options.security is not None or options.hidden):
+    if options.wifi_ssid is None and (options.wifi_security is not None or options.wifi_hidden):
         raise DeployError("--wifi-security and --wifi-hidden go with --wifi-ssid")
-    if options.file is not None:
-        named = parse_wifi(read_file(options.file), options.file.name, options.country)
-        if options.password_file is None:
+    if options.wifi is not None:
+        named = parse_wifi(read_file(options.wifi), options.wifi.name, options.country)
+        if options.wifi_password_file is None:
             return named
-        return dataclasses.replace(named, password=_password_in(options.password_file))
-    if options.ssid is None:
-        if options.password_file is not None:
+        return dataclasses.replace(named, password=_password_in(options.wifi_password_file))
+    if options.wifi_ssid is None:
+        if options.wifi_password_file is not None:
             raise DeployError("--wifi-password-file is given without --wifi-ssid")
         return None
     if options.country is None:
         raise DeployError("--country is missing: two capital letters, as DE")
-    security = options.security or WPA2
+    security = options.wifi_security or WPA2
     # Checked first without the password, so that nobody types it for nothing.
-    network = Wifi(os.fsencode(options.ssid), options.country, "", security, options.hidden)
-    if options.password_file is not None:
-        password = _password_in(options.password_file)
+    network = Wifi(
+        os.fsencode(options.wifi_ssid), options.country, "", security, options.wifi_hidden
+    )
+    if options.wifi_password_file is not None:
+        password = _password_in(options.wifi_password_file)
     elif security == OPEN:
         password = ""
     else:
-        password = _ask(options.ssid)
+        password = _ask(options.wifi_ssid)
     return dataclasses.replace(network, password=password)
 
 

@@ -20,7 +20,7 @@ import mmap
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from deploy.errors import DeployError, Interrupted
@@ -157,42 +157,27 @@ def write(image: Image, target: Target, customise: Callable[[], object]) -> None
     Raises `DeployError` with one line that says where it failed and what the card is now.
     """
     head = Stretch(0, min(HEAD_BYTES, image.boot.offset))
-    body = [part for part in _without(head, image.stretches) if part.start < part.stop]
-    stage = _Stage()
-    with _never_half(target, stage):
+    behind = (Stretch(max(part.start, head.stop), part.stop) for part in image.stretches)
+    body = [part for part in behind if part.start < part.stop]
+    # Whether zeros are known to stand in sector 0, whatever the card answers from then on.
+    table_gone = False
+    try:
         target.write(0, bytes(head.stop))
         _flush(target, 0)
-        stage.table_gone = True
+        table_gone = True
         _write(image, target, body)
         _compare(image, target, body)
         customise()
         first = Stretch(0, SECTOR_BYTES)
         rest = Stretch(SECTOR_BYTES, head.stop)
         for last in (rest, first):
-            stage.table_gone = last is rest
+            table_gone = last is rest
             for start, data in chunks(image.file, last):
                 target.write(start, data)
             _flush(target, last.start)
         _compare(image, target, [head], quiet=True)
-
-
-def _without(head: Stretch, stretches: Iterable[Stretch]) -> Iterator[Stretch]:
-    for stretch in stretches:
-        yield Stretch(max(stretch.start, head.stop), stretch.stop)
-
-
-class _Stage:
-    """Whether zeros are known to stand in sector 0, whatever the card answers from now on."""
-
-    table_gone = False
-
-
-@contextlib.contextmanager
-def _never_half(target: Target, stage: _Stage) -> Iterator[None]:
-    try:
-        yield
     except BaseException as error:
-        known = stage.table_gone or _zero_again(target)
+        known = table_gone or _zero_again(target)
         state = NOT_BOOTABLE if known else UNKNOWN
         if isinstance(error, KeyboardInterrupt | Interrupted):
             raise Interrupted(f"{target.path}: interrupted: {state}") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import subprocess
@@ -15,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
+from deploy.board.inputs import digest
 from deploy.board.releases import manifest
 from deploy.board.releases.choose import MANIFEST, RELEASE
 from deploy.board.releases.receive import SIGNATURE
@@ -63,7 +63,7 @@ def make(files: Mapping[str, bytes], key: Path, replaces: str = "") -> Bundle:
     `replaces` is the one newer version that the bundle may take a card back from. Raises
     `DeployError` for what a card would refuse, or when the key does not sign.
     """
-    listed = [[path, len(data), _sha256(data)] for path, data in sorted(files.items())]
+    listed = [[path, len(data), digest(data)] for path, data in sorted(files.items())]
     document = {
         "schema": manifest.SCHEMA,
         "release": json.loads(files[RELEASE]),
@@ -152,12 +152,8 @@ def _add(
 
 
 def _digest(files: Mapping[str, bytes]) -> str:
-    listed = "".join(f"{path} {_sha256(data)}\n" for path, data in sorted(files.items()))
-    return _sha256(listed.encode())
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
+    listed = "".join(f"{path} {digest(data)}\n" for path, data in sorted(files.items()))
+    return digest(listed.encode())
 
 
 def _json(document: Any) -> bytes:
