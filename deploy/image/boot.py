@@ -56,15 +56,10 @@ The folder of this payload.
 def contents(
     board: str, kernel: str, machine: str, tree: Tree, initrd: bytes | None, root: str
 ) -> Tree:
-    """Adds what is ours to the partition's files, in place.
+    """Adds what is ours to the partition's files, which are kernel and board's firmware, in place.
 
-    Args:
-        board: its name.
-        kernel: the name of the kernel's file in the tree.
-        machine: as `uname -m` says there.
-        tree: kernel, device trees, overlays, the board's firmware.
-        initrd: the first root.
-        root: as the kernel's line names it.
+    `kernel` names the kernel's file in the tree, `machine` is as `uname -m` says there, `root` as
+    the kernel's line names it.
     """
     more = "arm_64bit=1\n" if machine == "aarch64" else ""
     if board == "qemu":

@@ -72,8 +72,7 @@ def build(
 
     Args:
         image: the final name; what is there stays until the new one is whole.
-        board: one with a kernel of its own.
-        kernel: that.
+        board: one with a kernel of its own, which is `kernel`.
         rootfs: the packages' root, an uncompressed tar.
         site: a folder of unpacked wheels; None: none are needed.
         checkout: of this project, with git.

@@ -240,15 +240,9 @@ _TARGET = re.compile(r'^Fast link dest: "(.*)"$')
 def read_tree(image: Path, wanted: Callable[[str], bool], work: Path) -> Tree:
     """All entries with owners, modes and links' targets; contents only of what is wanted.
 
-    Args:
-        image: the file system.
-        wanted: tells by a path whether its content is needed; an entry without it cannot be read.
-        work: a folder in which the contents stay.
-
-    A target of 60 bytes and more, which lies outside its inode, stays empty.
-
-    Raises:
-        DeployError: no ext4, or damaged.
+    `wanted` tells by a path whether its content is needed, which then lies in the folder `work`; an
+    entry without it cannot be read. A target of 60 bytes and more, which lies outside its inode,
+    stays empty. Raises `DeployError` for what is no ext4, or damaged.
     """
     tree = Tree()
     folders = [""]
@@ -281,14 +275,7 @@ def unpack(image: Path, tree: Tree, folder: Path) -> None:
     """Writes a file system to a new folder of the disk, with owners, modes and times; needs root.
 
     Not so device nodes, pipes, sockets and extended attributes; a file of two names becomes two.
-
-    Args:
-        image: the file system.
-        tree: what `read_tree` gave for it.
-        folder: made here.
-
-    Raises:
-        DeployError: damaged, or no room.
+    `tree` is what `read_tree` gave for it. Raises `DeployError` when it is damaged or has no room.
     """
     folder.mkdir()
     said = run(["debugfs", "-R", f'rdump / "{folder}"', image], merge=True)

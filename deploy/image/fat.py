@@ -22,16 +22,9 @@ LAST_SECOND = 4_354_819_199
 def make(image: Path, size: int, tree: Tree, label: str, serial: int, epoch: int) -> None:
     """Makes a file system of `size` bytes with the tree's files; owners and modes are lost.
 
-    Args:
-        image: made again.
-        size: bytes.
-        tree: files and folders; FAT knows no links.
-        label: up to 11 capital letters.
-        serial: the volume's number, 32 bits.
-        epoch: the time of everything in it, s since 1970, in 1980 to 2107.
-
-    Raises:
-        DeployError: the tree does not fit, or a tool fails.
+    `label` has up to 11 capital letters, `serial` 32 bits; `epoch` is the time of everything in it,
+    s since 1970, in 1980 to 2107. Raises `DeployError` when the tree does not fit or has a link,
+    which FAT does not know, or a tool fails.
     """
     needed = bytes_needed(tree)
     if size < needed:

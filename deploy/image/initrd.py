@@ -32,12 +32,8 @@ _WELCOME = ("bcm2835", "sdhci-iproc", "mmc_block", "virtio_mmio", "virtio_pci", 
 def build(tree: Tree, release: str) -> bytes:
     """The compressed archive for a kernel whose modules lie in the tree.
 
-    Args:
-        tree: the root, with busybox-static and `usr/lib/modules/RELEASE` with depmod's tables.
-        release: the kernel's, as `uname -r` says.
-
-    Raises:
-        DeployError: busybox, the tables or a needed module is missing.
+    That is `usr/lib/modules/RELEASE` with depmod's tables, RELEASE as `uname -r` says. Raises
+    `DeployError` when busybox, the tables or a needed module is missing.
     """
     if _BUSYBOX not in tree:
         raise DeployError(f"/{_BUSYBOX}: not there; the root needs the package busybox-static")

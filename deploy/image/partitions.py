@@ -46,16 +46,11 @@ def power_of_two(size: int) -> int:
 
 
 def assemble(image: Path, partitions: list[Partition], disk: int, size: int | None = None) -> None:
-    """Writes the table and the partitions, in order, into a new file.
+    """Writes the table and at most 4 partitions, in order, into a new file.
 
-    Args:
-        image: made again, with holes where nothing that matters lies.
-        partitions: at most 4; each begins at a multiple of `ALIGN_BYTES`.
-        disk: the disk's number, 32 bits, not 0.
-        size: of the image in bytes (default: to the last partition's end).
-
-    Raises:
-        DeployError: they do not fit into `size`.
+    Each begins at a multiple of `ALIGN_BYTES`; holes are where nothing that matters lies. `disk` is
+    the disk's number, 32 bits and not 0; `size` is the image's in bytes (default: to the last
+    partition's end). Raises `DeployError` when they do not fit into it.
     """
     starts: list[int] = []
     end = ALIGN_BYTES

@@ -66,14 +66,10 @@ SCHEMA = "blimp.release/1"
 
 
 def build(checkout: Path, site: Path | None, machine: str, python: str, epoch: int) -> Tree:
-    """The release of a checkout.
+    """The release of a checkout's tracked files, made at `epoch`, s since 1970.
 
-    Args:
-        checkout: with git; only tracked files are taken.
-        site: a folder of unpacked wheels that run on the machine; None: none are needed.
-        machine: as `uname -m` says there.
-        python: as `3.13`.
-        epoch: when it counts as made, s since 1970.
+    `site` is a folder of unpacked wheels that run on the machine (None: none are needed), `machine`
+    as `uname -m` says there, `python` as `3.13`.
     """
     tree = Tree()
     firmware = files(checkout, "pi_firmware")

@@ -38,17 +38,10 @@ _MODES = {"etc/sudoers.d/blimp": 0o440}
 
 
 def customise(tree: Tree, checkout: Path, board: str, release: Tree, epoch: int) -> list[str]:
-    """Makes a system of packages the payload's; changes the tree in place.
+    """Makes a system of packages the payload's, in place; gives the units that are enabled, sorted.
 
-    Args:
-        tree: what the packages gave.
-        checkout: of this project, with git.
-        board: its name, as in `--board`.
-        release: the firmware that the card comes with.
-        epoch: s since 1970; the clock of a board without one starts here.
-
-    Returns:
-        The units that are enabled, sorted.
+    `release` is the firmware that the card comes with; at `epoch`, s since 1970, the clock of a
+    board without one starts.
     """
     for path in [name for name, _ in tree.items() if any(_fits(name, p) for p in _NOT_SHIPPED)]:
         tree.remove(path)

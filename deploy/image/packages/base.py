@@ -66,13 +66,8 @@ def add_packages(
     Which versions come is what the base's sources have on that day: the same base and the same
     cache give the same card, another day's cache may not. The card's manifest lists them.
 
-    Args:
-        board: whose.
-        base: the base image's SHA-256.
-        file_system: its root's, ext4 in a file; only read.
-        tree: what `ext4.read_tree` gave for it.
-        missing: names of the packages.
-        cache_folder: where layers are kept, as `base-BOARD-KEY.tar`.
+    `base` is the base image's SHA-256, `file_system` its root's, which is only read, and `tree`
+    what `ext4.read_tree` gave for it. Layers are kept in `cache_folder` as `base-BOARD-KEY.tar`.
 
     Raises:
         DeployError: not root, no emulator, no room, a source is out of reach or not trusted, a
@@ -161,9 +156,7 @@ State = tuple[int, ...]
 def snapshot(folder: Path, ignored: Callable[[str], bool]) -> dict[str, State]:
     """The state of every file, folder and link below a folder, by its path from there.
 
-    Args:
-        folder: looked through without following links.
-        ignored: tells by a path whether it, and all below it, is none of ours.
+    `ignored` tells by a path whether it, and all below it, is none of ours.
     """
     return dict(_states(folder, "", ignored))
 

@@ -49,11 +49,7 @@ class Kernel:
 
 
 def unpack_kernel(board: Board, cache_folder: Path) -> Kernel:
-    """The board's kernel, downloaded and verified once, then taken from the cache.
-
-    Args:
-        board: whose; one that is made from a base image has none of its own.
-        cache_folder: where it is kept, as `kernel-BOARD-KEY/`.
+    """The board's kernel, downloaded and verified once, then kept in `cache_folder`.
 
     Raises:
         DeployError: the archive is out of reach or not trusted, the package lacks a file or a

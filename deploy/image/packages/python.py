@@ -36,15 +36,9 @@ def byte_compile(
     The same sources give the same bytes (PEP 552, unchecked hashes). Emulated, a file takes about
     half a second; with a cache, only those do whose content or place is new.
 
-    Args:
-        board: whose.
-        rootfs: its root file system's tar, which brings the Python.
-        tree: a folder of Python.
-        installed_at: where the folder will lie on the card, which tracebacks then name.
-        cache_folder: where byte code is kept, in `bytecode/`.
-
-    Raises:
-        DeployError: the tar has no such Python, the emulator is missing, or a file has an error.
+    `rootfs` is the tar of the board's root file system, which brings the Python; `installed_at` is
+    where the folder will lie on the card, which tracebacks then name. Raises `DeployError` when the
+    tar has no such Python, the emulator is missing, or a file has an error.
     """
     # `cpython-313`: PEP 3147's name of the interpreter that reads it.
     ending = f".cpython-{board.python.replace('.', '')}.pyc"
