@@ -2,6 +2,9 @@
 
 Everything is made beside the image in a folder of its own and renamed at the end, the image last:
 what lies under the final name is whole, with the files that describe it.
+
+Words of config.txt are the Raspberry Pi's (raspberrypi.com, "config.txt"); the emulator plays the
+board's first stages and reads the same file.
 """
 
 from __future__ import annotations
@@ -21,16 +24,80 @@ from pathlib import Path
 from typing import Any
 
 from deploy.errors import DeployError
-from deploy.image import boot, ext4, fat, initrd, partitions, release, root
+from deploy.image import ext4, fat, initrd, partitions, release, root
 from deploy.image.packages.board import Board
 from deploy.image.packages.kernel import Kernel
 from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two, table
 from deploy.image.release import folder_files, utc
 from deploy.image.sparse import Range, sha256
 from deploy.image.tree import Tree
+from deploy.provisioning.model import Provisioning, Wifi
+from deploy.provisioning.text import render
 from deploy.run import run
 
-ROOT_LABEL, DATA_LABEL = "blimp-root", "blimp-data"
+BOOT_LABEL, ROOT_LABEL, DATA_LABEL = "BLIMPBOOT", "blimp-root", "blimp-data"
+_INITRD = "initrd.img"
+
+# Started again 10 s after a kernel that gives up; said on the screen, if any, and on no UART: that
+# is the autopilot's.
+# Raspberry Pi's firmware switches the accounting off that MemoryMax= needs.
+_KERNEL_LINE = "rootfstype=ext4 ro rootwait panic=10 fsck.repair=yes cgroup_enable=memory"
+_CAMERA_OF_QEMU = " modules_load=vivid"
+
+_CONFIG = """\
+# What the board starts with. A payload is told about its network in blimp/, not here.
+kernel={kernel}
+initramfs {initrd} followkernel
+{more}\
+disable_splash=1
+boot_delay=0
+
+# Camera and gauge.
+camera_auto_detect=1
+dtparam=i2c_arm=on
+
+# The autopilot has the real UART: Bluetooth would take it.
+enable_uart=1
+dtoverlay=disable-bt
+
+# A system that hangs is started again.
+dtparam=watchdog=on
+"""
+
+_README = """\
+The folder of this payload.
+
+1. Copy blimp-example.toml to blimp.toml and write down there the payload's name and its Wi-Fi.
+2. Put the folder certificates/ that `blimp keys payload NAME` made beside it.
+3. Put the card into the payload and give it power. It takes the secrets out of this folder, and
+   STATUS.txt says what came of it.
+
+`make flash` does 1 and 2 by itself.
+"""
+
+
+def boot_contents(
+    board: str, kernel: str, machine: str, tree: Tree, initrd: bytes, root: str
+) -> Tree:
+    """Adds what is ours to the partition's files, which are kernel and board's firmware, in place.
+
+    `kernel` names the kernel's file in the tree, `machine` is as `uname -m` says there, `root` as
+    the kernel's line names it.
+    """
+    more, camera = "arm_64bit=1\n" if machine == "aarch64" else "", ""
+    if board == "qemu":
+        more, camera = more + "device_tree=bcm2837-rpi-3-b.dtb\n", _CAMERA_OF_QEMU
+    tree.write("config.txt", _CONFIG.format(kernel=kernel, initrd=_INITRD, more=more))
+    tree.write("cmdline.txt", f"console=tty1{camera} root={root} {_KERNEL_LINE}\n")
+    tree.write(_INITRD, initrd)
+    tree.folder("blimp")
+    example = Provisioning("blimp-1", Wifi(b"name of the network", "DE", "its password"))
+    for name, text in (("blimp-example.toml", render(example)), ("README.txt", _README)):
+        # Line ends that the simplest editor of any laptop shows as such.
+        tree.write(f"blimp/{name}", text.replace("\n", "\r\n"))
+    return tree
+
+
 DESCRIPTIONS = (".bmap", ".manifest.json", ".sha256")
 Say = Callable[[str], None]
 _MIB = 1 << 20
@@ -105,7 +172,7 @@ def build(
         if kernel.image not in files:
             raise DeployError(f"{kernel.boot}: no kernel '{kernel.image}' in it")
         where = f"UUID={new.uuid('root')}"
-        front = boot.contents(board.name, kernel.image, board.machine, files, first, where)
+        front = boot_contents(board.name, kernel.image, board.machine, files, first, where)
         say("root partition")
         place = work / "root"
         size = align(ext4.bytes_needed(tree))
@@ -125,7 +192,7 @@ def finish(image: Path, front: Tree, root_place: Path, new: Identifiers, told: T
     board, epoch = told.board, told.epoch
     boot_place, data_place = image.with_name("boot"), image.with_name("data")
     size = BOOT_BYTES.get(board, REAL_BOOT_BYTES)
-    fat.make(boot_place, size, front, boot.LABEL, new.number("boot"), epoch)
+    fat.make(boot_place, size, front, BOOT_LABEL, new.number("boot"), epoch)
     data = new.uuid("data")
     ext4.make(data_place, DATA_BYTES, Tree(), DATA_LABEL, data, epoch, journal=True)
     layout = [

@@ -16,7 +16,7 @@ import shutil
 from pathlib import Path
 
 from deploy.errors import DeployError
-from deploy.image import boot, card, ext4, initrd, partitions, release, root
+from deploy.image import card, ext4, initrd, partitions, release, root
 from deploy.image.card import Identifiers, building
 from deploy.image.packages.base import add_packages, lay_over
 from deploy.image.packages.board import Board
@@ -87,7 +87,7 @@ def build(
         ext4.fill(root_place, tree, epoch, before)
         where = f"UUID={ext4.facts(root_place)['Filesystem UUID']}"
         files = _boot_files(base, boot_place, work / "base-files")
-        front = boot.contents(board.name, _KERNEL, board.machine, files, first, where)
+        front = card.boot_contents(board.name, _KERNEL, board.machine, files, first, where)
         say("boot and data partition, image, block map and checksums")
         told = card.Told(board.name, checkout, epoch, packages, site, units, base)
         card.finish(work / image.name, front, root_place, new, told)

@@ -12,7 +12,7 @@ from card_parts import EPOCH, commit, git
 
 from deploy.errors import DeployError
 from deploy.image import __main__ as command
-from deploy.image import boot, initrd, release, sparse
+from deploy.image import card, initrd, release, sparse
 from deploy.image.root import Accounts, apply_presets
 from deploy.image.sparse import Range
 from deploy.image.tree import Tree
@@ -204,7 +204,7 @@ def test_zeros_that_matter_are_written(tmp_path):
 def test_a_real_boards_first_stages_get_its_kernel_and_leave_the_uart_alone(board, machine, kernel):
     files = Tree()
     files.write(kernel, "x")
-    tree = boot.contents(board, kernel, machine, files, b"initrd", "UUID=1")
+    tree = card.boot_contents(board, kernel, machine, files, b"initrd", "UUID=1")
     config = tree.read("config.txt").decode().splitlines()
     assert f"kernel={kernel}" in config and "dtoverlay=disable-bt" in config
     assert ("arm_64bit=1" in config) == (machine == "aarch64")
