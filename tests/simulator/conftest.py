@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,11 +14,14 @@ from quick_flight import quick_settings
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.simulator import lighting
+from ground_station.simulator import simulate as flights
 from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.simulate import simulate
 from ground_station.simulator.surfaces import Surface
+from ground_station.simulator.textures import TextureBank
 
 TEXELS_PER_M = 100
 DOT_M = 0.10
@@ -53,6 +57,22 @@ def _dotted(surface: Surface, rng: np.random.Generator) -> tuple[U8, F64, F64]:
             centres.append(surface.origin_m + s * u + t * v)
             halves.append([0.5 * DOT_M * u, 0.5 * DOT_M * v])
     return texture, np.array(centres), np.array(halves)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_light() -> Iterator[None]:
+    """Light from fewer directions and in a coarser map of the sun; each lit scene is kept."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lighting, "_SKY_DIRECTIONS", 8)
+        patch.setattr(lighting, "_SUN_MAP_PX", 1024)
+        patch.setattr(flights, "lit_scene", functools.cache(lighting.lit_scene.__wrapped__))
+        yield
+
+
+@pytest.fixture(scope="session")
+def bank() -> TextureBank:
+    """The fields that every scene's textures are cut from; they take seconds to make."""
+    return TextureBank(7)
 
 
 @pytest.fixture(scope="session")

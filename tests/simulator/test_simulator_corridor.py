@@ -11,7 +11,6 @@ from ground_station.simulator import scenes
 from ground_station.simulator.corridor import BAY_M, BAYS, LENGTH_M, WIDTH_M
 from ground_station.simulator.lighting import surface_albedo
 from ground_station.simulator.plans import Reference, plan_named
-from ground_station.simulator.textures import TextureBank
 
 
 @pytest.fixture(scope="module")
@@ -19,18 +18,17 @@ def corridor():
     return scenes.build("corridor", 10)
 
 
-def _textures(scene, material):
-    bank = TextureBank(scene.texture_seed)
+def _textures(scene, material, bank):
     chosen = [k for k, s in enumerate(scene.surfaces) if s.material == material]
     return [(scene.surfaces[k], surface_albedo(bank, scene, k)) for k in chosen]
 
 
 @pytest.mark.parametrize("text", ["SAFETY", "NEWS", "STAFF"])
-def test_prints_are_equal_in_every_bay(corridor, text):
+def test_prints_are_equal_in_every_bay(corridor, text, bank):
     material = "door" if text == "STAFF" else "poster"
     equal = [
         (surface, texture)
-        for surface, texture in _textures(corridor, material)
+        for surface, texture in _textures(corridor, material, bank)
         if surface.options["text"] == text
     ]
     assert len(equal) == BAYS
@@ -40,8 +38,9 @@ def test_prints_are_equal_in_every_bay(corridor, text):
         assert np.allclose(step, [number * BAY_M, 0, 0])
 
 
-def test_the_paint_differs_from_bay_to_bay(corridor):
-    walls = [t for s, t in _textures(corridor, "plaster") if abs(s.u_m[0]) == BAY_M and s.v_m[2]]
+def test_the_paint_differs_from_bay_to_bay(corridor, bank):
+    painted = _textures(corridor, "plaster", bank)
+    walls = [texture for s, texture in painted if abs(s.u_m[0]) == BAY_M and s.v_m[2]]
     assert len(walls) == 2 * BAYS
     assert all(not np.array_equal(a, b) for a, b in itertools.combinations(walls, 2))
 

@@ -12,7 +12,7 @@ from ground_station.simulator import scenes
 from ground_station.simulator.dynamics import GRAVITY_M_S2, Blimp, BlimpState, fly, step
 from ground_station.simulator.handheld import carry
 from ground_station.simulator.plans import Plan, Reference, plan_named
-from ground_station.simulator.scene import Scene, SimulatorError
+from ground_station.simulator.scene import Scene
 
 DT_S = 1 / 200
 
@@ -59,7 +59,7 @@ def test_its_terminal_speed_is_where_drag_equals_thrust(axis: int) -> None:
 
 def test_a_draught_carries_it_to_the_airs_speed() -> None:
     blimp, state = Blimp.of_build(), at_rest()
-    for _ in range(round(120 / DT_S)):
+    for _ in range(round(60 / DT_S)):
         step(blimp, state, (0.0, 0.0, 0.0), 0.0, (0.0, 0.3, 0.0), DT_S)
     assert state.velocity_m_s[1] == pytest.approx(0.3, rel=0.1)
 
@@ -116,8 +116,3 @@ def test_a_seed_gives_its_flight_again_and_another_seed_another(scene: Scene) ->
 
     assert np.array_equal(positions(3), positions(3))
     assert np.abs(positions(3) - positions(4)).max() > 0.02
-
-
-def test_an_unknown_plan_is_refused_by_name(scene: Scene) -> None:
-    with pytest.raises(SimulatorError, match=r"^plan 'zigzag' is unknown; there are: mapping, "):
-        plan_of("zigzag", scene)

@@ -57,9 +57,8 @@ def test_nothing_is_trained_on_the_materials_that_tell_an_interior() -> None:
     assert judged - shared == images.HELD_OUT and not trained & images.HELD_OUT
 
 
-def test_prints_of_one_plate_are_equal_and_there_are_several() -> None:
+def test_prints_of_one_plate_are_equal_and_there_are_several(bank: TextureBank) -> None:
     scene = interior(1)
-    bank = TextureBank(scene.texture_seed)
     of_plate: dict[int, list[int]] = {}
     for k, surface in enumerate(scene.surfaces):
         if surface.material == "poster" and "print" in surface.options:
@@ -70,9 +69,7 @@ def test_prints_of_one_plate_are_equal_and_there_are_several() -> None:
     assert np.array_equal(a, b)
 
 
-def test_wallpaper_repeats_and_laminate_is_nearly_blank() -> None:
-    bank = TextureBank(3)
-
+def test_wallpaper_repeats_and_laminate_is_nearly_blank(bank: TextureBank) -> None:
     def made(material: str) -> np.ndarray:
         return MATERIALS[material](bank, 212, 212, 100.0, np.random.default_rng(5))[..., 0]
 

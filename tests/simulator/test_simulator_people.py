@@ -32,8 +32,10 @@ def test_one_goes_to_and_fro_and_turns_round() -> None:
 
 def test_their_ways_are_free_of_what_stands_there() -> None:
     scene = scenes.build("atrium", 12.0)
-    crowd = walkers(scene, 30, 100.0, np.random.default_rng(2))
+    crowd, again = (walkers(scene, 30, 100.0, np.random.default_rng(2)) for _ in range(2))
     assert len(crowd) == 30
+    assert all(np.array_equal(a.coat, b.coat) for a, b in zip(crowd, again, strict=True))
+    assert [one.along_m for one in crowd] == [one.along_m for one in again]
     places = np.array([one.place(t)[:2] for one in crowd for t in np.linspace(0, 40, 300)])
     assert (places > 0.3).all() and (places < np.array(scene.size_m[:2]) - 0.3).all()
     for thing in scene.footprints:
@@ -48,16 +50,12 @@ def test_where_there_is_no_room_for_them_it_is_said() -> None:
         walkers(narrow, 5, 100.0, np.random.default_rng(1))
 
 
-def _frames(out: Path, **changes: object) -> list[np.ndarray]:
-    simulate(quick_settings(out, **changes))
-    return [frame.image.astype(int) for frame in open_input(out)]
-
-
-def test_they_are_seen_move_and_come_again_with_their_seed(tmp_path: Path) -> None:
-    empty = _frames(tmp_path / "empty.mcap")
-    crowded = _frames(tmp_path / "crowded.mcap", people=30)
-    again = _frames(tmp_path / "again.mcap", people=30)
-    assert all((a == b).all() for a, b in zip(crowded, again, strict=True))
+def test_they_are_seen_and_move_and_nothing_else_changes(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "crowded.mcap"
+    simulate(quick_settings(out, people=30))
+    empty, crowded = (
+        [frame.image.astype(int) for frame in open_input(path)] for path in (flight, out)
+    )
     changed = [np.abs(a - b) > 40 for a, b in zip(empty, crowded, strict=True)]
     # They hide some of the picture, and of what lies above their heads nothing.
     assert all(0.002 < one.mean() < 0.4 for one in changed)

@@ -47,7 +47,7 @@ def turns_deg(wTc: F64) -> F64:
     return np.degrees([float(poses.rotation_angle(a.T @ b)) for a, b in pairs])
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", range(2))
 def test_stills_are_eight_headings_at_each_of_twelve_places(seed: int) -> None:
     flight = flight_of("stills", seed)
     wTc = true_poses(flight)
@@ -99,9 +99,10 @@ def test_the_wide_lens_sees_a_hundred_degrees_and_is_rendered_whole() -> None:
     assert (pixels > 0).all() and (pixels < [pinhole.width_px - 1, pinhole.height_px - 1]).all()
 
 
-def test_the_halls_panels_are_two_prints_and_its_doors_and_posters_all_differ() -> None:
+def test_the_halls_panels_are_two_prints_and_its_doors_and_posters_all_differ(
+    bank: TextureBank,
+) -> None:
     hall = scenes.build("hall", 10)
-    bank = TextureBank(hall.texture_seed)
     walls = [k for k, s in enumerate(hall.surfaces) if s.size_m == pytest.approx((PANEL_M, ROW_M))]
     assert len(walls) == 160
     plates = {surface_albedo(bank, hall, k).tobytes() for k in walls}
@@ -111,7 +112,7 @@ def test_the_halls_panels_are_two_prints_and_its_doors_and_posters_all_differ() 
         assert len({surface_albedo(bank, hall, k).tobytes() for k in own}) == count
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", range(3))
 def test_a_headset_walks_thirty_metres_and_touches_nothing(seed: int) -> None:
     flight = flight_of("headset", seed)
     wTc = true_poses(flight)
@@ -142,7 +143,7 @@ def test_a_headset_goes_through_rooms_and_comes_back_for_some_seeds_only() -> No
 
 def test_a_calibration_off_by_a_share_is_carried_and_the_true_lens_noted(tmp_path: Path) -> None:
     out, right = tmp_path / "wrong.mcap", tmp_path / "right.mcap"
-    quick = {"scene": "rooms", "plan": "headset", "duration_s": 0.4, "light": "cloudy"}
+    quick = {"scene": "rooms", "plan": "headset", "duration_s": 0.2, "light": "cloudy"}
     simulate(quick_settings(out, lens_error=0.01, **quick))
     simulate(quick_settings(right, **quick))
     reader = RecordingReader(out)
@@ -162,15 +163,11 @@ def test_a_calibration_off_by_a_share_is_carried_and_the_true_lens_noted(tmp_pat
 
 def test_each_still_is_exposed_for_what_it_shows(tmp_path: Path) -> None:
     out = tmp_path / "stills.mcap"
-    simulate(quick_settings(out, scene="hall", plan="stills", duration_s=8.0, rate_hz=None))
-    info = [i for _, i in RecordingReader(out).json(FRAME_INFO_TOPIC)]
-    assert len(info) == 4
-    flight = prepare_flight(
-        quick_settings(out, scene="hall", plan="stills", duration_s=8.0, rate_hz=None)
-    )
-    stamps = [t for t, _ in RecordingReader(out).json(FRAME_INFO_TOPIC)]
-    assert np.diff(stamps).tolist() == [2_000_000_000] * 3
-    assert flight.camera == WIDE_CAMERA
+    settings = quick_settings(out, scene="hall", plan="stills", duration_s=4.0, rate_hz=None)
+    simulate(settings)
+    stamps, info = zip(*RecordingReader(out).json(FRAME_INFO_TOPIC), strict=True)
+    assert np.diff(stamps).tolist() == [2_000_000_000]
+    assert prepare_flight(settings).camera == WIDE_CAMERA
     assert len({i["exposure_s"] for i in info}) > 1
 
 

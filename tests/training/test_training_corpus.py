@@ -1,5 +1,6 @@
 """The rooms on disk: made once, resumable, refused when they are others' or damaged."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,9 +24,15 @@ def painted(seed: int, number: int, places: int, lights: int, size: tuple[int, i
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
+def quickly(monkeypatch) -> None:
+    """Painted rooms, by threads: a new process would have to draw them."""
     monkeypatch.setattr(rooms, "views_of_room", painted)
     monkeypatch.setattr(corpus.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(corpus, "ProcessPoolExecutor", lambda jobs, _: ThreadPoolExecutor(jobs))
+
+
+@pytest.fixture
+def folder(tmp_path, quickly) -> Path:
     for number in range(SETTINGS.rooms):
         corpus._make_shard(SETTINGS, number, corpus.shard_path(tmp_path, number))
     return tmp_path
@@ -39,8 +46,8 @@ def test_a_room_comes_back_nearly_as_it_was_drawn(folder):
     assert corpus.shard_path(folder, 1).stat().st_size < wanted.nbytes / 2
 
 
-def test_a_killed_corpus_goes_on_and_another_is_refused(tmp_path):
-    few = replace(SETTINGS, rooms=1, places=1)
+def test_a_killed_corpus_goes_on_and_another_is_refused(tmp_path, quickly):
+    few = replace(SETTINGS, rooms=2, places=1)
     corpus.make(tmp_path, few, jobs=1)
     path = corpus.shard_path(tmp_path, 0)
     whole = path.read_bytes()
