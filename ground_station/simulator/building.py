@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground_station.arrays import F64
-from ground_station.simulator.scene import Footprint, KnownPoint, Scene
-from ground_station.simulator.surfaces import Surface
+from ground_station.simulator.scene import Footprint, KnownPoint, Scene, Surface
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 OPEN = ("-x", "+x", "-y", "+y", "+z")

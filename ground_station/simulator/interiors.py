@@ -14,8 +14,7 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Scene, SimulatorError
-from ground_station.simulator.surfaces import Surface
+from ground_station.simulator.scene import Scene, SimulatorError, Surface
 
 Rng = np.random.Generator
 

@@ -22,8 +22,7 @@ from scipy import ndimage
 from ground_station.arrays import F32, F64, I64, U8
 from ground_station.simulator import scenes
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-from ground_station.simulator.scene import Scene
-from ground_station.simulator.surfaces import Surface
+from ground_station.simulator.scene import Scene, Surface
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
 _GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels

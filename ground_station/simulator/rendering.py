@@ -18,8 +18,7 @@ import numpy as np
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.simulator.people import Walker
-from ground_station.simulator.scene import SimulatorError
-from ground_station.simulator.surfaces import Surface
+from ground_station.simulator.scene import SimulatorError, Surface
 
 _ATLAS_TEXELS = 2048
 _GUTTER_TEXELS = 8  # repeated border around each texture, so that mipmaps don't mix neighbours

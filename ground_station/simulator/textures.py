@@ -236,7 +236,7 @@ def sky(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: An
     return np.asarray(blue * (1 - cloud[..., None]) + white * cloud[..., None], np.float32)
 
 
-def frame(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+def door(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """A door leaf: frame, panels, handle, and a number plate."""
     image = wood(b, rows, columns, scale, rng, upright=True, rgb=o.get("rgb", (0.30, 0.17, 0.09)))
     border = round(0.14 * scale)
@@ -373,23 +373,8 @@ def screen(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     return image
 
 
-Material = Callable[..., F32]
-MATERIALS: dict[str, Material] = {
-    "plaster": plaster,
-    "concrete": concrete,
-    "terrazzo": terrazzo,
-    "wood": wood,
-    "brick": brick,
-    "fabric": fabric,
-    "metal": metal,
-    "foliage": foliage,
-    "sky": sky,
-    "door": frame,
-    "poster": poster,
-    "carpet": carpet,
-    "tiles": tiles,
-    "wallpaper": wallpaper,
-    "laminate": laminate,
-    "panelling": panelling,
-    "screen": screen,
-}
+_PAINTERS: tuple[Callable[..., F32], ...] = (
+    plaster, concrete, terrazzo, wood, brick, fabric, metal, foliage, sky, door, poster, carpet,
+    tiles, wallpaper, laminate, panelling, screen,
+)  # fmt: skip
+MATERIALS = {painter.__name__: painter for painter in _PAINTERS}

@@ -19,8 +19,8 @@ from ground_station.simulator import simulate as flights
 from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
 from ground_station.simulator.rendering import SceneRenderer
+from ground_station.simulator.scene import Surface
 from ground_station.simulator.simulate import simulate
-from ground_station.simulator.surfaces import Surface
 from ground_station.simulator.textures import TextureBank
 
 TEXELS_PER_M = 100
