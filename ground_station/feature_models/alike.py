@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ground_station.feature_models.graph import Graph, fold_batch_norm
-from ground_station.feature_models.weights import Weights, WeightsError
+from ground_station.feature_models.torch_file import Weights, WeightsError
 from ground_station.features.model_info import ModelInfo
 
 _SIZES = {

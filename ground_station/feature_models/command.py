@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ground_station.files import write_json
 
 if TYPE_CHECKING:
-    from ground_station.feature_models.comparison import Comparison
+    from ground_station.feature_models.quantize import Comparison
     from ground_station.features.model_info import Model
 
 _FRAMES = (4, 512)
@@ -143,7 +143,7 @@ def _import(args: argparse.Namespace) -> dict[str, Any]:
 def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     import hashlib
 
-    from ground_station.feature_models import comparison, importer, quantize
+    from ground_station.feature_models import importer, quantize
     from ground_station.features import catalogue, extractors
     from ground_station.features.extractor import FeatureError
     from ground_station.features.model_info import Model
@@ -163,12 +163,12 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     reference = catalogue.find(args.model)
     quantize.check(reference)
     wanted = parse_range(args.range) if args.range else None
-    images = comparison.evenly(open_input(args.calibrate, args.rate_hz, wanted), args.frames)
+    images = quantize.evenly(open_input(args.calibrate, args.rate_hz, wanted), args.frames)
     if len(images) < 2:
         raise FeatureError(f"{args.calibrate}: {len(images)} frames; at least 2 are needed")
     data, info = quantize.int8(reference, images[::2], name)
     made = Model(catalogue.path_for(name), info, data, hashlib.sha256(data).hexdigest())
-    result = comparison.compare(reference, made, images[1::2], args.threads, args.seed)
+    result = quantize.compare(reference, made, images[1::2], args.threads, args.seed)
     described = _described(importer.add(data, info))
     _print_comparison(reference, made, result, args.threads)
     return {"model": described, "reference": args.model, **_document(result, args)}

@@ -6,7 +6,6 @@ noise, compression. Pictures are grey, (H, W), uint8 outside and float32 0..1 in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 
 import av
@@ -61,41 +60,32 @@ def round_trip(pictures: list[U8], quantizer: int) -> U8:
 Rng = np.random.Generator
 
 
-@dataclass(frozen=True)
-class Chances:
-    """How often each thing happens to a view; what happens is then of a random strength."""
-
-    light: float = 0.7
-    shadow: float = 0.35
-    defocus: float = 0.35
-    motion: float = 0.35
-    tone: float = 0.85
-    noise: float = 0.8
-    compression: float = 0.55
+_LIGHT, _SHADOW, _DEFOCUS, _MOTION = 0.7, 0.35, 0.35, 0.35
+_TONE, _NOISE, _COMPRESSION = 0.85, 0.8, 0.55
+"""How often each happens to a view; it is then of a random strength."""
 
 
-def degrade(picture: U8, rng: Rng, chances: Chances | None = None) -> U8:
+def degrade(picture: U8, rng: Rng) -> U8:
     """A picture (H, W), H and W even, as a payload in other light might have sent it."""
-    c = chances or Chances()
     linear = (picture.astype(np.float32) * np.float32(1 / 255)) ** np.float32(2.2)
-    if rng.random() < c.light:
+    if rng.random() < _LIGHT:
         linear *= light(linear.shape, rng)
-    if rng.random() < c.shadow:
+    if rng.random() < _SHADOW:
         linear *= shadow(linear.shape, rng)
-    if rng.random() < c.defocus:
+    if rng.random() < _DEFOCUS:
         linear = defocus(linear, float(rng.gamma(2.0, 0.45)))
     motion = np.zeros(2)
-    if rng.random() < c.motion:
+    if rng.random() < _MOTION:
         motion = rng.normal(0, 1, 2) * rng.uniform(0.5, 4)
         linear = motion_blur(linear, motion)
     # A blur by a Fourier transform leaves black a little below nought, which has no power.
     linear = np.maximum(linear, 0)
-    tone = rng.random() < c.tone
+    tone = rng.random() < _TONE
     code = developed(linear, rng) if tone else linear ** np.float32(1 / 2.2)
-    if rng.random() < c.noise:
+    if rng.random() < _NOISE:
         code = noisy(code, rng)
     result = quantized(code)
-    if rng.random() < c.compression:
+    if rng.random() < _COMPRESSION:
         # The frame before was taken a little elsewhere, and has another noise.
         step = np.array([[1, 0, 2 * motion[0]], [0, 1, 2 * motion[1]]], np.float32)
         before = cv2.warpAffine(

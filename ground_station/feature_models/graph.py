@@ -72,31 +72,20 @@ class Graph:
         self._weights[label] = numpy_helper.from_array(np.ascontiguousarray(array), label)
         return label
 
-    def conv(
-        self,
-        x: str,
-        weight: Array,
-        bias: Array | None = None,
-        stride: int = 1,
-        padding: int | None = None,
-    ) -> str:
-        """Cross-correlation with weight (out, in, height, width) and bias (out,).
+    def conv(self, x: str, weight: Array, bias: Array | None = None, stride: int = 1) -> str:
+        """Cross-correlation with weight (out, in, height, width), both odd, and bias (out,).
 
-        `padding` is zeros on each side; None keeps the size at stride 1 (odd kernels).
+        As many zeros stand around as keep the size at stride 1.
         """
         high, wide = weight.shape[2:]
-        pads = [high // 2, wide // 2] * 2 if padding is None else [padding] * 4
         label = self._next("Conv")
         inputs = [x, self.weight(f"{label}.weight", weight)]
         if bias is not None:
             inputs.append(self.weight(f"{label}.bias", bias))
         return self.node(
-            "Conv",
-            inputs,
-            kernel_shape=[high, wide],
-            strides=[stride, stride],
-            pads=pads,
-        )
+            "Conv", inputs, kernel_shape=[high, wide], strides=[stride, stride],
+            pads=[high // 2, wide // 2] * 2,
+        )  # fmt: skip
 
     def scale_shift(self, x: str, scale: Array, shift: Array) -> str:
         """scale · x + shift, both (C,): a batch normalisation that no convolution precedes."""

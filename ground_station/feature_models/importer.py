@@ -7,9 +7,8 @@ from pathlib import Path
 
 from ground_station import files
 from ground_station.feature_models import alike, scale, superpoint, torch_file
-from ground_station.feature_models.weights import WeightsError
+from ground_station.feature_models.torch_file import WeightsError
 from ground_station.features import catalogue, extractors, inspection
-from ground_station.features import model as models
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model, ModelInfo
 
@@ -64,4 +63,4 @@ def add(data: bytes, info: ModelInfo) -> Model:
     except OSError as error:
         raise FeatureError(f"{path}: {error.strerror or error}") from None
     files.write_bytes(path, data)
-    return models.read(path)
+    return inspection.read(path)

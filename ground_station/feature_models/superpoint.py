@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Final
 
 from ground_station.feature_models.graph import Graph, batch_norm_terms, fold_batch_norm
-from ground_station.feature_models.weights import Weights
+from ground_station.feature_models.torch_file import Weights
 from ground_station.features.model_info import ModelInfo
 
 _WIDTHS: Final = (64, 64, 128, 128)

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from ground_station import user_folders
-from ground_station.features import model, model_info
+from ground_station.features import model_info
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model
 
@@ -36,8 +36,10 @@ def find(name: str) -> Model:
     """The model of that name, read and checked.
 
     Raises `FeatureError` with one line: there is none, there are two that differ, the file is
-    called otherwise than the model in it, or it is none (see `model.read`).
+    called otherwise than the model in it, or it is none (see `inspection.read`).
     """
+    from ground_station.features import inspection  # with onnx, which only models need
+
     found = [path for folder in (SHIPPED, users()) for path in _files(folder) if path.stem == name]
     if not found:
         known = ", ".join(names()) or "none"
@@ -45,7 +47,7 @@ def find(name: str) -> Model:
             f"features: there is no model '{name:.80}' (known: {known});"
             " blimp models import FILE brings one"
         )
-    models = [model.read(path) for path in found]
+    models = [inspection.read(path) for path in found]
     if len({each.sha256 for each in models}) > 1:
         raise FeatureError(
             f"features: two models are named '{name}', {found[0]} and {found[1]}; "

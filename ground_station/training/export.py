@@ -61,7 +61,7 @@ class _OnnxOperations(Operations):
 
     def conv(self, layer: Conv, x: str) -> str:
         weight, bias = _folded(layer, self._weights)
-        return self._graph.conv(x, weight, bias, stride=layer.stride, padding=layer.size // 2)
+        return self._graph.conv(x, weight, bias, stride=layer.stride)
 
     def relu(self, x: str) -> str:
         return self._graph.relu(x)

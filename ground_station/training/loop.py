@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 import torch
 
-from ground_station.features import catalogue, model
+from ground_station.feature_models.homographic import NEAR_PX, compared
+from ground_station.features import catalogue, inspection
 from ground_station.features.blobs import BlobFeatures
 from ground_station.features.extractor import Extractor
 from ground_station.features.extractors import of_network
@@ -22,7 +23,7 @@ from ground_station.features.inference import Network
 from ground_station.features.methods.rootsift import RootSift
 from ground_station.features.settings import LearnedSettings
 from ground_station.progress import Progress, stop_noted
-from ground_station.training import checkpoint, corpus, curve, validation
+from ground_station.training import checkpoint, corpus, curve
 from ground_station.training.batches import Source, held_out
 from ground_station.training.errors import TrainingError
 from ground_station.training.export import export
@@ -160,7 +161,7 @@ class _Run:
             "rootsift": RootSift(_MOST_POINTS), "wren": of_network(wren, _MOST_POINTS)
         }  # fmt: skip
         for name, extractor in others.items():
-            figures = validation.figures(extractor, self.held)
+            figures = figures_of(extractor, self.held)
             self.log.add("baseline", step=step, name=name, **asdict(figures))
             _say(name, figures)
 
@@ -220,10 +221,10 @@ class _Run:
         source = f"blimp models train, seed {self.recipe.seed}, {pairs} pairs"
         weights, shape = self.trainer.weights(), self.trainer.shape
         export(shape, weights, self.model, source)
-        network = Network(model.read(self.model), threads=self.machine.threads)
+        network = Network(inspection.read(self.model), threads=self.machine.threads)
         self.compare(network)
         extractor = BlobFeatures(network, _MOST_POINTS, LearnedSettings())
-        figures = validation.figures(extractor, self.held)
+        figures = figures_of(extractor, self.held)
         _say(f"step {step}", figures)
         values = asdict(figures)
         self.log.add("validation", step=step, **values, seconds=round(self.seconds, 1))
@@ -247,7 +248,40 @@ class _Run:
                 raise TrainingError(f"{self.model}: its {name} differ from torch's by {gap:.2g}")
 
 
-def _say(name: str, figures: validation.Figures) -> None:
+@dataclass(frozen=True)
+class Figures:
+    """Means over pairs: `accuracy` the share of mutual nearest matches that are within 3 px,
+    `correct` their number; `repeatability` the share of key points in both views' common part that
+    lie within 3 px of one of the other's; `error_px` their median distance."""
+
+    accuracy: float
+    correct: float
+    repeatability: float
+    error_px: float
+
+
+def figures_of(extractor: Extractor, pairs: Batch) -> Figures:
+    """How well an extractor finds a view's key points again in the other; no lens may bend them.
+
+    See `feature_models.homographic` for what counts as a match.
+    """
+    images = (pairs.images[:, 0] * 255).round().to(torch.uint8).numpy()
+    matrices = (pairs.views.from_picture[1::2] @ pairs.views.to_picture[::2]).double().numpy()
+    found = [
+        compared(extractor, images[2 * k], images[2 * k + 1], matrix / matrix[2, 2])
+        for k, matrix in enumerate(matrices)
+    ]
+    pooled = np.concatenate([each.nearest_px for each in found])
+    pooled = pooled[pooled <= NEAR_PX]
+    return Figures(
+        accuracy=float(np.mean([each.accuracy for each in found])),
+        correct=float(np.mean([each.correct for each in found])),
+        repeatability=float(np.mean([each.repeatability for each in found])),
+        error_px=float(np.median(pooled)) if len(pooled) else float("nan"),
+    )
+
+
+def _say(name: str, figures: Figures) -> None:
     print(
         f"{name}: {100 * figures.accuracy:.1f} % of matches within 3 px ({figures.correct:.0f} a "
         f"pair), repeatability {100 * figures.repeatability:.1f} %, {figures.error_px:.2f} px",

@@ -44,7 +44,6 @@ def test_convolutions_are_the_references() -> None:
     assert close(ran(lambda g, x: g.conv(x, weight, bias), 5), wanted)
     # With stride 2 every second pixel of the same is left, from the first on.
     assert close(ran(lambda g, x: g.conv(x, weight, bias, stride=2), 5), wanted[..., ::2, ::2])
-    assert close(ran(lambda g, x: g.conv(x, weight, bias, padding=0), 5), wanted[..., 1:-1, 1:-1])
 
 
 def test_pools_and_gates_are_the_references() -> None:

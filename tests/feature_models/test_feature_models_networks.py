@@ -15,9 +15,10 @@ from reference import networks
 from safetensors.numpy import save
 
 from ground_station.feature_models import importer, torch_file
-from ground_station.feature_models.weights import WeightsError
-from ground_station.features import catalogue, detection, model
+from ground_station.feature_models.torch_file import WeightsError
+from ground_station.features import catalogue, detection
 from ground_station.features.extractor import FeatureError
+from ground_station.features.model_info import Model
 
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
 RNG = np.random.default_rng(9)
@@ -37,13 +38,13 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def brought(tmp_path: Path, data: bytes, name: str | None = None) -> model.Model:
+def brought(tmp_path: Path, data: bytes, name: str | None = None) -> Model:
     path = tmp_path / "weights.pth"
     path.write_bytes(data)
     return importer.import_weights(path, name)
 
 
-def outputs(found: model.Model, image: np.ndarray) -> list[np.ndarray]:
+def outputs(found: Model, image: np.ndarray) -> list[np.ndarray]:
     names = ["logits" if found.info.layout == "cells" else "scores", "descriptors"]
     session = onnxruntime.InferenceSession(found.data, providers=["CPUExecutionProvider"])
     return [np.asarray(v[0]) for v in session.run(names, {"image": image.astype(np.float32)[None]})]

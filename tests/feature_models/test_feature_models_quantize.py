@@ -12,9 +12,10 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from ground_station.feature_models import comparison, homographic, quantize
-from ground_station.features import inference, model
+from ground_station.feature_models import homographic, quantize
+from ground_station.features import inference, inspection
 from ground_station.features.extractor import FeatureError
+from ground_station.features.model_info import Model
 
 
 def picture(seed: int, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
@@ -31,29 +32,29 @@ IMAGES = [picture(seed) for seed in range(4)]
 
 
 @pytest.fixture(scope="module", params=["cells", "pixels"])
-def fp32(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> model.Model:
+def fp32(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Model:
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "cells":
-        return model.read(made_up.write_cells(folder, made_up.info(), (32, 32, 64)))
+        return inspection.read(made_up.write_cells(folder, made_up.info(), (32, 32, 64)))
     about = made_up.info(layout="pixels", multiple=32)
-    return model.read(made_up.write_pixels(folder, about))
+    return inspection.read(made_up.write_pixels(folder, about))
 
 
-def made(fp32: model.Model, folder: Path) -> model.Model:
+def made(fp32: Model, folder: Path) -> Model:
     data, info = quantize.int8(fp32, IMAGES, "made-up-int8")
     path = folder / f"{info.name}.onnx"
     path.write_bytes(data)
-    return model.read(path)
+    return inspection.read(path)
 
 
-def outputs(found: model.Model, image: np.ndarray) -> dict[str, np.ndarray]:
+def outputs(found: Model, image: np.ndarray) -> dict[str, np.ndarray]:
     session = onnxruntime.InferenceSession(found.data, providers=["CPUExecutionProvider"])
     names = [each.name for each in session.get_outputs()]
     blob = inference.network_input(found.info, image)
     return dict(zip(names, session.run(names, {"image": blob}), strict=True))
 
 
-def test_a_form_says_nearly_what_the_model_says(tmp_path: Path, fp32: model.Model) -> None:
+def test_a_form_says_nearly_what_the_model_says(tmp_path: Path, fp32: Model) -> None:
     found = made(fp32, tmp_path)
     whole, less = outputs(fp32, IMAGES[0]), outputs(found, IMAGES[0])
     assert whole.keys() == less.keys()
@@ -62,9 +63,7 @@ def test_a_form_says_nearly_what_the_model_says(tmp_path: Path, fp32: model.Mode
         assert 0 < error < 0.1, (name, error)
 
 
-def test_an_int8_form_computes_with_integers_but_for_the_heads(
-    tmp_path: Path, fp32: model.Model
-) -> None:
+def test_an_int8_form_computes_with_integers_but_for_the_heads(tmp_path: Path, fp32: Model) -> None:
     graph = onnx.load_model_from_string(made(fp32, tmp_path).data).graph
     makers = {name: node.op_type for node in graph.node for name in node.output}
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
@@ -77,7 +76,7 @@ def test_an_int8_form_computes_with_integers_but_for_the_heads(
         assert np.all(np.abs(array.astype(int)).max(axis=(1, 2, 3)) == 64)
 
 
-def test_a_form_is_a_model_of_its_own(tmp_path: Path, fp32: model.Model) -> None:
+def test_a_form_is_a_model_of_its_own(tmp_path: Path, fp32: Model) -> None:
     found = made(fp32, tmp_path)
     assert found.info.name == "made-up-int8" and found.sha256 != fp32.sha256
     assert found.info.source.endswith(f"; int8 of made-up {fp32.sha256[:16]}")
@@ -86,7 +85,7 @@ def test_a_form_is_a_model_of_its_own(tmp_path: Path, fp32: model.Model) -> None
         quantize.int8(found, IMAGES, "again")
 
 
-def test_without_pictures_nothing_is_quantized(fp32: model.Model) -> None:
+def test_without_pictures_nothing_is_quantized(fp32: Model) -> None:
     with pytest.raises(FeatureError, match="needs pictures to calibrate by"):
         quantize.int8(fp32, [], "x")
 
@@ -120,15 +119,15 @@ def test_frames_are_taken_evenly_in_one_pass() -> None:
             return None
 
     for total, wanted in ((3, 3), (8, 8), (100, 8), (1001, 8)):
-        kept = comparison.evenly(Source(total), 8)
+        kept = quantize.evenly(Source(total), 8)
         assert len(kept) == wanted
-    numbers = [int(image[0, 0]) for image in comparison.evenly(Source(200), 8)]
+    numbers = [int(image[0, 0]) for image in quantize.evenly(Source(200), 8)]
     gaps = np.diff(numbers)
     assert numbers[0] == 0 and numbers[-1] > 160 and gaps.max() <= 2 * gaps.min()
 
 
-def test_a_model_beside_itself_loses_nothing(fp32: model.Model) -> None:
-    result = comparison.compare(fp32, fp32, IMAGES[:2], threads=1, seed=4)
+def test_a_model_beside_itself_loses_nothing(fp32: Model) -> None:
+    result = quantize.compare(fp32, fp32, IMAGES[:2], threads=1, seed=4)
     assert result.reference == result.variant and result.pairs == 2
     assert result.reference.matches > 10 and 0 <= result.reference.accuracy <= 1
     assert result.time_ratio == result.variant_ms / result.reference_ms > 0
@@ -136,7 +135,7 @@ def test_a_model_beside_itself_loses_nothing(fp32: model.Model) -> None:
 
 def test_a_model_with_other_weights_loses_accuracy(tmp_path: Path) -> None:
     """The measure tells a good model from a spoilt one: descriptors that know nothing."""
-    fp32 = model.read(made_up.write_cells(tmp_path, made_up.info(), (32, 32, 64)))
+    fp32 = inspection.read(made_up.write_cells(tmp_path, made_up.info(), (32, 32, 64)))
     proto = onnx.load_model_from_string(fp32.data)
     for tensor in proto.graph.initializer:
         values = numpy_helper.to_array(tensor)
@@ -145,6 +144,6 @@ def test_a_model_with_other_weights_loses_accuracy(tmp_path: Path) -> None:
                 values * np.float32(1e-30) + np.arange(16, dtype=np.float32)[:, None, None, None]
             )
             tensor.CopyFrom(numpy_helper.from_array(spoilt, tensor.name))
-    bad = model.Model(fp32.path, fp32.info, proto.SerializeToString(), "0" * 64)
-    result = comparison.compare(fp32, bad, IMAGES, threads=1, seed=4)
+    bad = Model(fp32.path, fp32.info, proto.SerializeToString(), "0" * 64)
+    result = quantize.compare(fp32, bad, IMAGES, threads=1, seed=4)
     assert result.variant.accuracy < result.reference.accuracy - 0.1

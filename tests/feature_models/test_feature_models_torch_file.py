@@ -13,7 +13,7 @@ import torch_files as made
 from safetensors.numpy import save
 
 from ground_station.feature_models import pickle_subset, torch_file
-from ground_station.feature_models.weights import Weights, WeightsError
+from ground_station.feature_models.torch_file import Weights, WeightsError
 
 RNG = np.random.default_rng(5)
 TENSORS = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference import plain_superpoint
 
-from ground_station.features import blobs, model
+from ground_station.features import blobs, inspection
 from ground_station.features.blobs import BlobFeatures
 from ground_station.features.inference import Network
 from ground_station.features.settings import LearnedSettings
@@ -79,7 +79,7 @@ def test_the_strongest_are_kept_apart_and_off_the_border():
 def extractor(tmp_path_factory):
     about = made_up.info(layout="blobs", details=6)
     path = made_up.write_blobs(tmp_path_factory.mktemp("blobs"), about)
-    return BlobFeatures(Network(model.read(path)), 30, LearnedSettings())
+    return BlobFeatures(Network(inspection.read(path)), 30, LearnedSettings())
 
 
 def test_blobs_are_described_and_ranked_by_what_the_network_says_of_the_padded_picture(extractor):

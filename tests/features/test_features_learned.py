@@ -12,7 +12,7 @@ import onnxruntime
 import pytest
 from reference import plain_alike, plain_superpoint
 
-from ground_station.features import extractors, inference, model
+from ground_station.features import extractors, inference, inspection
 from ground_station.features.extractor import FeatureError
 from ground_station.features.inference import Network
 from ground_station.features.learned import CellFeatures, PixelFeatures
@@ -29,13 +29,13 @@ def image():
 @pytest.fixture(scope="module")
 def cells(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cells")
-    return model.read(made_up.write_cells(folder, made_up.info(subpixel_px=2)))
+    return inspection.read(made_up.write_cells(folder, made_up.info(subpixel_px=2)))
 
 
 @pytest.fixture(scope="module")
 def pixels(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pixels")
-    return model.read(made_up.write_pixels(folder, made_up.info(layout="pixels", multiple=32)))
+    return inspection.read(made_up.write_pixels(folder, made_up.info(layout="pixels", multiple=32)))
 
 
 def outputs(file, whole):
@@ -79,7 +79,7 @@ def test_pixels_are_alikes_method_on_the_padded_picture(pixels, image):
 
 def test_what_the_model_says_counts_and_settings_count_more(tmp_path, image):
     about = made_up.info(nms_px=8, threshold=0.02)
-    network = Network(model.read(made_up.write_cells(tmp_path, about)))
+    network = Network(inspection.read(made_up.write_cells(tmp_path, about)))
     own = CellFeatures(network, 500, LearnedSettings())
     assert (own.nms_px, own.threshold) == (8, 0.02)
     denser = CellFeatures(network, 500, LearnedSettings(nms_px=2, threshold=0.001))
@@ -122,12 +122,12 @@ def test_weights_that_are_no_numbers_give_no_features(tmp_path, image):
     for tensor in proto.graph.initializer:
         tensor.raw_data = np.full(len(tensor.raw_data) // 4, np.nan, np.float32).tobytes()
     path.write_bytes(proto.SerializeToString())
-    found = CellFeatures(Network(model.read(path)), 100, LearnedSettings()).extract(image)
+    found = CellFeatures(Network(inspection.read(path)), 100, LearnedSettings()).extract(image)
     assert len(found) == 0
 
 
 def test_a_picture_without_anything_has_no_features(tmp_path):
-    network = Network(model.read(made_up.write_cells(tmp_path, made_up.info())))
+    network = Network(inspection.read(made_up.write_cells(tmp_path, made_up.info())))
     found = CellFeatures(network, 100, LearnedSettings(threshold=0.5)).extract(
         np.zeros((48, 64), np.uint8)
     )

@@ -11,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from ground_station.feature_models.graph import Graph
-from ground_station.features import inspection, model
+from ground_station.features import inspection
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import ModelInfo
 
@@ -31,12 +31,12 @@ def change(path, edit):
 
 def refused(path, reason):
     with pytest.raises(FeatureError, match=reason) as caught:
-        model.read(path)
+        inspection.read(path)
     assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
 
 
 def test_what_was_written_is_read(path):
-    found = model.read(path)
+    found = inspection.read(path)
     assert found.info == made_up.info(threshold=0.01, nms_px=3, subpixel_px=2, distance_scale=1.5)
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert ModelInfo.of_metadata(found.info.metadata()) == found.info
@@ -44,17 +44,17 @@ def test_what_was_written_is_read(path):
 
 def test_models_of_pixels_and_of_blobs_are_read(tmp_path):
     about = made_up.info(layout="pixels", multiple=32)
-    assert model.read(made_up.write_pixels(tmp_path, about)).info == about
+    assert inspection.read(made_up.write_pixels(tmp_path, about)).info == about
     about = made_up.info("spots", layout="blobs", details=6)
     path = made_up.write_blobs(tmp_path, about)
-    assert model.read(path).info == about
+    assert inspection.read(path).info == about
     proto = onnx.load(path)
     for item in proto.metadata_props:
         if item.key == "blimp.details":
             item.value = "5"
     onnx.save(proto, path)
     with pytest.raises(FeatureError, match=r"'descriptors' has the shape 1x10x16x16"):
-        model.read(path)
+        inspection.read(path)
     with pytest.raises(FeatureError, match=r"details is 0; allowed: 1 to 15"):
         made_up.info(layout="blobs")
     with pytest.raises(FeatureError, match=r"details is 6; allowed: 0 to 0"):
@@ -101,7 +101,7 @@ def test_a_missing_a_foreign_a_cut_and_a_large_file_are_refused(path, tmp_path, 
     for share in (0.1, 0.5, 0.9, 0.999):
         other.write_bytes(whole[: int(share * len(whole))])
         refused(other, ".")
-    monkeypatch.setattr(model, "MAX_BYTES", 1000)
+    monkeypatch.setattr(inspection, "MAX_BYTES", 1000)
     refused(path, "more than 1000 bytes")
 
 
@@ -209,7 +209,7 @@ def test_a_fixed_size_and_an_output_of_another_are_refused(path, tmp_path):
 
 def test_what_a_network_takes_is_counted(tmp_path):
     path = made_up.write_cells(tmp_path, made_up.info(), widths=(8, 12, 16))
-    found = model.read(path)
+    found = inspection.read(path)
     pixels = 640 * 480
     expected = pixels * 9 * (8 + 8 * 12 / 4 + 12 * 16 / 16) + pixels / 64 * 16 * (65 + 16)
     assert inspection.macs(found.data, found.info) == pytest.approx(expected)
@@ -225,7 +225,7 @@ def test_flipped_bytes_are_read_or_refused_in_one_line(path):
             broken[place] ^= 1 << rng.integers(0, 8)
         path.write_bytes(broken)
         try:
-            model.read(path)
+            inspection.read(path)
         except FeatureError as error:
             refusals += 1
             assert "\n" not in str(error) and len(str(error)) < 500

@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch", reason="training's tests need torch, an opt
 
 from ground_station.feature_models import images  # noqa: E402
 from ground_station.features import blobs, sampling  # noqa: E402
-from ground_station.training import peaks  # noqa: E402
+from ground_station.training import losses  # noqa: E402
 from ground_station.training.losses import (  # noqa: E402
     LossSettings,
     anywhere_loss,
@@ -27,12 +27,12 @@ def test_blobs_are_those_of_extraction():
     size = (120, 160)
     for number in range(4):
         picture = images.procedural(5, number, size)
-        ours = peaks.responses(torch.from_numpy(picture)[None, None].float() / 255)
+        ours = losses.responses(torch.from_numpy(picture)[None, None].float() / 255)
         theirs = blobs.responses(picture)
         assert np.abs(ours[0].numpy() - theirs).max() < 1e-5
         both = torch.from_numpy(theirs)[None]
         everywhere = torch.ones(1, *size, dtype=torch.bool)
-        places, heights = peaks.strongest(both, 2, 150, everywhere, torch.ones(1, *size))
+        places, heights = losses.strongest(both, 2, 150, everywhere, torch.ones(1, *size))
         found, _ = blobs.strongest(theirs, 2, 150)
         kept = places[0][heights[0] > 0].numpy()
         assert len(kept) > 50
@@ -49,13 +49,13 @@ def test_where_and_favour_choose_the_blobs():
     where, favour = torch.ones(1, 64, 64, dtype=torch.bool), torch.ones(1, 64, 64)
     where[0, 20, 20] = False
     favour[0, 40, 20] = 9
-    places, heights = peaks.strongest(values, 2, 2, where, favour)
+    places, heights = losses.strongest(values, 2, 2, where, favour)
     assert places[0].tolist() == [[20, 40], [40, 20]] and heights[0].tolist() == [
         pytest.approx(0.1), pytest.approx(0.2),
     ]  # fmt: skip
-    assert (peaks.strongest(values, 2, 5, where, favour)[1][0, 2:] == 0).all()
+    assert (losses.strongest(values, 2, 5, where, favour)[1][0, 2:] == 0).all()
     values[0, 0, 40, 20] = 0.15  # higher at the scale beside it
-    found = peaks.strongest(values, 2, 5, where, favour)
+    found = losses.strongest(values, 2, 5, where, favour)
     assert found[0][0, 0].tolist() == [20, 40] and found[1][0, 0] == pytest.approx(0.15)
     assert (found[1][0] > 0).sum() == 2
 

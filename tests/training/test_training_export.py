@@ -7,7 +7,7 @@ import pytest
 import training_models
 
 from ground_station.feature_models import images
-from ground_station.features import model
+from ground_station.features import inspection
 from ground_station.features.blobs import BlobFeatures
 from ground_station.features.inference import Network
 from ground_station.features.settings import LearnedSettings
@@ -52,7 +52,7 @@ def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
     for path in paths:
         export.export(shape, training_models.weights(shape), path, "a test")
     assert paths[0].read_bytes() == paths[1].read_bytes()
-    read = model.read(paths[0])
+    read = inspection.read(paths[0])
     assert (read.info.name, read.info.layout, read.info.dimension) == ("lark", "blobs", 64)
     picture = images.procedural(1, 0, (120, 168))  # no multiple of 16: it is padded
     found = BlobFeatures(Network(read), 200, LearnedSettings()).extract(picture)
@@ -69,7 +69,7 @@ def test_normalisation_is_folded_into_the_weights(tmp_path):
     path = tmp_path / "lark.onnx"
     export.export(shape, weights, path, "a test")
     picture = np.random.default_rng(0).random((1, 1, 32, 48)).astype(np.float32)
-    said = Network(model.read(path)).run(picture)
+    said = Network(inspection.read(path)).run(picture)
     wanted = shape.build(Reference(weights), picture[0].astype(np.float64))
     for name, values in zip(OUTPUTS, wanted, strict=True):
         assert said[name][0] == pytest.approx(values, abs=1e-3)

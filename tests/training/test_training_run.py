@@ -215,7 +215,7 @@ def test_a_branch_ends_a_run_from_any_checkpoint(made, straight, tmp_path):
 
 
 def test_the_file_says_what_torch_says(torch, tmp_path):
-    from ground_station.features import model
+    from ground_station.features import inspection
     from ground_station.features.inference import Network
     from ground_station.training import export
     from ground_station.training.network import FeatureNetwork, exported
@@ -230,7 +230,7 @@ def test_the_file_says_what_torch_says(torch, tmp_path):
     path = tmp_path / "x.onnx"
     shape = SHAPES["lark"]
     export.export(shape, exported(shape, network.state_dict()), path, "a test")
-    said = Network(model.read(path)).run(image.numpy())
+    said = Network(inspection.read(path)).run(image.numpy())
     with torch.no_grad():
         wanted = network(image)
     for name, ours in zip(OUTPUTS, wanted, strict=True):

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="training's tests need torch, an opt
 
 from ground_station.feature_models import images  # noqa: E402
 from ground_station.features.methods.rootsift import RootSift  # noqa: E402
-from ground_station.training import pairs, validation, views  # noqa: E402
+from ground_station.training import loop, pairs, views  # noqa: E402
 from ground_station.training.degradation import degraded  # noqa: E402
 from ground_station.training.views import Chance, Views  # noqa: E402
 
@@ -138,11 +138,11 @@ def test_the_figures_of_validation_are_those_of_the_truth():
     eye = torch.eye(3)
     truth = Views(torch.stack([eye, eye]), torch.stack([eye, matrix]), torch.zeros(2), size)
     batch = replace(pairs.make(places(), Chance(CPU, 1), 1, VIEW, 32), images=both, views=truth)
-    right = validation.figures(RootSift(200), batch)
+    right = loop.figures_of(RootSift(200), batch)
     assert right.accuracy > 0.9 and right.repeatability > 0.8 and right.correct > 20
     assert right.error_px < 0.1
     # A truth that is wrong by 20 px makes all of it chance.
     off = matrix + torch.tensor([[0, 0, 20.0], [0, 0, 0], [0, 0, 0]])
     wrong = replace(batch, views=replace(truth, from_picture=torch.stack([eye, off])))
-    chance = validation.figures(RootSift(200), wrong)
+    chance = loop.figures_of(RootSift(200), wrong)
     assert chance.accuracy < 0.2 and chance.error_px > 0.5

@@ -1,4 +1,4 @@
-"""`ground_station.features.model`: ONNX files, looked through before anything of them is run."""
+"""`features.inspection.read`: ONNX files, looked through before anything of them is run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import onnx
 from onnx import helper
 from pieces import Picker, as_json, odd, refusing, scratch
 
-from ground_station.features import inspection, model, model_info
+from ground_station.features import inspection, model_info
 from ground_station.features.extractor import FeatureError
 
 _FILE = scratch("model") / "made-up.onnx"
@@ -88,7 +88,7 @@ def fuzz(data: bytes) -> None:
         content = proto.SerializeToString()
     _FILE.write_bytes(content)
     with refusing(FeatureError):
-        read = model.read(_FILE)
+        read = inspection.read(_FILE)
         assert read.data == content and len(read.sha256) == 64
         assert 2 <= read.info.dimension <= 1024 and read.info.layout in model_info.LAYOUTS
         assert inspection.macs(read.data, read.info) < 1e12

@@ -13,7 +13,7 @@ from pieces import Picker, blocks, refusing, scratch, stretch
 from safetensors.numpy import save
 
 from ground_station.feature_models import alike, superpoint, torch_file
-from ground_station.feature_models.weights import WeightsError
+from ground_station.feature_models.torch_file import WeightsError
 from readers import safetensors_file
 from readers.safetensors_file import array
 
