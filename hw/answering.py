@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hw import inverse, output, tables
-from hw.builds import Conditions, with_ballast
+from hw.builds import Conditions, shipped_builds, with_ballast
 from hw.buoyancy import THESIS_GROSS_G, gross_lift_g, gross_of, margin_g, reckon
-from hw.catalogue import shipped_builds
 from hw.command import CONDITIONS, MASSES, WEAR
 from hw.endurance import Wear
 from hw.envelopes import Envelope, of_shape, of_volume
@@ -181,9 +180,7 @@ def budget(args: argparse.Namespace) -> int:
         for path in plots.draw(build, margin, Wear(), args.out):
             print(path)
     if args.write_readme:
-        from hw import readme
-
-        for path in readme.write():
+        for path in tables.write_readme():
             print(path)
     _save(args.json, document)
     if margin.margin_g > 0:
@@ -193,7 +190,6 @@ def budget(args: argparse.Namespace) -> int:
 
 
 def wiring(args: argparse.Namespace) -> int:
-    """The drawing of a build's wiring."""
     from hw import wiring as drawn
 
     gauge, autopilot = drawn.variant_of(shipped_builds().named(args.build))

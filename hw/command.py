@@ -67,7 +67,6 @@ def _add(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
     result = _Parser(
         prog="python -m hw", description="The payload's lift, margin, endurance and wiring.",
         allow_abbrev=False,

@@ -57,7 +57,6 @@ def ellipsoid(length_m: float, width_m: float) -> Envelope:
 
 
 def sphere(diameter_m: float) -> Envelope:
-    """A sphere."""
     checked("diameter_m", diameter_m)
     r = diameter_m / 2
     volume, surface = 4 / 3 * math.pi * r**3, 4 * math.pi * r * r

@@ -68,7 +68,6 @@ def cell_of(build: Build, capacity_mAh: float) -> Part:
 
 
 def with_cell(build: Build, cell: Part) -> Build:
-    """The same build with another cell for the payload."""
     old = payload_cell(build)
     placed = tuple(
         (cell, place) if part is old and place == "gondola" else (part, place)

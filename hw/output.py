@@ -26,10 +26,8 @@ def write(path: Path, produce: Callable[[Path], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes text in UTF-8."""
     write(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Writes a document as JSON."""
     write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")

@@ -124,5 +124,4 @@ def entries_of(document: dict[str, Any], key: str, path: str | Path) -> list[dic
 
 @lru_cache(maxsize=1)
 def shipped_parts() -> dict[str, Part]:
-    """The parts that ship, read once."""
     return load_parts()

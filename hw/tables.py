@@ -1,18 +1,26 @@
-"""Tables that the command prints and the page shows: the same rows, as text or as Markdown."""
+"""Tables that the command prints and the page shows: the same rows, as text or as Markdown.
+
+What stands between two markers of the page is the program's output, and so are its drawings.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from hw.balance import balance_of, climb_of
-from hw.builds import Build
-from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, gross_of, margin_g, sigmas
-from hw.catalogue import Catalogue
+from hw import output
+from hw.builds import Build, Catalogue, shipped_builds
+from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, gross_of, margin_g, reckon, sigmas
 from hw.endurance import MODES, Endurance, Wear, fly
+from hw.flight import balance_of, climb_of
 from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_envelope
-from hw.parts import Part
+from hw.parts import Part, shipped_parts
+from hw.quantities import HardwareError
+from hw.wiring import GAUGES, drawing
+from pi_firmware.wire.errors import told
 
 CLIMB_M = 3.0
 
@@ -166,3 +174,49 @@ def erratum() -> Table:
 def _zero(value: float) -> float:
     """No minus sign before what is printed as 0.0."""
     return 0.0 if abs(value) < 0.05 else value
+
+
+PAGE = Path(__file__).with_name("README.md")
+
+
+def sections() -> dict[str, str]:
+    """Markdown by marker."""
+    catalogue, parts = shipped_builds(), shipped_parts()
+    build = catalogue.named(None)
+    endurance, _ = endurance_table(build, Wear())
+    made = {
+        "parts": bill_of_materials(parts),
+        "sources": citations(parts),
+        "builds": builds_table(catalogue),
+        "mass": mass_budget(build, reckon(build)),
+        "answers": answers(build),
+        "endurance": endurance,
+        "erratum": erratum(),
+    }
+    return {name: table.markdown() for name, table in made.items()}
+
+
+def filled(page: str) -> str:
+    """The page with each marked stretch made again; raises `HardwareError` for a missing marker."""
+    for name, text in sections().items():
+        pattern = re.compile(rf"(<!-- {name}: made .*?-->\n).*?(<!-- /{name} -->)", re.DOTALL)
+        found = list(pattern.finditer(page))
+        if len(found) != 1:
+            raise HardwareError(f"{PAGE.name}: {name!r} is marked {len(found)} times; allowed: 1")
+        page = f"{page[: found[0].end(1)]}{text}\n{page[found[0].start(2) :]}"
+    return page
+
+
+def drawings() -> dict[Path, str]:
+    """The committed drawings and what the program makes of them."""
+    return {PAGE.with_name(f"wiring-{gauge}.svg"): drawing(gauge) for gauge in GAUGES}
+
+
+def write_readme() -> list[Path]:
+    """Writes tables into the page, and the drawings beside it; raises `HardwareError`."""
+    with told(PAGE, HardwareError):
+        page = PAGE.read_text(encoding="utf-8")
+    output.write_text(PAGE, filled(page))
+    for path, text in drawings().items():
+        output.write_text(path, text)
+    return [PAGE, *drawings()]

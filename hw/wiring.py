@@ -189,6 +189,5 @@ def _legend(wiring: Wiring) -> list[str]:
 
 
 def drawing(gauge: str, autopilot: bool = True) -> str:
-    """The SVG of a variant."""
     title = f"Payload with {gauge.upper()}" + (" and autopilot" if autopilot else "")
     return svg(load_wiring(gauge, autopilot), title)

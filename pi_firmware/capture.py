@@ -154,7 +154,6 @@ class Capture:
             threading.Thread(target=self._source.stop, name="end", daemon=True).start()
 
     def force_idr(self) -> None:
-        """Makes the next frame an IDR."""
         media = self._media
         if media is not None:
             media.encoder.force_idr()
@@ -174,7 +173,6 @@ class Capture:
         return media.encoder.limit_bitrate(kbps) if media is not None else kbps
 
     def link_report(self, report: messages.LinkReport, corrections: float = 0.0) -> None:
-        """What the ground saw of the link of late."""
         media = self._media
         if media is not None:
             media.encoder.link_report(report, corrections)

@@ -67,7 +67,6 @@ class Commands:
             answer(_refused(f"{_WAITING} commands wait already"))
 
     def carry_out(self, name: str, command: Command) -> Answer:
-        """Carries out one command now."""
         try:
             values = self._checked(name).run(**self._numbers(name, command.arguments))
         except BlimpError as error:

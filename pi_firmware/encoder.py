@@ -66,7 +66,6 @@ class Adaptation:
         self._lossy_since_s: float | None = None
 
     def limited(self, kbps: float) -> float:
-        """A bit rate within the bounds."""
         settings = self._settings
         return max(settings.min_bitrate_kbps, min(self.ceiling_kbps, kbps))
 
@@ -300,7 +299,6 @@ class Encoder:
             self._lateness.add(now_ns, now_ns - clock_ns)
 
     def force_idr(self) -> None:
-        """Makes the next frame an IDR."""
         event = self._video.video_event_new_upstream_force_key_unit(
             self._gst.CLOCK_TIME_NONE, True, 0
         )
@@ -316,7 +314,6 @@ class Encoder:
         return self._since_idr > self._adaptation.gop_frames < self._longest
 
     def saw_idr(self) -> None:
-        """An IDR came out."""
         self._since_idr = 0
 
 

@@ -132,6 +132,7 @@ class Payload:
             publish=self._tell_battery,
             announce=announce,
             on_low=self._capture.limit_bitrate,
+            on_critical=self._on_critical,
         )
         self._commands = Commands(
             actions(
@@ -155,7 +156,7 @@ class Payload:
             self._supervision.start(
                 self._capture, self._ground, self._recorder, self._telemetry, self._autopilot
             )
-            self._battery.start(on_critical=self._on_critical)
+            self._battery.start()
             self._autopilot.start()
             self._telemetry.on_pose(self._on_pose)
             self._telemetry.on_link(self._ground.heard)
@@ -174,17 +175,14 @@ class Payload:
 
     @property
     def counters(self) -> Counters:
-        """Frames so far."""
         return self._capture.counters
 
     @property
     def cut_reason(self) -> str:
-        """Why the source ended early, in words; empty when it did not."""
         return self._capture.cut_reason
 
     @property
     def listening(self) -> tuple[str, ...]:
-        """Telemetry endpoints that this payload listens on."""
         return self._telemetry.listening
 
     def close(self) -> None:

@@ -68,7 +68,6 @@ class Budget:
         self._lock = threading.Lock()
 
     def sent(self, size: int) -> None:
-        """So much was sent."""
         with self._lock:
             self._left = min(self._most_bytes, self._left + int(_SHARE * size))
 

@@ -118,7 +118,6 @@ class Telemetry:
 
     @property
     def listening(self) -> tuple[str, ...]:
-        """Endpoints that this session listens on."""
         return self._session.listening if self._session else ()
 
     @property

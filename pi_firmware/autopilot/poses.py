@@ -176,9 +176,8 @@ _FUTURE_NS = 100_000_000  # a capture time so far ahead is of another clock
 
 @dataclass
 class PoseCounts:
-    """Poses so far: given to the autopilot, too old or out of order, not supported, not valid."""
+    """Poses that were not given so far: too old or out of order, not supported, not valid."""
 
-    passed: int = 0
     stale: int = 0
     lost: int = 0
     refused: int = 0
@@ -227,7 +226,6 @@ class PoseGate:
             self.reset_counter = (self.reset_counter + 1) % 256
         self._interrupted = False
         self._last = (message.capture_ns, pose)
-        self.counts.passed += 1
         return pose
 
     def is_fresh(self, capture_ns: int, now_ns: int) -> bool:

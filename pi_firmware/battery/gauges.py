@@ -85,7 +85,6 @@ def chips_known() -> dict[str, Chip]:
 
 
 def cell_of(settings: BatterySettings) -> Cell:
-    """The cell that the settings describe."""
     return Cell(
         capacity_ah=settings.capacity_mAh / 1000,
         full_v=settings.full_V,

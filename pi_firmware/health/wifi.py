@@ -79,7 +79,6 @@ class Wifi:
         return state
 
     def heard(self) -> None:
-        """The ground station was heard just now."""
         with self._lock:
             self._heard_at = self._clock()
             self._pause_s = self._restart_after_s

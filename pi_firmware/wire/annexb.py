@@ -39,7 +39,6 @@ def nal_type(unit: bytes) -> int:
 
 
 def nal_types(data: bytes) -> list[int]:
-    """The types of all NAL units in a byte stream."""
     return [nal_type(unit) for unit in nal_units(data)]
 
 

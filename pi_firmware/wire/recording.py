@@ -361,7 +361,6 @@ class RecordingReader:
         return None
 
     def poses(self, topic: str) -> list[PoseSample]:
-        """All poses of `topic`."""
         result = []
         for _, record in self.messages({topic}):
             message = self._parse(PoseInFrame, record)

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from hw.balance import GRAVITY_M_S2, balance_of, climb_of, climb_s
-from hw.builds import Build, Conditions, Hull, with_ballast
-from hw.catalogue import shipped_builds
+from hw.builds import Build, Conditions, Hull, shipped_builds, with_ballast
+from hw.flight import GRAVITY_M_S2, balance_of, climb_of, climb_s
 from hw.parts import load_parts
 from hw.quantities import HardwareError
 

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw.builds import Build, Conditions, Hull
+from hw.builds import Build, Conditions, Hull, shipped_builds
 from hw.buoyancy import gross_lift_g, gross_of, lift_in, margin_g, reckon
-from hw.catalogue import shipped_builds
 from hw.quantities import RANGES
 
 THESIS_M3 = 0.1905

@@ -11,7 +11,7 @@ import pytest
 
 from hw import answering
 from hw.__main__ import main
-from hw.catalogue import BUILDS_FILE, load_builds
+from hw.builds import BUILDS_FILE, load_builds
 
 ROOT = Path(__file__).parents[2]
 

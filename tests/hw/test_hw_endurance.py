@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hw.builds import Build
-from hw.catalogue import shipped_builds
+from hw.builds import Build, shipped_builds
 from hw.endurance import MODES, Wear, drain, fly, load_of
 from hw.inverse import cell_of, with_cell
 from hw.parts import load_parts

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw.builds import Build, with_ballast
+from hw.builds import Build, shipped_builds, with_ballast
 from hw.buoyancy import margin_g
-from hw.catalogue import shipped_builds
 from hw.endurance import fly
 from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_envelope, with_cell
 from hw.quantities import HardwareError

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hw import readme
-from hw.catalogue import shipped_builds
+from hw import tables
+from hw.builds import shipped_builds
 from hw.quantities import HardwareError
 from hw.wiring import GAUGES, WIRING_FILE, drawing, load_wiring, variant_of
 from pi_firmware.wire.errors import BlimpError
@@ -25,21 +25,21 @@ HEADER = {
 
 
 def test_the_pages_tables_are_the_programs() -> None:
-    page = readme.PAGE.read_text(encoding="utf-8")
+    page = tables.PAGE.read_text(encoding="utf-8")
     # Numbers that follow from CoolProp may differ in the last digit between its versions; the
     # lock fixes one.
-    assert readme.filled(page) == page, "run: python -m hw budget --write-readme"
+    assert tables.filled(page) == page, "run: python -m hw budget --write-readme"
 
 
 def test_a_page_without_a_marker_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readme, "sections", lambda: {"erratum": "| a |"})
-    page = readme.PAGE.read_text(encoding="utf-8").replace("<!-- /erratum -->", "")
+    monkeypatch.setattr(tables, "sections", lambda: {"erratum": "| a |"})
+    page = tables.PAGE.read_text(encoding="utf-8").replace("<!-- /erratum -->", "")
     with pytest.raises(HardwareError, match=r"'erratum' is marked 0 times; allowed: 1"):
-        readme.filled(page)
+        tables.filled(page)
 
 
 def test_the_drawings_are_the_programs() -> None:
-    for path, text in readme.drawings().items():
+    for path, text in tables.drawings().items():
         assert path.read_text(encoding="utf-8") == text, "run: python -m hw budget --write-readme"
 
 
@@ -113,7 +113,7 @@ def test_a_browser_renders_the_drawing(tmp_path: Path) -> None:
     subprocess.run(
         ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
          f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}",
-         "--window-size=1160,440", (readme.PAGE.parent / "wiring-max17048.svg").as_uri()],
+         "--window-size=1160,440", (tables.PAGE.parent / "wiring-max17048.svg").as_uri()],
         check=True, capture_output=True, timeout=120,
     )  # fmt: skip
     width, height, rows = png_rows(picture.read_bytes())

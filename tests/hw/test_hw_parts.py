@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hw.catalogue import BUILDS_FILE, load_builds
+from hw.builds import BUILDS_FILE, load_builds
 from hw.parts import load_parts
 from pi_firmware.wire.errors import BlimpError
 

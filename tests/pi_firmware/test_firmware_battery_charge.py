@@ -11,9 +11,9 @@ import pytest
 import simulated_gauges as simulated
 
 from pi_firmware.battery.cell import Cell, Polarization
-from pi_firmware.battery.charge import ChargeFilter
 from pi_firmware.battery.chip import Counts, WordBus
 from pi_firmware.battery.chips import ina
+from pi_firmware.battery.monitor import ChargeFilter
 
 CAPACITY_AH = 0.6
 SHUNT = ina.Shunt(0.1, 3.0)
@@ -152,7 +152,7 @@ def test_time_left_at_a_light_load_is_the_charge_over_the_current() -> None:
 
 def test_odd_readings_are_borne() -> None:
     charge = ChargeFilter(Cell(0.6))
-    assert charge.time_left_s(3.3) is None and charge.sigma is None
+    assert charge.time_left_s(3.3) is None
     first = charge.update(10.0, 3.8, 0.3)
     assert charge.update(10.0, 4.1, 0.3) == charge.update(5.0, 3.2, 0.3) == first
     assert charge.update(11.0, 3.8, 0.3) == pytest.approx(first, abs=0.02)

@@ -224,12 +224,20 @@ def test_another_chip_at_the_address_is_named() -> None:
         ("i2c:ina219@1:0x40?shunt_ohm=0", "shunt_ohm is '0'"),
         ("i2c:ina226@1:0x40?max_A=2", "2 A through 0.1 ohm are 0.2 V; the chip measures up to"),
         ("i2c:ina219@1:0x40?discharge=up", "allowed: positive, negative"),
+        ("i2c:bq27441@1:0x55", "expected i2c:CHIP@BUS:ADDRESS"),
+        ("gauge:", "unknown scheme"),
+        ("fake:1", "takes no path"),
+        ("fake:?percentage=2", "percentage is '2'; allowed: 0 to 1"),
+        ("fake:?a=1&a=" + "2" * 9000, "option 'a' is given twice"),
+        ("fake:\n?x", "the options are not name=value"),
+        ("fake:?a\n=1", "unknown option"),
     ],
 )
 def test_a_wrong_gauge_is_refused_in_one_line(text: str, named: str) -> None:
     with pytest.raises(SourceError) as caught:
         battery.open_gauge(text)
-    assert named in str(caught.value) and "\n" not in str(caught.value)
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from pi_firmware import battery, encoder, gstreamer, sources, uri
 from pi_firmware.settings import CameraSettings, EncoderSettings
 from pi_firmware.sources.schemes.replay import RateGrid
-from pi_firmware.wire.errors import BlimpError, SourceError, StreamError
+from pi_firmware.wire.errors import BlimpError, StreamError
 
 
 @pytest.mark.parametrize(
@@ -43,25 +43,6 @@ def test_a_camera_that_cannot_be_opened_is_named(text: str, named: str) -> None:
         sources.open_source(CameraSettings(uri=text))
     assert named in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("i2c:bq27441@1:0x55", "expected i2c:CHIP@BUS:ADDRESS"),
-        ("gauge:", "unknown scheme"),
-        ("fake:1", "takes no path"),
-        ("fake:?percentage=2", "percentage is '2'; allowed: 0 to 1"),
-        ("fake:?a=1&a=" + "2" * 9000, "option 'a' is given twice"),
-        ("fake:\n?x", "the options are not name=value"),
-        ("fake:?a\n=1", "unknown option"),
-    ],
-)
-def test_a_gauge_that_cannot_be_opened_is_named(text: str, named: str) -> None:
-    with pytest.raises(SourceError) as caught:
-        battery.open_gauge(text)
-    assert named in str(caught.value)
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
 def test_options_are_split_from_the_path() -> None:

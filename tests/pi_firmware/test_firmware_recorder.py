@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from recorded import (
-    GOP,
     PERIOD_NS,
     START_NS,
     Events,
@@ -337,7 +336,3 @@ def test_memory_does_not_grow_with_what_was_recorded(tmp_path: Path) -> None:
     made.stop()
     assert made.dropped == 0 and video(*files(tmp_path))[-1] == unit(1199, 15_000)
     assert taken[3] - taken[1] < 400_000  # of 9 MB recorded; a chunk in progress has up to 256 KB
-
-
-def test_groups_of_pictures_are_ten_frames_here() -> None:
-    assert [k for k in range(40) if annexb.is_idr(unit(k))] == list(range(0, 40, GOP))

@@ -16,58 +16,12 @@ from recorded import (
     feed,
     files,
     is_cut,
-    number_in,
     recorder,
     sequences,
 )
-from waiting import eventually
-
-from ground_station.recording.open import open_input
-from pi_firmware.wire.recording import RecordingReader
 
 MARGIN_S = 2.0
 """What a busy machine may add to `sync_s` before a test calls it lost."""
-
-
-def chunk_ends(path: Path) -> list[int]:
-    """Where the records of a file end, up to its index."""
-    data, at, ends = path.read_bytes(), 8, []
-    while data[at] != 0x0F:  # DataEnd
-        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-        ends.append(at)
-    return ends
-
-
-def test_a_file_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
-    made = recorder(tmp_path, sync_s=0.1)
-    made.start()
-    for block in range(8):
-        feed(made, range(block * 10, block * 10 + 10), 3000)
-        eventually(lambda: made._run is not None and not made._run.queue._items)
-        time.sleep(0.1)  # a sync passes; that it has is not needed
-    path = tmp_path / made.stop()
-    whole, ends = path.read_bytes(), chunk_ends(path)
-    messages = [(c.topic, m.log_time, m.data) for c, m in RecordingReader(path).messages()]
-    sizes = [len(data) for _, _, data in messages]
-    rng = random.Random(4)
-    places = [end + by for end in ends for by in (-40, -1, 0, 1, 9, 40)]
-    places += [rng.randrange(8, len(whole)) for _ in range(150)]
-    cut = tmp_path / "cut.mcap"
-    assert len(ends) > 5
-    for place in places:
-        cut.write_bytes(whole[:place])
-        reader = RecordingReader(cut)
-        read = [(c.topic, m.log_time, m.data) for c, m in reader.messages()]
-        assert read == messages[: len(read)]
-        # Nothing that lies before the cut is missing: only what stands around the messages.
-        following = sum(sizes[: len(read) + 1])
-        assert len(read) == len(messages) or following + 31 * (len(read) + 1) > place - 4000
-        assert reader.cut is (place < len(whole) - 8)
-    cut.write_bytes(whole[: ends[-2] + 50])
-    source = open_input(cut)
-    numbers = [number_in(frame.image) for frame in source]
-    assert numbers == [k % 40 for k in range(len(numbers))] and len(numbers) >= 10
-    assert "the file ends before its footer" in source.notes[0]
 
 
 @pytest.mark.parametrize("padding_bytes", [0, 15_000])

@@ -70,6 +70,12 @@ def test_the_shipped_file_says_every_unit_and_range() -> None:
         ("camera", "expected key=value"),
         ("payload_id.x=1", "not a table"),
         ("camera.rate_hz=fast", "'fast' is not a TOML value"),
+        ("camera.exposure_s=2", "0 to 1 s"),
+        ("camera.gain=-1", "0 to 1000"),
+        ("camera.white_balance=moon", "'auto', 'incandescent'"),
+        ("camera.focus_m=-1", "0 to 1000 m"),
+        ("encoder.min_bitrate_kbps=3000", "must not be above"),
+        ("battery.critical_percentage=0.3", "critical_percentage' is 0.3; it must be below"),
     ],
 )
 def test_a_bad_value_is_refused_in_one_line(override: str, named: str) -> None:

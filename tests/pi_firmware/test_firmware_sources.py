@@ -9,7 +9,7 @@ import pytest
 from receiving import Receiver
 from schemes import clock
 
-from pi_firmware.settings import CameraSettings, load
+from pi_firmware.settings import CameraSettings
 from pi_firmware.sources.schemes import v4l2
 
 WITH_CLOCK = f"""
@@ -35,7 +35,7 @@ def test_capture_time_at_the_receiver_is_that_of_the_picture_within_a_millisecon
         process = subprocess.Popen(
             [
                 sys.executable, "-c", WITH_CLOCK,
-                "--set", "camera.uri=clock:?duration_s=3",
+                "--set", "camera.uri=clock:?duration_s=2",
                 "--set", f"link.port={receiver.port}",
                 "--set", "telemetry.enabled=false",
                 "--set", "encoder.bitrate_kbps=4000",
@@ -49,11 +49,11 @@ def test_capture_time_at_the_receiver_is_that_of_the_picture_within_a_millisecon
                 frames.append(frame)
         out, err = process.communicate(timeout=30)
     assert process.returncode == 0, err
-    assert [frame.sequence for frame in frames] == list(range(90)), out
+    assert [frame.sequence for frame in frames] == list(range(60)), out
     errors_ns = [frame.time_ns - clock.read_clock(frame.image) for frame in frames]
     # Whoever is not let run between the picture and its stamp is late by as much.
-    assert sorted(map(abs, errors_ns))[80] < 1_000_000
-    assert len({clock.read_clock(frame.image) for frame in frames}) == 90
+    assert sorted(map(abs, errors_ns))[53] < 1_000_000
+    assert len({clock.read_clock(frame.image) for frame in frames}) == 60
 
 
 class Device:
@@ -117,19 +117,3 @@ def test_a_refusal_names_the_key_and_the_devices_range() -> None:
     assert "camera.gain: the device says 0 after it was set to 20" in refusals(stuck, FIXED)
     bare = Device({})
     assert "camera.white_balance: the device has no such control" in refusals(bare, FIXED)
-
-
-@pytest.mark.parametrize(
-    ("key", "named"),
-    [
-        ("camera.exposure_s=2", "0 to 1 s"),
-        ("camera.gain=-1", "0 to 1000"),
-        ("camera.white_balance=moon", "'auto', 'incandescent'"),
-        ("camera.focus_m=-1", "0 to 1000 m"),
-        ("encoder.min_bitrate_kbps=3000", "must not be above"),
-    ],
-)
-def test_a_bad_camera_setting_is_named(key: str, named: str) -> None:
-    with pytest.raises(Exception, match=named) as caught:
-        load(None, [key])
-    assert "\n" not in str(caught.value)

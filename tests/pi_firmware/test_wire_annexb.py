@@ -34,14 +34,6 @@ def test_an_access_unit_without_a_slice_takes_no_unit() -> None:
         annexb.insert_before_slice(b"\x00\x00\x00\x01\x67\x42\x00\x00\x01", b"\x06\x80")
 
 
-@settings(deadline=None, max_examples=100)
-@given(st.binary(max_size=200))
-def test_any_bytes_can_be_searched(data: bytes) -> None:
-    annexb.nal_types(data)
-    annexb.has_parameter_sets(data)
-    annexb.is_idr(data)
-
-
 def test_real_streams_with_and_without_parameter_sets_are_told_apart() -> None:
     if not STREAMS.is_dir():
         pytest.skip("shared/data/streams is not here")

@@ -102,13 +102,3 @@ def test_a_unit_of_nothing_but_messages_takes_linear_time(message: bytes) -> Non
 
     # 32 times as many would take 1024 times as long if each looked at all behind it.
     assert time_of(640_000) < 200 * max(time_of(20_000), 1e-3)
-
-
-@settings(deadline=None, max_examples=300)
-@given(st.binary(max_size=200), st.integers(0, 200))
-def test_hostile_bytes_raise_nothing(noise: bytes, at: int) -> None:
-    whole = carried(INFO)
-    cut = min(at, len(whole))
-    for data in (noise, b"\x00\x00\x01\x06" + noise, whole[:cut] + noise, noise + whole[cut:]):
-        found = sei.find(data)
-        assert found is None or isinstance(found, sei.FrameInfo)

@@ -53,7 +53,7 @@ def test_a_solved_frame_is_where_the_autopilot_takes_it() -> None:
     assert message.relocalized
     gate = PoseGate(AutopilotSettings(uri="off:"))
     taken = gate.take(message, FRAME.clock_ns + 10**7)
-    assert taken is not None and gate.counts.passed == 1
+    assert taken is not None
     np.testing.assert_allclose(taken.position_m, [1, -2, -3], atol=1e-12)  # north, east, down
     np.testing.assert_allclose(rotation(*taken.angles_rad), np.eye(3), atol=1e-12)
     assert taken.velocity_mps is not None and taken.turn_radps is not None

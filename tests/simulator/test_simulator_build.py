@@ -12,7 +12,7 @@ from ground_station.simulator.dynamics import Blimp, fly
 from ground_station.simulator.plans import Reference, plan_named
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import SimulationSettings, prepare_flight
-from hw.catalogue import shipped_builds
+from hw.builds import shipped_builds
 from hw.flight import flight_model
 from hw.quantities import HardwareError
 

@@ -242,22 +242,6 @@ def test_a_wrong_length_in_a_whole_file_is_damage_and_no_cut(flight: Path) -> No
     assert reader.cut and "a length is wrong" in reader.cut_reason
 
 
-@fuzz
-@given(st.binary(max_size=400))
-def test_random_bytes_after_the_magic_do_no_harm(flight: Path, data: bytes) -> None:
-    path = scratch(flight, MAGIC + data)
-    reader = RecordingReader(path)
-    list(reader.messages())
-    assert reader.message_count("/a") in (None, 0)
-
-
-@fuzz
-@given(st.binary(max_size=300), st.sampled_from(["", "zstd", "lz4"]))
-def test_random_bytes_in_a_chunk_do_no_harm(flight: Path, data: bytes, compression: str) -> None:
-    for body in (chunk(data, compression=compression), chunk(data, claimed=1000)):
-        list(RecordingReader(scratch(flight, MAGIC + CHANNEL + body)).messages())
-
-
 def bombs() -> dict[str, bytes]:
     zeros = b"\0" * (64 << 20)
     return {

@@ -41,7 +41,6 @@ class _Ina(ABC):
         self._ready = False
 
     def close(self) -> None:
-        """Releases the bus."""
         self._ready = False
         self._bus.close()
 

@@ -61,7 +61,6 @@ class Max17048:
         )
 
     def close(self) -> None:
-        """Releases the bus."""
         self._ready = False
         self._bus.close()
 

@@ -122,7 +122,6 @@ class Recorder:
             return self._latest.name if self._latest else ""
 
     def close(self, limit_s: float | None = None) -> None:
-        """Stops for good."""
         self._closed = True
         self.stop(limit_s)
 
