@@ -1,7 +1,13 @@
 """Restarts of process and board, counted in a file that may be cut, old or hostile."""
 
 import json
+import os
+import random
+import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -165,6 +171,25 @@ def test_a_number_that_cannot_be_makes_the_file_nonsense(
     assert not process.claim_reboot(ending=True)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_file_cut_or_bent_anywhere_raises_nothing_and_bounds_the_reboots(
+    card: Card, seed: int
+) -> None:
+    chance = random.Random(seed)
+    card.process()
+    good = card.path.read_bytes()
+    for _ in range(60):
+        bent = bytearray(good[: chance.randrange(len(good) + 1)])
+        for _ in range(chance.randrange(3)):
+            if bent:
+                bent[chance.randrange(len(bent))] = chance.randrange(256)
+        card.path.write_bytes(bent)
+        process = card.process()
+        process.claim_reboot(ending=True)
+        assert 0 <= process.process_restarts <= 10**9
+        assert json.loads(card.path.read_text())["schema"] == "blimp.restarts/1"
+
+
 def test_without_a_file_nothing_is_counted_and_nothing_rebooted(tmp_path: Path) -> None:
     for _ in range(5):
         process = Restarts("", 1)
@@ -203,3 +228,53 @@ def test_a_folder_that_is_not_there_stops_nothing(
 def test_a_board_without_a_boot_id_counts_all_the_same(card: Card) -> None:
     (card.root / "proc/sys/kernel/random/boot_id").unlink()
     assert [card.process().claim_reboot(ending=True) for _ in range(3)] == [False, False, True]
+
+
+def test_what_a_power_cut_needs_is_synced_in_its_order(
+    card: Card, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    sync, rename = os.fsync, Path.replace
+
+    def fsync(descriptor: int) -> None:
+        done.append(f"sync {Path(f'/proc/self/fd/{descriptor}').readlink().name}")
+        sync(descriptor)
+
+    def replace(path: Path, target: Path) -> Path:
+        done.append(f"rename {path.name} {target.name}")
+        return rename(path, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(Path, "replace", replace)
+    card.process()
+    assert done == [
+        "sync restarts.json.part",
+        "rename restarts.json.part restarts.json",
+        f"sync {card.path.parent.name}",
+    ]
+
+
+def test_killed_at_any_moment_the_file_is_whole(card: Card) -> None:
+    program = (
+        "import sys\n"
+        "from pi_firmware.health.restarts import Restarts\n"
+        "print('begun', flush=True)\n"
+        "while True:\n"
+        "    Restarts(sys.argv[1], 3).begin()\n"
+    )
+    chance = random.Random(1)
+
+    def counted() -> int:
+        return int(str(card.document["processes"])) if card.path.exists() else 0
+
+    for _ in range(5):
+        aim = counted() + 1
+        with subprocess.Popen(
+            [sys.executable, "-c", program, str(card.path)], stdout=subprocess.PIPE
+        ) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            eventually(lambda aim=aim: counted() >= aim)
+            time.sleep(chance.random() * 0.05)  # somewhere within a write
+            os.kill(process.pid, signal.SIGKILL)
+        assert counted() >= aim

@@ -7,6 +7,7 @@ here is met by the key's default: it would show nothing.
 from __future__ import annotations
 
 import itertools
+import json
 import shutil
 import subprocess
 import sys
@@ -25,6 +26,8 @@ from pi_firmware.wire.recording import RecordingReader
 sys.path.insert(0, str(Path(__file__).parents[1] / "stream"))
 
 FRAMES = 60
+GONE = "test:?gone_at_s=0.01"
+"""A test camera that is gone before its first frame."""
 OPEN_GATE = {"gate.min_entropy_bits": 0, "gate.min_sharpness_ratio": 0, "gate.min_difference": 0}
 
 
@@ -75,6 +78,16 @@ def test_each_of_the_gates_tests_can_be_left_out(recordings: dict[str, str]) -> 
         ("gate.min_difference", 2.0),
     ):
         assert len(fly({**settings, key: value}).sequences) < FRAMES, key
+
+
+def test_the_entropys_threshold_and_hysteresis_decide(
+    recordings: dict[str, str], whole: Flown
+) -> None:
+    rich = [frame.info.sequence for frame in whole.frames if frame.info.entropy_bits >= 7.0]
+    assert 5 < len(rich) < FRAMES - 5
+    settings = {"camera.uri": recordings["dusk"], "gate.min_entropy_bits": 7.0}
+    settings |= {"gate.heartbeat_s": 0, "gate.min_difference": 0, "gate.min_sharpness_ratio": 0}
+    assert fly({**settings, "gate.hysteresis_bits": 0}).sequences == rich
 
 
 def test_heartbeats_come_as_often_as_configured(recordings: dict[str, str]) -> None:
@@ -139,6 +152,23 @@ def test_telemetry_that_is_off_listens_nowhere(recordings: dict[str, str]) -> No
     settings = {"camera.uri": recordings["dusk"], "telemetry.connect": []}
     settings |= {"telemetry.listen": ["tcp/127.0.0.1:0"]}
     assert "telemetry on" not in fly({**settings, "telemetry.enabled": False}).out
+
+
+def test_a_process_ends_after_so_many_restarts_and_so_many_reboot_the_board(
+    tmp_path: Path,
+) -> None:
+    mark, state = tmp_path / "rebooted", tmp_path / "restarts.json"
+    settings = {
+        "camera.uri": GONE,
+        "supervision.restarts": 1,
+        "supervision.process_restarts": 1,
+        "supervision.reboot_command": ["touch", str(mark)],
+    }
+    uncounted = fly(settings)
+    assert uncounted.status == 3 and not mark.exists()
+    assert "; 1 restarts of camera and encoder did not help" in uncounted.err
+    assert fly({**settings, "supervision.state": str(state)}).status == 3
+    assert mark.exists() and json.loads(state.read_text())["reboots_in_a_row"] == 1
 
 
 def test_an_empty_battery_ends_the_flight_and_then_the_board(tmp_path: Path) -> None:

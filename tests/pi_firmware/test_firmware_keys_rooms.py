@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 from recorded import Events, feed, files
 from scipy.spatial.transform import Rotation
-from test_firmware_settings import fields_of
 from waiting import eventually
 
 from pi_firmware import encoder
@@ -23,13 +22,37 @@ from pi_firmware.autopilot.poses import PoseGate
 from pi_firmware.battery import Monitor
 from pi_firmware.battery.chip import Counts
 from pi_firmware.correction import Sender
+from pi_firmware.health.wifi import Wifi
 from pi_firmware.recording import Recorder
 from pi_firmware.settings import Settings, load
+from pi_firmware.sources.schemes import libcamera, v4l2
 from pi_firmware.wire import messages
+from pi_firmware.wire.errors import RecordingError
 
 S = 10**9
 AHEAD = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
 """A camera that looks along the map's x axis, upright."""
+
+
+def asked_of_libcamera(settings: Settings) -> dict[str, Any]:
+    return {name: asked.value for name, asked in libcamera.controls(settings.camera).items()}
+
+
+def set_on_v4l2(settings: Settings) -> dict[int, int]:
+    """What a device that has every control holds after all wishes were applied."""
+    held: dict[int, int] = {}
+
+    def ioctl(file: int, request: int, data: bytearray) -> None:
+        control = int.from_bytes(data[:4], "little")
+        if request == v4l2.VIDIOC_QUERYCTRL:
+            data[:] = v4l2._QUERYCTRL.pack(control, 0, b"", 0, 100_000, 1, 0, 0)
+        elif request == v4l2.VIDIOC_S_CTRL:
+            held[control] = v4l2._CONTROL.unpack(data)[1]
+        else:
+            data[:] = v4l2._CONTROL.pack(control, held[control])
+
+    assert [v4l2.apply(wish, 0, ioctl) for wish in v4l2.wishes(settings.camera, None)]
+    return {control: value for control, value in held.items() if control != 0x009A0903}
 
 
 class Element:
@@ -172,6 +195,15 @@ DEGREES_AND_PLACE = [0, 0, 0, 1, -2, -3]
 @pytest.mark.parametrize(
     ("key", "value", "look", "by_default", "seen"),
     [
+        ("camera.exposure_s", 0.01, asked_of_libcamera, {},
+         {"exposure-time-mode": "manual", "exposure-time": 10_000}),
+        ("camera.gain", 4, asked_of_libcamera, {},
+         {"analogue-gain-mode": "manual", "analogue-gain": 4.0}),
+        ("camera.white_balance", "cloudy", asked_of_libcamera, {}, {"awb-mode": "cloudy"}),
+        ("camera.focus_m", 4, asked_of_libcamera, {}, {"af-mode": "manual", "lens-position": 0.25}),
+        ("camera.exposure_s", 0.01, set_on_v4l2, {}, {0x009A0901: 1, 0x009A0902: 100}),
+        ("camera.gain", 4, set_on_v4l2, {}, {0x00980912: 0, 0x00980913: 4}),
+        ("camera.white_balance", "cloudy", set_on_v4l2, {}, {0x0098090C: 0, 0x0098091A: 6500}),
         ("encoder.name", "v4l2h264enc", encoder_element, "x264enc", "v4l2h264enc"),
         ("encoder.max_round_trip_s", 0.1, kbps_after_a_round_trip_of_0_2_s, 2000, 1700),
         ("encoder.max_queue_s", 0.2, kbps_after_a_queue_of_0_1_s, 1530, 2000),
@@ -216,9 +248,63 @@ def test_corrections_are_as_many_as_assumed_and_allowed() -> None:
         assert len([*sender.of(frame)] if sender.wanted else []) == sent
 
 
+@pytest.mark.parametrize("restart_after_s", [5, 40])
+def test_a_radio_is_restarted_after_so_long_a_silence(restart_after_s: int, tmp_path: Path) -> None:
+    folder = tmp_path / "sys/class/net/wlan0"
+    (folder / "wireless").mkdir(parents=True)
+    ran: list[str] = []
+    now_s = 0.0
+
+    def run(words: list[str]) -> str:
+        ran.append(" ".join(words))
+        return "Power save: off\n"
+
+    settings = load(None, ["wifi.interface=wlan0", f"wifi.restart_after_s={restart_after_s}"])
+    wifi = Wifi(
+        settings.wifi,
+        lambda name, text: None,
+        root=tmp_path,
+        run=run,
+        clock=lambda: now_s,
+        off_s=0.0,
+    )
+    wifi.heard()
+    while "ip link set dev wlan0 down" not in ran and now_s < 100:
+        now_s += 1.0
+        wifi.look()
+    assert restart_after_s <= now_s <= restart_after_s + 1
+    assert "iw dev wlan0 set power_save off" in ran
+
+
 def recorder(folder: Path, *given: str) -> Recorder:
     more = [f"recording.folder={folder}", *given]
     return Recorder(load(None, ["recording.min_free_MB=0", *more]).recording, Events())
+
+
+@pytest.mark.parametrize(("max_file_MB", "count"), [(1, 2), (2, 1)])
+def test_a_recordings_file_ends_at_its_size(max_file_MB: int, count: int, tmp_path: Path) -> None:
+    made = recorder(tmp_path, f"recording.max_file_MB={max_file_MB}")
+    made.start()
+    feed(made, range(100), 15_000)
+    made.stop()
+    assert len(files(tmp_path)) == count
+
+
+def test_old_recordings_go_when_all_are_too_large(tmp_path: Path) -> None:
+    for total, stays in (("3", True), ("2", False)):
+        folder = tmp_path / total
+        folder.mkdir()
+        (folder / "flight-000001.mcap").write_bytes(b"x" * 1_500_000)
+        made = recorder(folder, f"recording.max_total_MB={total}")
+        made.start()
+        feed(made, range(50), 15_000)
+        made.stop()
+        assert (folder / "flight-000001.mcap").exists() is stays
+
+
+def test_nothing_is_recorded_where_too_little_is_free(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"recording\.min_free_MB is 1000000$"):
+        recorder(tmp_path, "recording.min_free_MB=1000000").start()
 
 
 def test_a_recording_is_written_through_as_often_as_configured(tmp_path: Path) -> None:
@@ -240,12 +326,3 @@ def test_a_recording_is_written_through_as_often_as_configured(tmp_path: Path) -
     often.stop()
     seldom.stop()
     assert seldom_path.stat().st_size > head_bytes
-
-
-def test_each_key_of_the_settings_has_a_test_that_sets_it() -> None:
-    """A new one needs its own, which sees what it does."""
-    told = ""
-    for path in Path(__file__).parent.glob("test_firmware_*.py"):
-        told += path.read_text() if path.name != "test_firmware_settings.py" else ""
-    keys = [name for name, _ in fields_of(Settings)]
-    assert [key for key in keys if key.rpartition(".")[2] not in told] == []
