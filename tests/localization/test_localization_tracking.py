@@ -523,3 +523,17 @@ def test_what_a_job_raised_is_raised_where_it_lands_and_a_dropped_one_never():
     worker.submit(lambda: 1 // 0, 0)
     worker.drop()
     assert not worker.busy and worker.collect(1_000_000_000) is None
+
+
+def test_what_tells_no_view_leaves_the_keyframe_as_it_is(wall):
+    image = wall.picture(np.eye(4))
+    line = np.linspace([60, 240], [580, 240], 20, dtype=np.float32)
+    rng = np.random.default_rng(3)
+    for start, aim in [
+        (line[:4], line[:4] + 5),  # too few
+        (line, line + np.float32([0, 5])),  # one line
+        (line, np.full_like(line, 7)),  # one place
+        (line, rng.uniform(0, 480, line.shape).astype(np.float32)),  # anywhere
+    ]:
+        template, there = tracking._bent(image, start, aim, 21)
+        assert template is image and there is start

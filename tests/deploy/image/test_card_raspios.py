@@ -161,3 +161,10 @@ def test_a_root_with_too_few_inodes_gets_more(tmp_path):
     raspios._grow(place, tree, EPOCH)
     assert int(ext4.facts(place)["Free inodes"]) >= len(tree)
     ext4.fill(place, tree, EPOCH)
+
+
+def test_nobody_has_a_password_and_the_bases_user_is_gone(reader):
+    passwd, shadow = reader.rows("etc/passwd"), reader.rows("etc/shadow")
+    assert set(passwd) == set(shadow) and "somebody" not in passwd
+    assert all(row[1] == "*" for row in shadow.values())
+    assert reader.stat("etc/shadow")["mode"] == "0640"
