@@ -42,10 +42,10 @@ async def _serve(folder: Path) -> None:
     token = read_token(http)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    loop.set_exception_handler(complain(RateLimitedLog(_print)))
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     with listen(http.host, http.port) as socket, Bus(folder, processes.WEB) as bus:
+        loop.set_exception_handler(complain(RateLimitedLog(_print), socket))
         web = build(run, folder, bus, token)
         serving = server(web.guarded)
         gc.freeze()

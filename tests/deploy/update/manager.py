@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import struct
 import subprocess
 import threading
 import time
@@ -16,6 +17,7 @@ from deploy.board.releases.service import Seen, judge
 _LOOK_S = 0.05
 _END_S = 10.0
 _RESTART_S = 0.2  # the unit waits longer, for nothing that is tested here
+_CREDENTIALS = struct.Struct("3i")  # pid, uid, gid: unix(7)
 
 
 class Manager:
@@ -30,6 +32,7 @@ class Manager:
         self._command, self._environment = list(command), dict(environment)
         self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._notify.bind(str(folder / "notify"))
+        self._notify.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         self._notify.settimeout(_LOOK_S)
         self._environment["NOTIFY_SOCKET"] = str(folder / "notify")
         self._log = (folder / "journal").open("ab")
@@ -92,11 +95,10 @@ class Manager:
 
     def _run(self) -> None:
         while not self._over.is_set():
-            try:
-                line = self._notify.recv(4096).decode()
-            except TimeoutError:
-                line = ""
+            line, sender = self._hear()
             with self._lock:
+                if self._process is None or sender != self._process.pid:
+                    line = ""  # NotifyAccess=main: what one that has ended said late is of no other
                 if line == "READY=1":
                     self._ready_us = time.monotonic_ns() // 1000
                 elif line.startswith("STATUS="):
@@ -107,6 +109,14 @@ class Manager:
                     if time.monotonic() - self._ended_s >= _RESTART_S:
                         self._restarts += 1
                         self._start()
+
+    def _hear(self) -> tuple[str, int]:
+        """The next line of a program and its process, or nothing for a moment."""
+        try:
+            line, control, _, _ = self._notify.recvmsg(4096, socket.CMSG_SPACE(_CREDENTIALS.size))
+        except TimeoutError:
+            return "", 0
+        return line.decode(), _CREDENTIALS.unpack(control[0][2])[0]
 
 
 def environment(more: Mapping[str, str]) -> dict[str, str]:
