@@ -67,9 +67,8 @@ Alarms = Mapping[str, Standing]
 def judge(state: Mapping[str, Any], now_ns: int, before: Alarms) -> dict[str, Standing]:
     """The alarms that stand now, by id.
 
-    `state` is the document of GET /api/state with its events, `now_ns` the wall clock, `before`
-    what this function returned last. A clock that is set back makes no alarm stand longer than
-    `HOLD_S` from then on.
+    `state` is the document of GET /api/state, `now_ns` the wall clock, `before` what this function
+    returned last. A clock that is set back makes no alarm stand longer than `HOLD_S` from then on.
     """
     result: dict[str, Standing] = {}
     for alarm in _found(state, now_ns, frozenset(before)):
@@ -108,22 +107,27 @@ def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> I
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
     yield from _of_unlisted(state, now_ns)
-    yield from _of_stations(state["fleet"] or {})
+    yield from _of_stations(_table(state, "fleet"))
     yield from _of_neighbours(state, standing)
-    for payload_id, view in state["payloads"].items():
-        if not view["alive"]:
+    for payload_id, view in _table(state, "payloads").items():
+        if not isinstance(view, dict):
+            continue
+        if _table(view, "payload").get("relayed") and view.get("alive"):
+            continue  # its own station does, and says it
+        if not view.get("alive"):
             yield from _of_gone(payload_id, view)
-        elif not view["payload"]["relayed"]:  # else its own station does, and says it
-            yield from _of_flight(payload_id, view)
-            yield from _of_link(payload_id, view, standing)
-            yield from _of_board(payload_id, view["payload"], standing)
+            continue
+        yield from _of_flight(payload_id, view)
+        yield from _of_link(payload_id, view, standing)
+        yield from _of_board(payload_id, view, standing)
 
 
 def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    alive_s, age_s = view["alive_s"], view["age_s"]
-    frame_s, estimate_s = age_s["frame"], age_s["estimate"]
+    alive_s = _number(view.get("alive_s")) or 0.0
+    age_s = _table(view, "age_s")
+    frame_s, estimate_s = _number(age_s.get("frame")), _number(age_s.get("estimate"))
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
-    if not frames_come and (other := view["payload"]["station"]):
+    if not frames_come and (other := _table(view, "payload").get("station")):
         text = f"flies with station '{other}', which gets its video"
         yield Alarm(f"elsewhere/{payload_id}", INFO, payload_id, text)
     elif not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
@@ -132,161 +136,164 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
         if frame_s is None:  # telemetry comes through, and never any video
             text += ": a firewall? sudo blimp doctor looks"
         yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, text)
-    if estimate_s is None:
-        return
-    estimate, nothing_s = view["estimate"], view["nothing_known_s"] or 0.0
-    if estimate_s <= NO_FRAMES_S:
-        reason, state_s = estimate["reason"], view["state_s"]
-        if nothing_s > NOTHING_KNOWN_S and not reason.startswith(NO_MAP):
-            text = (
-                f"nothing of the map {estimate['map']} has been recognised for {nothing_s:.0f} s:"
-                " is it this building?"
-            )
-            yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
-        elif estimate["state"] == "LOST" and state_s > LOST_S:
-            text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
-            yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
-        if estimate["overload"]:
-            yield Alarm(f"overload/{payload_id}", WARNING, payload_id, estimate["overload"])
-    if frames_come and min(estimate_s, alive_s) > NO_POSES_S:
+    estimates_come = estimate_s is not None and estimate_s <= NO_FRAMES_S
+    estimate, state_s = _table(view, "estimate"), _number(view.get("state_s")) or 0.0
+    nothing_s = _number(view.get("nothing_known_s")) or 0.0
+    reason = str(estimate.get("reason") or "")
+    if estimates_come and nothing_s > NOTHING_KNOWN_S and not reason.startswith(NO_MAP):
+        text = f"nothing of the map {estimate.get('map')} has been recognised for {nothing_s:.0f} s"
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, f"{text}: is it this building?")
+    elif estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:
+        text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
+    if estimates_come and (overload := str(estimate.get("overload") or "")):
+        yield Alarm(f"overload/{payload_id}", WARNING, payload_id, overload)
+    if frames_come and estimate_s is not None and min(estimate_s, alive_s) > NO_POSES_S:
         text = f"frames come, but none was localized for {estimate_s:.0f} s"
         yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)
 
 
 def _of_link(payload_id: str, view: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    note = view["payload"]
-    share, name = note["lost_share"], f"radio/{payload_id}"
-    if share > (LOSS_NO_MORE_HIGH if name in standing else LOSS_HIGH):
-        signal = (note["health"] or {}).get("wifi_signal_dBm")
+    note = _table(view, "payload")
+    share, name = _number(note.get("lost_share")), f"radio/{payload_id}"
+    if share is not None and share > (LOSS_NO_MORE_HIGH if name in standing else LOSS_HIGH):
+        signal = _number(_table(note, "health").get("wifi_signal_dBm"))
         text = f"the radio loses {100 * share:.0f} % of the packets"
         text += f", at {signal:.0f} dBm" if signal is not None else ""
         yield Alarm(name, WARNING, payload_id, f"{text}: nearer to the access point?")
-    uncertain_ns = (note["clock"] or {}).get("uncertainty_ns")
+    uncertain_ns = _number(_table(note, "clock").get("uncertainty_ns"))
     limit_s = CLOCK_LOOSE_S * (CLOCK_OVER if f"clock/{payload_id}" in standing else 1.0)
     if uncertain_ns is not None and uncertain_ns > 1e9 * limit_s:
         text = f"the payload's clock is known to ±{1e-6 * uncertain_ns:.0f} ms only: slow network?"
         yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
-    unknown_s = view["clock_unknown_s"]
+    unknown_s = _number(view.get("clock_unknown_s"))
     if unknown_s is not None and unknown_s > CLOCK_UNKNOWN_S:
         text = "the payload's clock is not known: poses have no exact time"
         yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
 
 
 def _of_board(
-    payload_id: str, note: Mapping[str, Any], standing: frozenset[str]
+    payload_id: str, view: Mapping[str, Any], standing: frozenset[str]
 ) -> Iterator[Alarm]:
-    battery, health = note["battery"] or {}, note["health"] or {}
-    level = {ALARM_CRITICAL: ALARM, ALARM_LOW: WARNING}.get(battery.get("alarm", ""))
+    note = _table(view, "payload")
+    battery, health = _table(note, "battery"), _table(note, "health")
+    level = {ALARM_CRITICAL: ALARM, ALARM_LOW: WARNING}.get(str(battery.get("alarm")))
     if level is not None:
         text = "battery critical" if level == ALARM else "battery low"
-        text += f": {battery['voltage']:.2f} V"
-        if (share := battery["percentage"]) is not None:
-            text += f", {100 * share:.0f} %"
-        if (left_s := battery["time_left_s"]) is not None:
-            text += f", {left_s / 60:.0f} min left"
+        voltage, share = _number(battery.get("voltage")), _number(battery.get("percentage"))
+        left_s = _number(battery.get("time_left_s"))
+        parts = [
+            *([f"{voltage:.2f} V"] if voltage is not None else []),
+            *([f"{100 * share:.0f} %"] if share is not None else []),
+            *([f"{left_s / 60:.0f} min left"] if left_s is not None else []),
+        ]
+        text += f": {', '.join(parts)}" if parts else ""
         yield Alarm(f"battery/{payload_id}", level, payload_id, text)
     name = f"hot/{payload_id}"
-    celsius = health.get("temperature_C")
+    celsius = _number(health.get("temperature_C"))
     if celsius is not None and celsius > (NO_MORE_HOT_C if name in standing else HOT_C):
         text = f"the payload's processor has {celsius:.0f} °C"
         yield Alarm(name, WARNING, payload_id, text)
-    held = [one for one in health.get("throttled") or () if not one.endswith(WAS)]
+    held = [str(one) for one in health.get("throttled") or () if not str(one).endswith(WAS)]
     if held:
         text = f"the payload's board is held back: {', '.join(held)}"
         text += ": is its cell or its wiring too weak?" if UNDERVOLTAGE in held else ""
         yield Alarm(f"throttled/{payload_id}", WARNING, payload_id, text)
     name = f"payload-disk/{payload_id}"
-    free_MB = health.get("disk_free_MB")
+    free_MB = _number(health.get("disk_free_MB"))
     if health.get("recording") and _below(free_MB, DISK_WARNING_MB, name in standing):
         text = f"{free_MB:.0f} MB left on the payload's card, which records"
         yield Alarm(name, WARNING, payload_id, text)
 
 
 def _of_gone(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    gone_s = view["gone_s"]
+    gone_s = _number(view.get("gone_s"))
     if gone_s is None or gone_s > GONE_FOR_S:  # never here, or switched off for long
         return
     name = f"gone/{payload_id}"
-    if view["ended"]:
+    if view.get("ended"):
         yield Alarm(name, INFO, payload_id, "ended in order")
     else:
         yield Alarm(name, ALARM, payload_id, "gone: nothing is heard of the payload")
 
 
 def _of_recording(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    if (recording := state["recording"]) is None:
-        return
-    if recording["problem"]:
+    recording = _table(state, "recording")
+    if recording.get("problem"):
         yield Alarm("recording", ALARM, STATION, f"recording: {recording['problem']}")
-    if recording["resumed"] and recording["duration_s"] < RESUMED_S:
-        yield Alarm("resumed", WARNING, STATION, f"recording: {recording['resumed']}")
-    free_MB = recording["free_MB"]
+    resumed, lasts_s = recording.get("resumed"), _number(recording.get("duration_s")) or 0.0
+    if resumed and lasts_s < RESUMED_S:
+        yield Alarm("resumed", WARNING, STATION, f"recording: {resumed}")
+    free_MB = _number(recording.get("free_MB"))
     # It ends at the setting's limit: the warning comes before.
-    limit_MB = state["station"]["min_free_MB"]
+    limit_MB = _number(_table(state, "station").get("min_free_MB")) or 0.0
     limit_MB = limit_MB + max(limit_MB, DISK_WARNING_MB)
-    if recording["active"] and _below(free_MB, limit_MB, "disk" in standing):
+    if recording.get("active") and _below(free_MB, limit_MB, "disk" in standing):
         yield Alarm("disk", WARNING, STATION, f"{free_MB:.0f} MB left on the recordings' disk")
 
 
 def _of_processes(state: Mapping[str, Any]) -> Iterator[Alarm]:
-    payloads = state["payloads"]
-    for process in state["processes"]:
-        name, age_s, restarted_s = process["name"], process["age_s"], process["restarted_s"]
+    payloads = _table(state, "payloads")
+    for process in state.get("processes") or ():
+        name, age_s = str(process.get("name")), _number(process.get("age_s"))
         kind, _, payload_id = name.partition("/")
         payload = payload_id if payload_id in payloads else STATION
         # A localizer ends with its payload.
-        if payload_id and (payload == STATION or not payloads[payload_id]["alive"]):
-            continue
-        if age_s > SILENT_S:
+        wanted = not payload_id or bool(_table(payloads, payload_id).get("alive"))
+        if wanted and age_s is not None and age_s > SILENT_S:
             level = ALARM if kind in ("intake", "localizer") else WARNING
             text = f"the process {name} is silent for {age_s:.0f} s"
             yield Alarm(f"silent/{name}", level, payload, text)
-        if restarted_s is not None and restarted_s < RESTARTED_S:
+        restarted_s = _number(process.get("restarted_s"))
+        if wanted and restarted_s is not None and restarted_s < RESTARTED_S:
             yield Alarm(f"restarted/{name}", WARNING, payload, f"the process {name} was restarted")
 
 
 def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     refused: dict[str, Alarm] = {}
-    for event in state["events"]:
-        lately = abs(now_ns - event["time_ns"]) < MAP_REFUSED_S * 1e9
-        if event["name"] == MAP_REFUSED and lately:
-            level = ALARM if event["level"] == ALARM else WARNING
-            payload_id = event["payload"]
-            refused[payload_id] = Alarm(f"map/{payload_id}", level, payload_id, event["text"])
-    for payload_id, view in state["payloads"].items():
+    for event in state.get("events") or ():
+        time_ns = _number(event.get("time_ns"))
+        if event.get("name") != MAP_REFUSED or time_ns is None:
+            continue
+        if abs(now_ns - time_ns) < MAP_REFUSED_S * 1e9:
+            payload_id, text = str(event.get("payload")), str(event.get("text"))
+            level = ALARM if event.get("level") == ALARM else WARNING
+            refused[payload_id] = Alarm(f"map/{payload_id}", level, payload_id, text)
+    for payload_id, view in _table(state, "payloads").items():
         # A localizer without a map says so with its frames.
-        reason = (view["estimate"] or {}).get("reason", "")
-        if reason.startswith(NO_MAP) and view["alive"]:
+        reason = str(_table(view, "estimate").get("reason") or "")
+        if reason.startswith(NO_MAP) and isinstance(view, dict) and view.get("alive"):
             refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
     yield from refused.values()
 
 
 def _of_unlisted(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     # An intake that is started again says it again, where that is still so.
-    restarted = (one["restarted_s"] for one in state["processes"] if one["name"] == "intake")
-    restarted_s = next(restarted, None)
+    of_intake: Iterator[Mapping[str, Any]] = (
+        one for one in state.get("processes") or () if one.get("name") == "intake"
+    )
+    restarted_s = _number(next(of_intake, {}).get("restarted_s"))
     since_ns = now_ns - 1e9 * (math.inf if restarted_s is None else restarted_s)
     said = [
         event
-        for event in state["events"]
-        if event["name"] == UNLISTED and event["time_ns"] >= since_ns
+        for event in state.get("events") or ()
+        if event.get("name") == UNLISTED and (_number(event.get("time_ns")) or 0.0) >= since_ns
     ]
-    newest = max(said, key=lambda event: event["time_ns"], default=None)
-    if newest is not None and newest["level"] == WARNING:
-        yield Alarm(UNLISTED, WARNING, STATION, newest["text"])
+    newest = max(said, key=lambda event: _number(event.get("time_ns")) or 0.0, default=None)
+    if newest is not None and newest.get("level") == WARNING:
+        yield Alarm(UNLISTED, WARNING, STATION, str(newest.get("text")))
 
 
 def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
     """Two blimps too near each other, whichever stations they fly with, in maps of one origin."""
-    limit_m = state["station"]["apart_m"]
+    limit_m = _number(_table(state, "station").get("apart_m")) or 0.0
     where: dict[str, Any] = {}
-    for payload_id, view in state["payloads"].items():
-        estimate, age_s = view["estimate"], view["age_s"]["estimate"]
-        if age_s is None or age_s > NO_FRAMES_S or estimate["position_m"] is None:
-            continue
-        if estimate["state"] in ("TRACKING", "DEGRADED"):
-            coordinates = estimate["coordinates"] or estimate["map"]
-            where[payload_id] = coordinates, estimate["position_m"]
+    for payload_id, view in _table(state, "payloads").items():
+        estimate, age_s = _table(view, "estimate"), _number(_table(view, "age_s").get("estimate"))
+        position_m = [_number(value) for value in estimate.get("position_m") or ()]
+        known = estimate.get("state") in ("TRACKING", "DEGRADED") and len(position_m) == 3
+        if known and None not in position_m and age_s is not None and age_s <= NO_FRAMES_S:
+            where[payload_id] = estimate.get("coordinates") or estimate.get("map"), position_m
     for one, other in itertools.combinations(sorted(where), 2):
         (ours, here), (theirs, there) = where[one], where[other]
         name, distance_m = f"near/{one}/{other}", math.dist(here, there)
@@ -295,7 +302,7 @@ def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterat
 
 
 def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
-    for other in fleet.get("stations", ()):
+    for other in fleet.get("stations") or ():
         name, age_s, clock_s = other["name"], other["age_s"], other["clock_s"]
         if age_s > SILENT_S:
             text = f"nothing is heard of station '{name}'"
@@ -310,16 +317,27 @@ def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
                 f"station '{name}' flies in another map, '{other['map']}': its poses are not shown"
             )
             yield Alarm(f"station-map/{name}", INFO, STATION, text)
-    for offer in fleet.get("offers", ()):
+    for offer in fleet.get("offers") or ():
         station, name = offer["station"], offer["map"]
         text = f"station '{station}' has '{name}', this map with {offer['more']} landmarks more"
         yield Alarm(f"station-offers/{station}/{name}", INFO, STATION, f"{text}: Map… (M)")
-    for payload_id, name in fleet.get("twins", {}).items():
+    for payload_id, name in _table(fleet, "twins").items():
         text = f"two payloads have this name: one flies here, one with station '{name}'"
         yield Alarm(f"twin/{payload_id}", ALARM, payload_id, text)
-    for text in fleet.get("refused", ()):
+    for text in fleet.get("refused") or ():
         yield Alarm(f"refused/{text[:80]}", WARNING, STATION, f"not joined: {text}")
 
 
 def _below(value: float | None, limit: float, stands: bool) -> bool:
     return value is not None and value < limit * (DISK_OVER if stands else 1.0)
+
+
+def _table(of: Any, name: str) -> dict[str, Any]:
+    value = of.get(name) if isinstance(of, Mapping) else None
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value)
