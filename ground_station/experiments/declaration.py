@@ -45,6 +45,13 @@ class FlightDeclaration:
         None, "deviation of the air's speed, which makes the blimp swing", unit="m/s", low=0, high=2
     )
     people: int = config.key(0, "who walk to and fro", low=0, high=100)
+    storey_m: float = config.key(
+        0.0,
+        "height of its floor above the map's, which has nothing of it",
+        unit="m",
+        low=0,
+        high=100,
+    )
     lens_error: float = config.key(
         0.0, "share by which the focal length that is known is off", low=-0.2, high=0.2
     )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from ground_station.errors import InputError
 from ground_station.experiments.declaration import FlightDeclaration
@@ -41,7 +43,10 @@ def flown(flight: FlightDeclaration, recording: Path | None, data: Path) -> Flow
         source = FlightRecording(recording)
         if source.camera is None:
             raise InputError(f"{recording}: it carries no camera calibration")
-        return Flown(source, source.camera, trajectory_of(recording, TRUTH_TOPIC), recording)
+        truth = trajectory_of(recording, TRUTH_TOPIC)
+        above_m = np.array([0.0, 0.0, flight.storey_m])
+        truth = replace(truth, position_m=truth.position_m + above_m)
+        return Flown(source, source.camera, truth, recording)
     if not (flight.truth and flight.camera):
         raise InputError(f"the folder '{flight.folder}' needs 'truth' and 'camera' beside it")
     wanted = parse_range(flight.range) if flight.range else FrameRange()

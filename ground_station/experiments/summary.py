@@ -85,7 +85,7 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         "localizer": dict(case.localizer),
         "presets": presets,
         "common": common,
-        "worse": worse(presets, common),
+        "worse": elsewhere(presets) if case.flight.storey_m else worse(presets, common),
     }
 
 
@@ -179,6 +179,24 @@ def _shares(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str,
         for k, run in enumerate(pair):
             localized[k] += len(times & {*(run.get("series") or {"time_s": ()})["time_s"]})
     return {"ours": localized[0] / seen, "theirs": localized[1] / seen} if seen else None
+
+
+def elsewhere(presets: dict[str, Any]) -> list[str]:
+    """In what the default is worse where the map has nothing of the flight, and all poses are
+    wrong.
+    """
+    ours = presets.get("default")
+    if ours is None:
+        return []
+    if ours["failed"]:
+        return [f"it failed: {ours['failed'][0]}"]
+    return [
+        f"{100 * ours['localized']:.1f} % of the frames are localized where none can be, "
+        f"{said} {100 * theirs['localized']:.1f} %"
+        for name, said in RIVALS.items()
+        if (theirs := presets.get(name)) and not theirs["failed"]
+        if ours["localized"] > theirs["localized"]
+    ]
 
 
 def worse(presets: dict[str, Any], common: dict[str, Any]) -> list[str]:

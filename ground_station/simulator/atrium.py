@@ -32,17 +32,17 @@ _MOVED_SEED = 5
 
 
 class _Atrium:
-    def __init__(self, texels_per_m: float, *, moved: bool, posted: bool) -> None:
+    def __init__(self, texels_per_m: float, *, moved: float, posted: bool) -> None:
         self.b = SceneBuilder(texels_per_m)
         self.moved, self.posted = moved, posted
         self._places = np.random.default_rng(_MOVED_SEED)
+        self._pieces = np.random.default_rng(_MOVED_SEED + 1)
 
     def placed(self, x: float, y: float) -> tuple[float, float]:
         """Where a piece of furniture stands that was at (x, y) when the hall was mapped."""
-        if not self.moved:
-            return x, y
         dx, dy = self._places.uniform(-MOVED_M, MOVED_M, 2).tolist()
-        return x + dx, y + dy
+        stays = self._pieces.random() >= self.moved
+        return (x, y) if stays else (x + dx, y + dy)
 
     def sign(
         self, name: str, origin: list[float], u: list[float], v: list[float], **o: Any
@@ -340,16 +340,17 @@ class _Atrium:
         self.b.rectangle([-6, 20, 14], [36, 0, 0], [0, -26, 0], "sky", detail=0.2, outside=True)
 
 
-def build_atrium(texels_per_m: float, *, moved: bool = False, posted: bool = False) -> Scene:
+def build_atrium(texels_per_m: float, *, moved: float = 0.0, posted: bool = False) -> Scene:
     """The scene `atrium`.
 
-    `moved`: benches, sofas and plants stand up to `MOVED_M` elsewhere; `posted`: other posters hang
-    in the old ones' places. That is the hall some time after it was mapped.
+    A share `moved` of benches, sofas and plants stands up to `MOVED_M` elsewhere; `posted`: other
+    posters hang in the old ones' places. That is the hall some time after it was mapped.
     """
     a = _Atrium(texels_per_m, moved=moved, posted=posted)
     for part in (
         a.floor_and_ceiling, a.south, a.west, a.east, a.north, a.pillars, a.furniture, a.outside,
     ):  # fmt: skip
         part()
-    name = "atrium" + "-moved" * moved + "-posted" * posted
+    share = "" if moved == 1 else f"-{100 * moved:.0f}"
+    name = "atrium" + f"-moved{share}" * (moved > 0) + "-posted" * posted
     return a.b.scene(name, (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

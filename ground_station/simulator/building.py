@@ -15,13 +15,21 @@ from ground_station.simulator.scene import Footprint, KnownPoint, Scene, Surface
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 OPEN = ("-x", "+x", "-y", "+y", "+z")
 """Of what stands on something."""
+REFLECTION = "reflection"
+"""Material of what a pane shows: the texture of surface `of`, as seen in a mirror."""
+_OF_A_STOREY = 2_000_000
+"""First of the numbers by which textures of a storey are drawn; above those of all plates."""
 
 
 class SceneBuilder:
-    """Collects what a scene is of; every solid is made of rectangles."""
+    """Collects what a scene is of; every solid is made of rectangles.
 
-    def __init__(self, texels_per_m: float) -> None:
-        self.texels_per_m = texels_per_m
+    Textures are drawn by a surface's number, so scenes of equal rooms have equal ones; those of
+    another `storey` are others, but for prints of a plate.
+    """
+
+    def __init__(self, texels_per_m: float, storey: int = 0) -> None:
+        self.texels_per_m, self.storey = texels_per_m, storey
         self.surfaces: list[Surface] = []
         self.footprints: list[Footprint] = []
         self.known: list[KnownPoint] = []
@@ -39,6 +47,8 @@ class SceneBuilder:
         **options: Any,
     ) -> Surface:
         """Adds one rectangle; `detail` scales the scene's texture resolution."""
+        if self.storey:
+            options.setdefault("print", self.storey * _OF_A_STOREY + len(self.surfaces))
         surface = Surface(
             np.asarray(origin_m, dtype=np.float64),
             np.asarray(u_m, dtype=np.float64),
@@ -110,6 +120,26 @@ class SceneBuilder:
             ([x, y, z], [0, s, 0]), ([x + s, y + s, z], [0, -s, 0]),
         ):  # fmt: skip
             self.rectangle(origin, u, [0, 0, curb_m], "plaster", rgb=rgb)
+
+    def mirrors(self, pane: Surface, share: float) -> None:
+        """Adds what a pane of dark glass shows: a share of the light of all that is there so far.
+
+        Its back, which no camera sees, is to the room; what is beyond it are the room's surfaces
+        reflected in its plane. Who walks is not, nor is what other panes show.
+        """
+        normal = pane.normal
+        flip = np.eye(3) - 2 * np.outer(normal, normal)
+        for number, s in enumerate(tuple(self.surfaces)):
+            behind_m = (pane.origin_m - s.corners()) @ normal
+            if s.outside or behind_m.max() < 1e-6:
+                continue
+            u, v = flip @ s.u_m, flip @ s.v_m
+            origin = s.origin_m + 2 * ((pane.origin_m - s.origin_m) @ normal) * normal
+            # A reflection turns fronts into backs: from its other end its columns run as u does.
+            self.surfaces.append(
+                Surface(origin + u, -u, v, REFLECTION, s.texels_per_m,
+                        {"of": number, "share": share}, outside=True)
+            )  # fmt: skip
 
     def walls(self, *bounds_m: tuple[float, float, float, float]) -> None:
         """Adds walls to the floor plan: low x, low y, high x, high y of each."""

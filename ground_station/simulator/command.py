@@ -26,8 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--scene",
         default="atrium",
-        help="atrium, office, corridor, hall (repeating panels), rooms (a flat), interior-1 to"
-        " interior-999 (by chance: odd halls, even offices), atrium-moved (other furniture),"
+        help="atrium, office, corridor, hall (repeating panels), hall-glazed (a wall of dark"
+        " glass), hall-above (the floor above: the same panels, other posters and furniture),"
+        " rooms (a flat), interior-1 to interior-999 (by chance: odd halls, even offices),"
+        " atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
         " atrium-moved-posted (and other posters) (default: atrium)",
     )
     add(
@@ -37,7 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " person's camera: stills (12 places, 8 headings, a wide lens), headset (a walk through"
         " --scene rooms), walk (round an interior with a phone)",
     )
-    add("--light", default="noon", help="noon, cloudy, evening or sunset (default: noon)")
+    add(
+        "--light",
+        default="noon",
+        help="noon, cloudy, evening, sunset, or 0h to 23h of a day (default: noon)",
+    )
     add("--seed", type=int, default=0, help="seed of path, draughts and noise (default: 0)")
     add("--out", type=Path, metavar="F.mcap", help="recording to write")
     add("--duration-s", type=float, metavar="S", help="length of the flight (default: the plan's)")

@@ -3,8 +3,10 @@
 Three panels of four are the same two plates over and over, and so are the strips between them, the
 pilasters, the skirting and the ceiling: a view of one stretch of wall matches every other one.
 What tells the stretches apart is what does so in a real hall: doors with their numbers, posters,
-furniture, boxes on the wall, and the floor's stains. x runs east along the long walls, z up; the
-origin is the south-west corner on the floor. Light falls in through the roof.
+furniture, boxes on the wall, and the floor's stains. The floor above has the same plates, doors and
+lamps, and other posters, furniture and stains; a glazed hall has dark panes for a third of its
+northern wall, which show the hall as windows do at night. x runs east along the long walls, z up;
+the origin is the south-west corner on the floor. Light falls in through the roof.
 """
 
 from __future__ import annotations
@@ -74,10 +76,18 @@ _FURNITURE = (
 _PLANTS = ((2.0, 11.2), (17.3, 10.9), (8.7, 0.5), (17.2, 3.6), (0.5, 6.4))
 
 
-def _panels(b: SceneBuilder, wall: _Wall) -> None:
+_PANES = range(4, 9), range(3)
+"""Panels of the northern wall that are of glass where it is glazed: along it, and from below."""
+_REFLECTS = 0.3
+"""Of what falls on dark glass at a slant; head-on it is a tenth (two faces, Fresnel)."""
+
+
+def _panels(b: SceneBuilder, wall: _Wall, glazed: bool) -> None:
     """Chequers of two plates, strips between them, pilasters at every third, the skirting."""
     for j in range(round(wall.length_m / PANEL_M)):
         for k in range(round(HEIGHT_M / ROW_M)):
+            if glazed and j in _PANES[0] and k in _PANES[1]:
+                continue
             is_dark = (j + k) % 2
             material = "wood" if is_dark else "concrete"
             b.rectangle(
@@ -125,9 +135,9 @@ def _roof(b: SceneBuilder) -> list[tuple[float, float, float]]:
     return [(4.5 * i, y, HEIGHT_M - 0.5) for i in (1, 2, 3) for y in (3.0, 9.0)]
 
 
-def build_hall(texels_per_m: float) -> Scene:
-    """The scene `hall`."""
-    b = SceneBuilder(texels_per_m)
+def build_hall(texels_per_m: float, *, glazed: bool = False, above: bool = False) -> Scene:
+    """The scene `hall`, glazed, or the floor above it, in coordinates of its own floor."""
+    b = SceneBuilder(texels_per_m, storey=int(above))
     b.walls(
         (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
         (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
@@ -137,23 +147,34 @@ def build_hall(texels_per_m: float) -> Scene:
             b.rectangle([3 * i, 4 * j, 0], [3, 0, 0], [0, 4, 0], "terrazzo", slab_m=0.75,
                         detail=0.8)  # fmt: skip
     for wall in (_SOUTH, _EAST, _NORTH, _WEST):
-        _panels(b, wall)
+        _panels(b, wall, glazed and wall is _NORTH)
     b.lamps = _roof(b)
     for wall, at, text in _DOORS:
+        text = text.replace("H ", "H 1") if above else text
         b.rectangle(wall.at(at + 1.1, 0.03, 0), wall.rightwards(1.1), [0, 0, 2.15], "door",
                     text=text, detail=1.3)  # fmt: skip
         for post in (at - 0.1, at + 1.1):
             b.box(*wall.solid((post, post + 0.1), 0.07, (0.0, 2.25)), "wood", upright=True)
     for wall, at, z, width, height, text in _POSTERS:
+        at, text = (wall.length_m - width - at, text[::-1]) if above else (at, text)
         b.sign(f"sign-{text.lower()}", wall.at(at + width, 0.03, z), wall.rightwards(width),
                [0, 0, height], text)  # fmt: skip
     for wall, at in ((_SOUTH, 4.0), (_EAST, 10.9), (_NORTH, 6.1), (_WEST, 6.6)):  # fuse boxes
         b.box(*wall.solid((at, at + 0.5), 0.14, (1.3, 2.0)), "metal", rgb=_RED)
     for x, y, length, width, height, material, rgb in _FURNITURE:
+        y = WIDTH_M - width - y if above else y
         colour = {} if rgb is None else {"rgb": rgb}
         b.stand([x, y, 0], [x + length, y + width, height], material, faces=OPEN, **colour)
     for x, y in _PLANTS:
+        y = WIDTH_M - y if above else y
         b.box([x - 0.2, y - 0.2, 0], [x + 0.2, y + 0.2, 0.45], "concrete", rgb=_DARK)
         b.box([x - 0.3, y - 0.3, 0.45], [x + 0.3, y + 0.3, 1.25], "foliage")
         b.footprints.append(Footprint((x - 0.2, y - 0.2, x + 0.2, y + 0.2), "furniture"))
-    return b.scene("hall", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)
+    if glazed:
+        along, rows = _PANES
+        left = _NORTH.at(PANEL_M * along.start, 0.0, 0.0)
+        right = [PANEL_M * len(along) * a for a in _NORTH.along]
+        pane = b.rectangle(left, [*right, 0.0], [0, 0, ROW_M * len(rows)], "metal", detail=0.1)
+        b.mirrors(pane, _REFLECTS)
+    name = "hall" + "-glazed" * glazed + "-above" * above
+    return b.scene(name, (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

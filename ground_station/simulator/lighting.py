@@ -21,8 +21,9 @@ from scipy import ndimage
 
 from ground_station.arrays import F32, F64, I64, U8
 from ground_station.simulator import scenes
+from ground_station.simulator.building import REFLECTION
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
-from ground_station.simulator.scene import Scene, Surface
+from ground_station.simulator.scene import Scene, SimulatorError, Surface
 from ground_station.simulator.textures import MATERIALS, TextureBank
 
 _GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels
@@ -62,6 +63,57 @@ LIGHTS: dict[str, Light] = {
     "evening": Light(-128, 24, 2.6, (1.30, 0.96, 0.62), 0.35, (0.90, 1.0, 1.15), 0.05),
     "sunset": Light(-142, 7, 0.9, (1.60, 0.88, 0.42), 0.09, (0.88, 0.97, 1.22), 0.16),
 }
+
+
+def light_named(name: str) -> Light:
+    """One of `LIGHTS`, or that of an hour of a day, as `17h`; raises `SimulatorError`."""
+    if name in LIGHTS:
+        return LIGHTS[name]
+    hour = name.removesuffix("h")
+    if hour == name or not hour.isdecimal() or int(hour) > 23:
+        known = ", ".join(LIGHTS)
+        raise SimulatorError(f"light '{name:.40}' is unknown; there are: {known}, 0h to 23h")
+    return _at_hour(int(hour))
+
+
+def _at_hour(hour: float) -> Light:
+    """A clear day in April at 40° north, by the sun's time; lamps are lit while it is dim.
+
+    The sun comes through the air mass of Kasten and Young (1989) as Meinel and Meinel (1976) have
+    it; what it loses of each colour, and what the sky gives, lies between `noon` and `sunset`.
+    """
+    turn, north, tilt = np.radians([15 * (hour - 12), 40.0, 10.0])
+    up = np.sin(north) * np.sin(tilt) + np.cos(north) * np.cos(tilt) * np.cos(turn)
+    south = np.sin(north) * np.cos(tilt) * np.cos(turn) - np.cos(north) * np.sin(tilt)
+    elevation_deg = float(np.degrees(np.arcsin(up)))
+    azimuth_deg = float(np.degrees(np.arctan2(-south, -np.cos(tilt) * np.sin(turn))))
+    noon, sunset = LIGHTS["noon"], LIGHTS["sunset"]
+
+    def through(elevation_deg: float) -> float:
+        """The power of the air mass by which light is lost."""
+        mass = 1 / (np.sin(np.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.08) ** -1.6364)
+        return float(mass**0.678)
+
+    least, most = through(noon.sun_elevation_deg), through(sunset.sun_elevation_deg)
+    lost = through(max(elevation_deg, 0.0))
+    share = (lost - least) / (most - least)
+    red, green, blue = (
+        a * (b / a) ** share for a, b in zip(noon.sun_rgb, sunset.sun_rgb, strict=True)
+    )
+    sky = max(up / np.sin(np.radians(noon.sun_elevation_deg)), 0.0) ** 1.2
+    return Light(
+        sun_azimuth_deg=azimuth_deg,
+        sun_elevation_deg=elevation_deg,
+        sun_level=noon.sun_level * 0.7 ** (lost - least) if elevation_deg > 0 else 0.0,
+        sun_rgb=(red, green, blue),
+        sky_level=float(noon.sky_level * sky),
+        sky_rgb=noon.sky_rgb,
+        lamp_level=sunset.lamp_level if sky < _DIM else 0.0,
+    )
+
+
+_DIM = 0.35
+"""Below this light of the sky, over that of noon, lamps are lit: that of `evening`."""
 
 
 def looking(direction: F64, centre_m: npt.ArrayLike, distance_m: float) -> F64:
@@ -242,7 +294,7 @@ class LitTextures:
 def lit_scene(scene_name: str, texels_per_m: float, light_name: str) -> tuple[Scene, LitTextures]:
     """A scene and its lit textures by name; the last is kept, since flights come in series."""
     scene = scenes.build(scene_name, texels_per_m)
-    return scene, lit_textures(scene, LIGHTS[light_name])
+    return scene, lit_textures(scene, light_named(light_name))
 
 
 def lit_textures(scene: Scene, light: Light) -> LitTextures:
@@ -253,8 +305,12 @@ def lit_textures(scene: Scene, light: Light) -> LitTextures:
     sun = light.sun_level * max(light.to_sun[2], 0.0)
     outdoors = sun * np.asarray(light.sun_rgb) + light.sky_level * np.asarray(light.sky_rgb)
     bank = TextureBank(scene.texture_seed)
-    textures = []
+    textures: list[U8] = []
     for index, (s, grid) in enumerate(zip(scene.surfaces, grids, strict=True)):
+        if s.material == REFLECTION:  # codes go with the root of the radiance
+            seen = textures[s.options["of"]][:, ::-1] * np.sqrt(s.options["share"])
+            textures.append(np.rint(seen).astype(np.uint8))
+            continue
         albedo = surface_albedo(bank, scene, index)
         columns, rows = s.size_texels
         if s.outside:

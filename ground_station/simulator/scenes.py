@@ -18,9 +18,13 @@ SCENES: dict[str, Callable[[float], Scene]] = {
     "office": build_office,
     "corridor": build_corridor,
     "hall": build_hall,
+    "hall-glazed": partial(build_hall, glazed=True),
+    "hall-above": partial(build_hall, above=True),
     "rooms": build_rooms,
-    "atrium-moved": partial(build_atrium, moved=True),
-    "atrium-moved-posted": partial(build_atrium, moved=True, posted=True),
+    "atrium-moved-25": partial(build_atrium, moved=0.25),
+    "atrium-moved-50": partial(build_atrium, moved=0.5),
+    "atrium-moved": partial(build_atrium, moved=1.0),
+    "atrium-moved-posted": partial(build_atrium, moved=1.0, posted=True),
 }
 _INTERIOR, _DIGITS = "interior-", 3
 

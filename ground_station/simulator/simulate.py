@@ -29,7 +29,7 @@ from ground_station.simulator.imaging import (
     row_offsets_s,
 )
 from ground_station.simulator.known_points import choose_observations, write_pairs
-from ground_station.simulator.lighting import LIGHTS, lit_scene
+from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
 from ground_station.simulator.rendering import SceneRenderer
@@ -104,9 +104,7 @@ class SimulationSettings:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise SimulatorError(f"{name} is {value}; allowed: {low:g} to {high:g}")
-        if self.light not in LIGHTS:
-            known = ", ".join(LIGHTS)
-            raise SimulatorError(f"light '{self.light}' is unknown; there are: {known}")
+        light_named(self.light)
         if self.duration_s is not None and not 0 < self.duration_s <= 3600:
             raise SimulatorError(f"duration_s is {self.duration_s:g}; allowed: above 0 to 3600")
         unsteady(self.exposure_steps, self.light_steps, self.flicker)

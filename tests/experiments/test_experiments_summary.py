@@ -189,3 +189,15 @@ def test_times_stand_beside_the_thesis_s_words_for_them(tmp_path):
     assert rows[0] == ["features", "–", "0.0200", "0.0200"]
     assert rows[-1] == ["total", "0.261, 0.256", "0.0500", "0.0500"]
     assert "0.261, 0.256" in tables.text(told)
+
+
+def test_where_the_map_has_nothing_of_the_flight_whoever_localizes_less_is_better():
+    def preset(localized):
+        return {"failed": [], "localized": localized}
+
+    shares = {"thesis": preset(0.0), "alone": preset(0.04), "default": preset(0.02)}
+    (reason,) = summary.elsewhere(shares)
+    assert reason.startswith("2.0 % of the frames are localized where none can be, the thesis")
+    assert summary.elsewhere(shares | {"default": preset(0.0)}) == []
+    failed = shares | {"default": {"failed": ["no map"], "localized": None}}
+    assert summary.elsewhere(failed) == ["it failed: no map"]

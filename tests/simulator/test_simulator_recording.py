@@ -163,11 +163,19 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
             "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor, "
             "stills, headset, walk, tour",
         ),
-        ({"light": "moon"}, "light 'moon' is unknown; there are: noon, cloudy, evening, sunset"),
+        (
+            {"light": "moon"},
+            "light 'moon' is unknown; there are: noon, cloudy, evening, sunset, 0h to 23h",
+        ),
+        (
+            {"light": "24h"},
+            "light '24h' is unknown; there are: noon, cloudy, evening, sunset, 0h to 23h",
+        ),
         (
             {"scene": "cave"},
-            "scene 'cave' is unknown; there are: atrium, office, corridor, hall, rooms, "
-            "atrium-moved, atrium-moved-posted, interior-N",
+            "scene 'cave' is unknown; there are: atrium, office, corridor, hall, hall-glazed, "
+            "hall-above, rooms, atrium-moved-25, atrium-moved-50, atrium-moved, "
+            "atrium-moved-posted, interior-N",
         ),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
         ({"duration_s": -1.0}, "duration_s is -1; allowed: above 0 to 3600"),

@@ -9,8 +9,10 @@ import pytest
 
 from ground_station.recording.open import open_input
 from ground_station.simulator import scenes
-from ground_station.simulator.lighting import surface_albedo
+from ground_station.simulator.building import SceneBuilder
+from ground_station.simulator.lighting import light_named, lit_textures, looking, surface_albedo
 from ground_station.simulator.plans import Reference, plan_named
+from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.simulate import simulate
 from ground_station.simulator.textures import TextureBank
@@ -55,7 +57,7 @@ def test_a_halls_plan_that_leaves_the_corridor_is_refused(plan: str) -> None:
 
 
 def test_buildings_share_no_texture() -> None:
-    names = [name for name in scenes.SCENES if not name.startswith("atrium-")]
+    names = [name for name in scenes.SCENES if not name.startswith(("atrium-", "hall-"))]
     assert len({scenes.build(name, 10).texture_seed for name in names}) == len(names)
 
 
@@ -74,6 +76,61 @@ def test_the_office_can_be_filmed(tmp_path: Path) -> None:
     simulate(quick_settings(out, scene="office", light="cloudy", duration_s=0.4))
     frames = [frame.image for frame in open_input(out)]
     assert len(frames) == 2 and all(frame.std() > 20 for frame in frames)
+
+
+def test_of_the_furniture_only_the_share_that_is_asked_for_has_been_moved() -> None:
+    fresh = scenes.build("atrium", 10)
+
+    def moved(name: str) -> set[int]:
+        pairs = enumerate(zip(fresh.surfaces, scenes.build(name, 10).surfaces, strict=True))
+        return {k for k, (a, b) in pairs if not np.array_equal(a.origin_m, b.origin_m)}
+
+    few, half, all_ = (moved(f"atrium-moved{share}") for share in ("-25", "-50", ""))
+    assert few < half < all_
+    assert 0.1 < len(few) / len(all_) < 0.4 < len(half) / len(all_) < 0.6
+
+
+def test_the_floor_above_has_the_same_plates_and_nothing_else_that_is_equal(
+    bank: TextureBank,
+) -> None:
+    below, above = (scenes.build(name, 10) for name in ("hall", "hall-above"))
+    equal = {True: 0, False: 0}
+    for k, a in enumerate(below.surfaces):
+        if a.material in ("sky", "metal", "foliage") or a.options.get("rgb") == (0.13, 0.13, 0.14):
+            continue
+        same = np.array_equal(surface_albedo(bank, below, k), surface_albedo(bank, above, k))
+        assert same == ("print" in a.options), a
+        equal[same] += 1
+    assert equal[True] > 250 and equal[False] > 150
+
+
+def test_dark_glass_shows_what_a_camera_behind_it_would_see_mirrored() -> None:
+    builder = SceneBuilder(40)
+    for x in (-2.0, 0.4):  # two prints a metre or two before the pane
+        builder.rectangle(
+            [x + 1.6, -1 - x / 4, 0], [-1.6, 0.2, 0.1], [0, 0, 1.7], "poster", text="GLASS"
+        )
+    count = len(builder.surfaces)
+    pane = builder.rectangle([2, 1, 0], [-4, 0, 0], [0, 0, 2], "metal")
+    assert np.allclose(pane.normal, [0, 1, 0])  # its back is to what it shows
+    builder.mirrors(pane, 0.25)
+    lit = lit_textures(builder.scene("glass", (4, 2, 2), 7), light_named("noon"))
+    pinhole = Pinhole(320, 240, 200)
+    eye = looking(np.array([0.1, -1.0, 0.0]), np.array([0.2, 0.6, 0.9]), 0.0)
+    mirrored = np.diag([1.0, -1.0, 1.0, 1.0]) @ eye @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirrored[1, 3] += 2.0  # in the plane y = 1
+    pictures = []
+    for pose, some in ((eye, slice(count, None)), (mirrored, slice(count))):
+        surfaces = builder.surfaces[some]
+        with SceneRenderer(surfaces, lit.textures[some], (320, 240)) as renderer:
+            pictures.append(renderer.image_and_depth(pose, pinhole))
+    (seen, away_m), (true, far_m) = pictures
+    assert np.isfinite(far_m).mean() > 0.2
+    assert np.array_equal(np.isfinite(away_m), np.isfinite(far_m[:, ::-1]))
+    both = np.isfinite(away_m)
+    assert np.abs(away_m[both] - far_m[:, ::-1][both]).max() < 0.01
+    off = seen.astype(float) - 0.5 * true[:, ::-1]  # codes go with the root of the light
+    assert np.abs(off).mean() < 2.0 and seen[both].std() > 5.0
 
 
 def test_the_aged_hall_is_the_old_one_but_for_its_furniture_and_posters(bank: TextureBank) -> None:
@@ -95,3 +152,16 @@ def test_the_aged_hall_is_the_old_one_but_for_its_furniture_and_posters(bank: Te
     assert np.array_equal(old, same) and np.abs(old - new).mean() > 0.02
     wall = next(k for k, s in enumerate(fresh.surfaces) if s.material == "brick")
     assert np.array_equal(surface_albedo(bank, fresh, wall), surface_albedo(bank, posted, wall))
+
+
+def test_light_goes_through_a_day_and_lamps_are_lit_when_it_is_dim() -> None:
+    night, dawn, noon, dusk = (light_named(f"{hour}h") for hour in (1, 6, 12, 18))
+    assert noon.sun_elevation_deg == pytest.approx(60.0)
+    assert noon.sun_azimuth_deg == pytest.approx(-90.0)  # the south
+    assert abs(dawn.sun_azimuth_deg) < 15 and abs(abs(dusk.sun_azimuth_deg) - 180) < 15
+    assert night.sun_level == night.sky_level == 0.0 < night.lamp_level == dusk.lamp_level
+    assert noon.lamp_level == 0.0 and 0 < dusk.sun_level < 0.5 * noon.sun_level
+    assert dusk.sun_rgb[0] / dusk.sun_rgb[2] > 2 * noon.sun_rgb[0] / noon.sun_rgb[2]
+    for hour in range(6, 19):
+        light = light_named(f"{hour}h")
+        assert 0 < light.sun_level <= noon.sun_level and 0 < light.sky_level <= noon.sky_level
