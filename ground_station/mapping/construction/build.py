@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.arrays import F64
+from ground_station.arrays import F64, U16
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, colmap_files, landmarks, store
@@ -98,7 +98,7 @@ def build_map(
         # A camera that somebody gives without a word on its lens is a calibrated one.
         lens = SelfCalibration(prior or LensPrior(camera, "file", 0.0), images, settings)
         rounds: list[_Round] = []
-        unlike: set[Pair] = set()
+        matched: dict[Pair, U16] = {}
         going = True
         while going:
             if lens.camera != camera:
@@ -109,7 +109,7 @@ def build_map(
                 limits = _with_noise(limits, seen)
                 pairs = match(
                     images, camera, limits, threads,
-                    cache=cache, workers=workers, unlike=unlike,
+                    cache=cache, workers=workers, matched=matched,
                 )  # fmt: skip
             work = None
             if cache:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ground_station.arrays import F32, F64, I32, I64
+from ground_station.arrays import F32, F64, I32, I64, U16
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction import content
@@ -65,13 +65,13 @@ def match(
     *,
     cache: Cache | None = None,
     workers: Workers | None = None,
-    unlike: set[Pair] | None = None,
+    matched: dict[Pair, U16] | None = None,
 ) -> dict[Pair, TwoView]:
     """Verified pairs (i, j) of images; raises `MapError` when no two images overlap.
 
     What `cache` holds is not compared again. Where not every pair is compared, a second round
-    tries those that images seen by both bring near each other. `unlike` are pairs whose descriptors
-    deny them, by whatever lens: they are not compared, and what is found of them is added.
+    tries those that images seen by both bring near each other. `matched` are what `alike` found of
+    pairs, by whatever lens: nine tenths of a comparison. What is found anew is added to it.
     """
     descriptors = Lazily(len(images.names), lambda k: images.features[k].descriptors)
     sequence = choice.sequences(images.names, images.time_ns)
@@ -88,7 +88,7 @@ def match(
     with sharing as shared:
         run = _Comparison(
             images, shared, camera, settings, sequence, cache, workers,
-            set() if unlike is None else unlike,
+            {} if matched is None else matched,
         )  # fmt: skip
         verified = run.compare(chosen, "matching, pairs")
         if wanted.covisible and not choice.is_exhaustive(len(descriptors), wanted):
@@ -137,16 +137,18 @@ def verify_pair(
 
 
 def verify_pairs(
-    pairs: Sequence[tuple[int, int, Rules]], camera_matrix: F64, *sides: Side | KeptSide
-) -> list[tuple[bool, TwoView | None]]:
-    """Of each (i, j, rules), i and j indices into `sides`: are they `alike`, and their geometry."""
+    pairs: Sequence[tuple[int, int, Rules, U16 | None]], camera_matrix: F64, *sides: Side | KeptSide
+) -> list[tuple[U16, TwoView | None]]:
+    """Of each (i, j, rules, matches), i and j indices into `sides`: the matches (K, 2), by `alike`
+    where they are not known, and the geometry that they share.
+    """
     opened = [side.load() if isinstance(side, KeptSide) else side for side in sides]
     result = []
-    for i, j, rules in pairs:
+    for i, j, rules, known in pairs:
         (first, first_px), (second, second_px) = opened[i], opened[j]
-        matches = alike(first, second, rules)
+        matches = alike(first, second, rules) if known is None else known.astype(np.int32)
         view = verify_pair(first_px, second_px, matches, rules, camera_matrix)
-        result.append((len(matches) > 0, view))
+        result.append((matches.astype(np.uint16), view))
     return result
 
 
@@ -162,7 +164,7 @@ class _Comparison:
         sequence: I64,
         cache: Cache | None,
         workers: Workers,
-        unlike: set[Pair],
+        matched: dict[Pair, U16],
     ) -> None:
         self._images, self._sides, self._sequence = images, sides, sequence
         self._matrix = camera.matrix
@@ -171,7 +173,7 @@ class _Comparison:
         self._how = {
             far: content.comparison(camera, asdict(rules)) for far, rules in self._rules.items()
         }
-        self._cache, self._workers, self._unlike = cache, workers, unlike
+        self._cache, self._workers, self._matched = cache, workers, matched
 
     def compare(self, pairs: Sequence[Pair], label: str) -> dict[Pair, TwoView]:
         """The pairs that share a geometry."""
@@ -190,7 +192,8 @@ class _Comparison:
                 batch: list[Pair] = []
                 for pair in pairs:
                     known = self._known(pair)
-                    if known is not None or pair in self._unlike:
+                    matches = self._matched.get(pair)
+                    if known is not None or (matches is not None and not len(matches)):
                         note(pair, known.view if known else None, new=known is None)
                         continue
                     batch.append(pair)
@@ -206,9 +209,8 @@ class _Comparison:
                     yield self._call(batch)
 
             for views in self._workers.map(verify_pairs, calls()):
-                for pair, (is_alike, view) in zip(under_way.popleft(), views, strict=True):
-                    if not is_alike:
-                        self._unlike.add(pair)
+                for pair, (matches, view) in zip(under_way.popleft(), views, strict=True):
+                    self._matched[pair] = matches
                     note(pair, view, new=True)
         return verified
 
@@ -232,5 +234,8 @@ class _Comparison:
         """The arguments of `verify_pairs`, with each image once."""
         used = sorted({k for pair in batch for k in pair})
         place = {k: n for n, k in enumerate(used)}
-        rows = [(place[i], place[j], self._rules[self._is_far((i, j))]) for i, j in batch]
+        rows = [
+            (place[i], place[j], self._rules[self._is_far((i, j))], self._matched.get((i, j)))
+            for i, j in batch
+        ]
         return rows, self._matrix, *(self._sides[k] for k in used)
