@@ -101,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
         print(tables.text(experiment), end="\n\n")
     print(document["conditions"])
     print(tables.verdict(document))
+    for line in document["worse"]:
+        print(f"  {line}")
     for claim in document["claims"]:
         if claim["kept"] is not False:  # the others stand in the verdict
             print(summary.claim_line(claim))

@@ -158,6 +158,7 @@ class Row:
     alter: Alteration = config.table(Alteration)
     localizer: dict[str, Any] = config.key({}, "checked by its settings, when a preset is known")
     thesis: Figures = config.table(Figures)
+    cause: str = config.key("", "why the default is the worse one here, as far as it is known")
 
 
 @dataclass(frozen=True)

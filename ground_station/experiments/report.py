@@ -60,6 +60,7 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
         _TEMPLATE,
         title="The experiments of the thesis, flown again",
         verdict=tables.verdict(document),
+        worse=tables.worse(document),
         good=good(document),
         claims=[claim_line(claim) for claim in document["claims"]],
         document=document,
@@ -72,7 +73,8 @@ def write(document: dict[str, Any], out: Path, floorplan: Path | None = None) ->
 def markdown(document: dict[str, Any]) -> str:
     """All tables, after the verdict."""
     quick = f" {QUICK}" if document["quick"] else ""
-    parts = [tables.verdict(document), document["conditions"] + quick, PRINTED]
+    worse = markdown_table(tables.worse(document)) if document["worse"] else ""
+    parts = [tables.verdict(document), worse, document["conditions"] + quick, PRINTED]
     parts += ["\n".join(f"- {claim_line(claim)}" for claim in document["claims"])]
     for experiment in document["experiments"]:
         title = f"### {experiment['title']}"
@@ -135,7 +137,7 @@ BLOCK = Block(
 ACCEPTED = "accepted.json"
 """Of the file beside `experiments.toml` that holds what README shows of the accepted run."""
 _OF_EXPERIMENT = ("name", "title", "level", "date")
-_OF_CASE = ("name", "title", "thesis", "worse")
+_OF_CASE = ("name", "title", "thesis", "worse", "cause")
 _OF_PRESET = {
     "failed": None,
     "localized": None,
@@ -162,7 +164,8 @@ def render(document: dict[str, Any]) -> str:
             title, printed = f"{e['title']}: {case['title']}", tables.printed(case)
             shown = [tables.figures(case, preset) for preset in presets]
             rows.append([title, printed, *shown, tables.inside(case)])
-    parts = [markdown_table(table).rstrip() for table in (rows, series) if len(table) > 1]
+    shown_tables = (tables.worse(document), rows, series)
+    parts = [markdown_table(table).rstrip() for table in shown_tables if len(table) > 1]
     said = f"{document['conditions']} {_measured(document['experiments'])} {PRINTED}"
     return "\n\n".join([tables.verdict(document), *parts, said]) + "\n"
 

@@ -85,6 +85,7 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         "localizer": dict(case.localizer),
         "presets": presets,
         "common": common,
+        "cause": case.cause,
         "worse": elsewhere(presets) if case.flight.storey_m else worse(presets, common),
     }
 

@@ -120,11 +120,22 @@ def verdict(document: dict[str, Any]) -> str:
     else:
         said = (
             f"In {len(not_better)} of {len(compared)} rows the default is worse than {rivals} (by "
-            f"more than {100 * AS_GOOD:g} %): {'; '.join(document['worse'])}."
+            f"more than {100 * AS_GOOD:g} %)."
         )
     alone = [f"{others} more rows have one preset only."] if others else []
     broken = [claim_line(one) for one in document["claims"] if one["kept"] is False]
     return " ".join([said, *alone, *_wrong(document), *_covariance(document), *broken])
+
+
+def worse(document: dict[str, Any]) -> list[list[str]]:
+    """Head and rows: where the default is worse than a rival, by what, and why; [] if nowhere."""
+    found = [
+        [f"{e['title']}, {case['title']}", "; ".join(case["worse"]), case["cause"] or "not known"]
+        for e in document["experiments"]
+        for case in e["cases"]
+        if case["worse"]
+    ]
+    return [["the default is worse in", "by", "because"], *found] if found else []
 
 
 def _default(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

@@ -14,7 +14,7 @@ from ground_station.experiments.plan import Plan
 from ground_station.experiments.store import Store
 
 
-def document(tmp_path, runs, thesis="thesis.position_m = 0.2"):
+def document(tmp_path, runs, thesis='thesis.position_m = 0.2\ncause = "it is dark"'):
     """Of one experiment with one case, whose presets have those runs."""
     path = tmp_path / "e.toml"
     head = 'seeds = [1, 2]\n[experiment.light]\ntitle = "Light <b>"\n[experiment.light.case.noon]\n'
@@ -78,7 +78,9 @@ def test_where_ours_is_worse_the_verdict_begins_with_it(tmp_path, theirs, ours, 
     found = document(tmp_path, runs)
     assert any(words in line for line in found["worse"]), found["worse"]
     assert tables.verdict(found).startswith("In 1 of 1 rows the default is worse")
-    assert words in report.markdown(found).splitlines()[0]
+    (_, (row, by, why)) = tables.worse(found)
+    assert row == "Light <b>, noon" and words in by and why == "it is dark"
+    assert words in report.markdown(found).split("\n\n")[1]
 
 
 def test_as_good_is_not_worse(tmp_path):
@@ -99,7 +101,7 @@ def test_a_row_is_good_only_where_it_beats_every_rival(tmp_path):
     assert position == "position error 17.397 cm, the thesis's method 5.000 cm"
     assert again == "position error 21.260 cm, each frame alone 1.000 cm"
     said = tables.verdict(found)
-    assert "worse than the preset thesis and each frame alone (by more than 2 %): " in said
+    assert "worse than the preset thesis and each frame alone (by more than 2 %). " in said
     head, row = tables.every(found["experiments"][0])[1]
     assert row[head.index("wrong TRACKING, frames")] == "2"  # one in each of two runs
     assert row[head.index("found at first after")] == "0.10 ± 0.00 s"
