@@ -25,11 +25,11 @@ class SceneBuilder:
     """Collects what a scene is of; every solid is made of rectangles.
 
     Textures are drawn by a surface's number, so scenes of equal rooms have equal ones; those of
-    another `storey` are others, but for prints of a plate.
+    another `storey` are others, but where it is `alike` for prints of a plate.
     """
 
-    def __init__(self, texels_per_m: float, storey: int = 0) -> None:
-        self.texels_per_m, self.storey = texels_per_m, storey
+    def __init__(self, texels_per_m: float, storey: int = 0, *, alike: bool = False) -> None:
+        self.texels_per_m, self.storey, self.alike = texels_per_m, storey, alike
         self.surfaces: list[Surface] = []
         self.footprints: list[Footprint] = []
         self.known: list[KnownPoint] = []
@@ -47,8 +47,9 @@ class SceneBuilder:
         **options: Any,
     ) -> Surface:
         """Adds one rectangle; `detail` scales the scene's texture resolution."""
-        if self.storey:
-            options.setdefault("print", self.storey * _OF_A_STOREY + len(self.surfaces))
+        if self.storey and not (self.alike and "print" in options):
+            number = options.get("print", len(self.surfaces))
+            options["print"] = self.storey * _OF_A_STOREY + number
         surface = Surface(
             np.asarray(origin_m, dtype=np.float64),
             np.asarray(u_m, dtype=np.float64),

@@ -27,9 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene",
         default="atrium",
         help="atrium, office, corridor, hall (repeating panels), hall-glazed (a wall of dark"
-        " glass), hall-above (the floor above: the same panels, other posters and furniture),"
-        " rooms (a flat), interior-1 to interior-999 (by chance: odd halls, even offices),"
-        " atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
+        " glass), hall-above (the floor above: panels at the same places), hall-above-alike (of"
+        " the same prints), rooms (a flat), interior-1 to interior-999 (by chance: odd halls, even"
+        " offices), atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
         " atrium-moved-posted (and other posters) (default: atrium)",
     )
     add(

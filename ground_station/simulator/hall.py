@@ -3,10 +3,11 @@
 Three panels of four are the same two plates over and over, and so are the strips between them, the
 pilasters, the skirting and the ceiling: a view of one stretch of wall matches every other one.
 What tells the stretches apart is what does so in a real hall: doors with their numbers, posters,
-furniture, boxes on the wall, and the floor's stains. The floor above has the same plates, doors and
-lamps, and other posters, furniture and stains; a glazed hall has dark panes for a third of its
-northern wall, which show the hall as windows do at night. x runs east along the long walls, z up;
-the origin is the south-west corner on the floor. Light falls in through the roof.
+furniture, boxes on the wall, and the floor's stains. The floor above has panels, doors and lamps at
+the same places, and other posters, furniture and stains; where it is alike its plates are the same,
+too. A glazed hall has dark panes for a third of its northern wall, which show the hall as windows
+do at night. x runs east along the long walls, z up; the origin is the south-west corner on the
+floor. Light falls in through the roof.
 """
 
 from __future__ import annotations
@@ -135,9 +136,11 @@ def _roof(b: SceneBuilder) -> list[tuple[float, float, float]]:
     return [(4.5 * i, y, HEIGHT_M - 0.5) for i in (1, 2, 3) for y in (3.0, 9.0)]
 
 
-def build_hall(texels_per_m: float, *, glazed: bool = False, above: bool = False) -> Scene:
+def build_hall(
+    texels_per_m: float, *, glazed: bool = False, above: bool = False, alike: bool = False
+) -> Scene:
     """The scene `hall`, glazed, or the floor above it, in coordinates of its own floor."""
-    b = SceneBuilder(texels_per_m, storey=int(above))
+    b = SceneBuilder(texels_per_m, storey=int(above), alike=alike)
     b.walls(
         (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
         (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
@@ -176,5 +179,5 @@ def build_hall(texels_per_m: float, *, glazed: bool = False, above: bool = False
         right = [PANEL_M * len(along) * a for a in _NORTH.along]
         pane = b.rectangle(left, [*right, 0.0], [0, 0, ROW_M * len(rows)], "metal", detail=0.1)
         b.mirrors(pane, _REFLECTS)
-    name = "hall" + "-glazed" * glazed + "-above" * above
+    name = "hall" + "-glazed" * glazed + "-above" * above + "-alike" * alike
     return b.scene(name, (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

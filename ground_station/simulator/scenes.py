@@ -20,6 +20,7 @@ SCENES: dict[str, Callable[[float], Scene]] = {
     "hall": build_hall,
     "hall-glazed": partial(build_hall, glazed=True),
     "hall-above": partial(build_hall, above=True),
+    "hall-above-alike": partial(build_hall, above=True, alike=True),
     "rooms": build_rooms,
     "atrium-moved-25": partial(build_atrium, moved=0.25),
     "atrium-moved-50": partial(build_atrium, moved=0.5),

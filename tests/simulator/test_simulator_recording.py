@@ -174,7 +174,7 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
         (
             {"scene": "cave"},
             "scene 'cave' is unknown; there are: atrium, office, corridor, hall, hall-glazed, "
-            "hall-above, rooms, atrium-moved-25, atrium-moved-50, atrium-moved, "
+            "hall-above, hall-above-alike, rooms, atrium-moved-25, atrium-moved-50, atrium-moved, "
             "atrium-moved-posted, interior-N",
         ),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),

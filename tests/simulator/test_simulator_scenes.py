@@ -90,18 +90,19 @@ def test_of_the_furniture_only_the_share_that_is_asked_for_has_been_moved() -> N
     assert 0.1 < len(few) / len(all_) < 0.4 < len(half) / len(all_) < 0.6
 
 
-def test_the_floor_above_has_the_same_plates_and_nothing_else_that_is_equal(
-    bank: TextureBank,
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_floor_above_that_is_alike_has_the_same_plates_and_nothing_else_is_equal(
+    bank: TextureBank, alike: bool
 ) -> None:
-    below, above = (scenes.build(name, 10) for name in ("hall", "hall-above"))
+    below, above = (scenes.build("hall" + more, 10) for more in ("", "-above" + "-alike" * alike))
     equal = {True: 0, False: 0}
     for k, a in enumerate(below.surfaces):
         if a.material in ("sky", "metal", "foliage") or a.options.get("rgb") == (0.13, 0.13, 0.14):
             continue
         same = np.array_equal(surface_albedo(bank, below, k), surface_albedo(bank, above, k))
-        assert same == ("print" in a.options), a
+        assert same == (alike and "print" in a.options), a
         equal[same] += 1
-    assert equal[True] > 250 and equal[False] > 150
+    assert equal[False] > 150 and (equal[True] > 250 if alike else equal[False] > 400)
 
 
 def test_dark_glass_shows_what_a_camera_behind_it_would_see_mirrored() -> None:
