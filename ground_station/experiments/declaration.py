@@ -52,6 +52,9 @@ class FlightDeclaration:
         low=0,
         high=100,
     )
+    processing: str = config.key(
+        "none", "what the camera makes of its sensor's light", choices=("none", "camera")
+    )
     lens_error: float = config.key(
         0.0, "share by which the focal length that is known is off", low=-0.2, high=0.2
     )

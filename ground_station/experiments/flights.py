@@ -13,9 +13,10 @@ def stem(flight: FlightDeclaration, seed: int) -> str:
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
     crowd = f"-{flight.people}people" if flight.people else ""
+    processed = "" if flight.processing == "none" else f"-{flight.processing}-processing"
     return (
         f"{flight.scene}-{flight.plan}-{flight.light}-{seed}"
-        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}{crowd}"
+        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}{crowd}{processed}"
     )
 
 
@@ -38,6 +39,7 @@ def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
         draught_m_s=flight.draught_m_s,
         lens_error=flight.lens_error,
         people=flight.people,
+        processing=flight.processing,
         points=points_of(path) if flight.clicked else None,
     )
     if simulate(settings).interrupted:

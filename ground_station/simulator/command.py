@@ -74,6 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="deviation of the air's speed (default: 0.05)",
     )
     add("--people", type=int, default=0, metavar="N", help="so many walk to and fro (default: 0)")
+    add(
+        "--processing",
+        default="none",
+        metavar="P",
+        help="of pictures in the camera: none (default: a perfect sensor with noise) or camera (a"
+        " mosaic of colours, demosaiced, denoised, sharpened)",
+    )
     add("--build", metavar="NAME", help="the blimp, of hw/builds.toml (default: atrium)")
     add(
         "--exposure-steps",

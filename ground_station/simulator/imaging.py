@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.simulator import processing
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 
@@ -28,6 +29,7 @@ _RIM = math.tan(math.radians(80.0))
 # Saturation of the sensor over the level of white: headroom for the tone curve.
 _OVERRANGE = 4.0
 _CONTRAST = 0.8
+_GREY = 0.18
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,10 @@ def _rim(camera: Camera) -> F64:
 
 
 class FrameMaker:
-    """Takes frames of a lit scene with a camera in motion; deterministic but for `rng`'s noise."""
+    """Takes frames of a lit scene with a camera in motion; deterministic but for `rng`'s noise.
+
+    `processed` says what becomes of what the sensor takes, one of `PROCESSINGS`.
+    """
 
     def __init__(
         self,
@@ -100,6 +105,7 @@ class FrameMaker:
         *,
         sensor: Sensor | None = None,
         renders: int = 2,
+        processed: str = "none",
     ) -> None:
         self.camera, self.pinhole, self.renders = camera, pinhole, renders
         self.sensor = sensor or Sensor()
@@ -124,6 +130,12 @@ class FrameMaker:
         coded = curve ** (1 / 2.2)
         coded += _CONTRAST * (coded * coded * (3 - 2 * coded) - coded)
         self._tone = np.rint(255 * coded).astype(np.uint8)
+        self._codes_per_level = 255 * float(np.interp(_GREY, level, np.gradient(coded, level)))
+        self._balance: F32 | np.float32 = np.float32(1)
+        self._by_mosaic = processed == "camera"
+        if self._by_mosaic:
+            gains = np.asarray(processing.WHITE_BALANCE, np.float32)
+            self._balance = processing.mosaic(np.broadcast_to(gains, (h, w, 3)))
 
     def radiance(self, motion: Motion, time_s: float, exposure_s: float) -> F32:
         """Mean radiance (H, W, 3) that each pixel collects in the frame at `time_s`.
@@ -185,22 +197,29 @@ class FrameMaker:
     ) -> U8:
         """The 8-bit picture (H, W, 3) RGB: shot and read noise, saturation, gamma 1/2.2.
 
-        Without `rng`, no noise.
+        Without `rng`, no noise. What the camera does beyond that is done to it.
         """
         s = self.sensor
         level = radiance * (
             self._vignette[..., None] * np.float32(s.sensitivity * exposure_s * gain)
         )
         level = np.minimum(level, _OVERRANGE)
+        if self._by_mosaic:
+            level = processing.mosaic(level)
+        per_level = gain / s.full_well_e
         if rng is not None:
             # Electrons e = level·W/g; the level's deviation is g/W·√(e + r²).
-            per_level = gain / s.full_well_e
             deviation = np.sqrt(
-                level * np.float32(per_level) + np.float32((s.read_noise_e * per_level) ** 2)
+                level * np.float32(per_level) * self._balance
+                + np.float32((s.read_noise_e * per_level) ** 2) * self._balance**2
             )
             level += deviation * rng.standard_normal(level.shape, dtype=np.float32)
         codes = np.clip(level / np.float32(_OVERRANGE), 0, 1) * np.float32(16383) + np.float32(0.5)
-        return np.asarray(self._tone[codes.astype(np.uint16)])
+        if not self._by_mosaic:
+            return np.asarray(self._tone[codes.astype(np.uint16)])
+        picture = self._tone[processing.demosaiced(codes.astype(np.uint16))]
+        noise = math.sqrt(_GREY * per_level + (s.read_noise_e * per_level) ** 2)
+        return processing.finished(picture, noise * self._codes_per_level)
 
 
 class AutoExposure:

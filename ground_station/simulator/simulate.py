@@ -32,6 +32,7 @@ from ground_station.simulator.known_points import choose_observations, write_pai
 from ground_station.simulator.lighting import light_named, lit_scene
 from ground_station.simulator.motion import Motion
 from ground_station.simulator.plans import Plan, Reference, plan_named
+from ground_station.simulator.processing import PROCESSINGS
 from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.unsteady import unsteady
@@ -61,6 +62,9 @@ class SimulationSettings:
     `exposure_steps`, `light_steps` and `flicker` are as `unsteady` reads them; with a
     `longest_exposure_s` gain does what time may not, as against motion blur. So many `people` walk
     to and fro.
+
+    `processing` is what the camera does to its pictures: "none", a perfect sensor's but for noise,
+    or "camera", a mosaic of colours that is demosaiced, denoised and sharpened.
     """
 
     out: Path
@@ -86,6 +90,7 @@ class SimulationSettings:
     flicker: float = 0.0
     longest_exposure_s: float | None = None
     people: int = 0
+    processing: str = "none"
 
     def __post_init__(self) -> None:
         limits = {
@@ -105,6 +110,9 @@ class SimulationSettings:
             if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise SimulatorError(f"{name} is {value}; allowed: {low:g} to {high:g}")
         light_named(self.light)
+        if self.processing not in PROCESSINGS:
+            known = ", ".join(PROCESSINGS)
+            raise SimulatorError(f"processing '{self.processing}' is unknown; there are: {known}")
         if self.duration_s is not None and not 0 < self.duration_s <= 3600:
             raise SimulatorError(f"duration_s is {self.duration_s:g}; allowed: above 0 to 3600")
         unsteady(self.exposure_steps, self.light_steps, self.flicker)
@@ -222,8 +230,9 @@ def simulate(settings: SimulationSettings, progress: Progress | None = None) -> 
     surfaces = flight.scene.surfaces
     with SceneRenderer(surfaces, lit.textures, buffer, walkers=walkers) as renderer:
         maker = FrameMaker(
-            renderer, lit.decoder(), camera, pinhole, sensor=sensor, renders=settings.renders
-        )
+            renderer, lit.decoder(), camera, pinhole, sensor=sensor, renders=settings.renders,
+            processed=settings.processing,
+        )  # fmt: skip
         setup_s = time.monotonic() - started
         taken, interrupted = _record(settings, flight, maker, progress)
         frame_s = (time.monotonic() - started - setup_s) / max(taken, 1)
@@ -328,6 +337,7 @@ def _write_head(
                 else {}
             ),
             **({"people": str(settings.people)} if settings.people else {}),
+            **({"processing": settings.processing} if settings.processing != "none" else {}),
             **({"lens_error": f"{settings.lens_error:g}"} if settings.lens_error else {}),
             **{name: str(value) for name in _UNSTEADY if (value := getattr(settings, name))},
         },

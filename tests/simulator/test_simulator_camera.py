@@ -11,9 +11,16 @@ import pytest
 from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.simulator.imaging import AutoExposure, Sensor, row_offsets_s
+from ground_station.simulator.imaging import (
+    AutoExposure,
+    FrameMaker,
+    Sensor,
+    covering_pinhole,
+    row_offsets_s,
+)
 from ground_station.simulator.known_points import project_rolling
 from ground_station.simulator.motion import Motion, Mount
+from ground_station.simulator.processing import PROCESSINGS
 from tests.simulator.conftest import Room, open_room
 
 GLOBAL = replace(THESIS_CAMERA, readout_s=0.0)
@@ -168,6 +175,47 @@ def test_noise_follows_shot_and_read_noise_and_grows_with_gain(room: Room) -> No
         deviations.append(noisy.std())
     assert 0.5 < deviations[0] < 4
     assert deviations[1] / deviations[0] == pytest.approx(np.sqrt(8), rel=0.25)
+
+
+def as_camera(room: Room, level: F64, gain: float, seed: int | None) -> tuple[F64, F64]:
+    """A grey level (H, W, 3) as RGB pictures: a perfect sensor's and a camera's."""
+    exposure_s = 1e-3
+    pictures = []
+    for processed in PROCESSINGS:
+        pinhole = covering_pinhole(GLOBAL, room.supersampling)
+        maker = FrameMaker(room.renderer, room.decoder, GLOBAL, pinhole, processed=processed)
+        radiance = (level / (maker.sensor.sensitivity * exposure_s * gain)).astype(np.float32)
+        rng = None if seed is None else np.random.default_rng(seed)
+        pictures.append(maker.expose(radiance, exposure_s, gain, rng).astype(float))
+    return pictures[0], pictures[1]
+
+
+def test_a_cameras_processing_keeps_colours_and_sharpens_edges(room: Room) -> None:
+    level = np.empty((480, 640, 3))
+    level[:, :320], level[:, 320:] = (0.5, 0.2, 0.1), (0.05, 0.3, 0.6)
+    perfect, processed = as_camera(room, level, 1.0, None)
+    for side in (slice(260, 300), slice(340, 380)):
+        colours = [p[220:260, side].mean(axis=(0, 1)) for p in (perfect, processed)]
+        assert colours[1] == pytest.approx(colours[0], abs=3)
+    level[:, :320], level[:, 320:] = 0.1, 0.4
+    perfect, processed = as_camera(room, level, 1.0, None)
+    across = processed[240, 300:340, 1]
+    low, high = perfect[240, 300, 1], perfect[240, 339, 1]
+    overshoot = max(across.max() - high, low - across.min()) / (high - low)
+    assert 0.03 < overshoot < 0.2
+    assert np.ptp(perfect[240, 300:340, 1]) <= high - low + 4  # but for the vignette
+
+
+def test_a_cameras_processing_leaves_less_noise_in_larger_grains(room: Room) -> None:
+    for gain in (1.0, 8.0):
+        off = []
+        for picture in as_camera(room, np.full((480, 640, 3), 0.18), gain, 1):
+            grey = picture[200:280, 280:360] @ [0.299, 0.587, 0.114]
+            off.append(grey - grey.mean())
+        perfect, processed = off
+        neighbours = [(d[:, 1:] * d[:, :-1]).mean() / d.var() for d in off]
+        assert abs(neighbours[0]) < 0.1 and neighbours[1] > 0.3
+        assert 0.3 < processed.std() / perfect.std() < 0.9
 
 
 def test_darker_light_means_longer_exposure_first_and_gain_then() -> None:

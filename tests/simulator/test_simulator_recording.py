@@ -184,6 +184,7 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
             "plan 'headset' walks through doorways; scene 'atrium' has none: --scene rooms",
         ),
         ({"crf": 90.0}, "crf is 90.0; allowed: 0 to 51"),
+        ({"processing": "raw"}, "processing 'raw' is unknown; there are: none, camera"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(
@@ -267,6 +268,27 @@ def test_unsteady_light_and_exposure_are_shown_and_told(tmp_path: Path) -> None:
     reader.topics()
     simulation = reader.metadata["simulation"]
     assert [simulation[name] for name in names] == ["0.2:1,0.4:-1", "0.5:0.01", "0.5", "0.002"]
+
+
+def test_a_cameras_processing_is_named_and_changes_pictures_only(
+    flight: Path, tmp_path: Path
+) -> None:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    asked = command.settings_from(
+        parser.parse_args(["--out", "f.mcap", "--processing", "camera"])
+    ).processing
+    out = tmp_path / "f.mcap"
+    simulate(quick_settings(out, processing=asked))
+    plain, processed = RecordingReader(flight), RecordingReader(out)
+    assert processed.poses(TRUTH_TOPIC) == plain.poses(TRUTH_TOPIC)
+    assert [s.data for s in processed.video()] != [s.data for s in plain.video()]
+    named = processed.metadata_table("simulation")
+    assert named == plain.metadata_table("simulation") | {"processing": "camera"}
+    # What is not asked for is not named: flights of before are the same, byte for byte.
+    assert set(plain.metadata_table("simulation")) == {
+        "seed", "scene", "plan", "light", "rate_hz", "duration_s", "version",
+    }  # fmt: skip
 
 
 def test_the_light_changes_colour_contrast_and_exposure(flight: Path, tmp_path: Path) -> None:
