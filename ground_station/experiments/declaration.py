@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from ground_station.errors import InputError
 from ground_station.recording.frames import FrameRange
 from ground_station.recording.open import parse_range
+from ground_station.simulator.processing import PROCESSINGS
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
@@ -53,10 +54,10 @@ class FlightDeclaration:
         high=100,
     )
     processing: str = config.key(
-        "none", "what the camera makes of its sensor's light", choices=("none", "camera")
+        "none", "what the camera makes of its sensor's light", choices=PROCESSINGS
     )
-    lens_error: float = config.key(
-        0.0, "share by which the focal length that is known is off", low=-0.2, high=0.2
+    calibrated: bool = config.key(
+        False, "its camera is known by a film of a board, calibrated; otherwise as it is"
     )
     clicked: int = config.key(
         0, "of a map's: points that a person clicks and measured; 0: registered by the true poses",

@@ -37,7 +37,6 @@ def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
         rate_hz=flight.rate_hz,
         bitrate_kbps=flight.bitrate_kbps or None,
         draught_m_s=flight.draught_m_s,
-        lens_error=flight.lens_error,
         people=flight.people,
         processing=flight.processing,
         points=points_of(path) if flight.clicked else None,

@@ -31,14 +31,16 @@ def build(
     settings: MappingSettings,
     folder: Path,
     cache: Path,
+    lens: Path | None = None,
 ) -> store.Map:
     """The map of a flight's frames in `folder`, registered by its true poses or by clicked points.
 
     By true poses an error against it is the localizer's and the landmarks', not the registration's;
-    by points the registration's share is told apart (`displacement`). What a build that was killed
+    by points the registration's share is told apart (`displacement`). Its camera is the recording's
+    own, or what the file `lens` says. What a build that was killed
     has made is taken from the folder `cache`, as maps of the same frames do.
     """
-    material = flown(spec.flight, recording, data)
+    material = flown(spec.flight, recording, data, lens)
     total = material.frames.count()
     if total is None:
         total = sum(1 for _ in material.frames)

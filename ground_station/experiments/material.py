@@ -34,10 +34,13 @@ class Flown:
                 yield sample.data
 
 
-def flown(flight: FlightDeclaration, recording: Path | None, data: Path) -> Flown:
+def flown(
+    flight: FlightDeclaration, recording: Path | None, data: Path, lens: Path | None = None
+) -> Flown:
     """A flight's frames; raises `InputError` naming what is missing.
 
-    `recording` is the simulated one's; a folder of real pictures lies below `data`.
+    `recording` is the simulated one's, its camera the recording's own or the file `lens`; a folder
+    of real pictures lies below `data`.
     """
     if recording is not None:
         source = FlightRecording(recording)
@@ -46,7 +49,8 @@ def flown(flight: FlightDeclaration, recording: Path | None, data: Path) -> Flow
         truth = trajectory_of(recording, TRUTH_TOPIC)
         above_m = np.array([0.0, 0.0, flight.storey_m])
         truth = replace(truth, position_m=truth.position_m + above_m)
-        return Flown(source, source.camera, truth, recording)
+        camera = source.camera if lens is None else load_camera(lens)
+        return Flown(source, camera, truth, recording)
     if not (flight.truth and flight.camera):
         raise InputError(f"the folder '{flight.folder}' needs 'truth' and 'camera' beside it")
     wanted = parse_range(flight.range) if flight.range else FrameRange()

@@ -9,7 +9,7 @@ import ast
 import functools
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,21 @@ from ground_station.experiments.declaration import (
 )
 from ground_station.experiments.flights import stem
 from ground_station.features import extractors
+from ground_station.geometry.camera import Camera
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.mapping.settings import MappingSettings
+from ground_station.simulator.plans import camera_of
+
+
+@dataclass(frozen=True)
+class LensJob:
+    """Calibrates a camera by a film of a board into `flights/<name>`, a camera's file."""
+
+    key: str
+    name: str
+    camera: Camera
+    processing: str
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -40,12 +53,16 @@ class FlightJob:
 
 @dataclass(frozen=True)
 class MapJob:
-    """Builds a map in `maps/<key>`; `recording` is the name of the flight's, None: real ones."""
+    """Builds a map in `maps/<key>`; `recording` is the name of the flight's, None: real ones.
+
+    `lens` is the name of what calibration found of its camera, None: it is known.
+    """
 
     key: str
     spec: MapSpec
     settings: MappingSettings
     recording: str | None
+    lens: str | None = None
 
 
 @dataclass(frozen=True)
@@ -60,9 +77,10 @@ class RunJob:
     alter: Alteration
     preset: str
     settings: LocalizerSettings
+    lens: str | None = None
 
 
-Job = FlightJob | MapJob | RunJob
+Job = LensJob | FlightJob | MapJob | RunJob
 
 
 @dataclass(frozen=True)
@@ -106,10 +124,10 @@ def _runs(
     seeds = declaration.seeds if flight.simulated else declaration.seeds[:1]
     keys = []
     for seed in seeds:
-        of_flight, recording, needs = _flown(plan, flight, seed, data)
+        flown = _flown(plan, flight, seed, data)
         depends = {
             "map": map_job.key,
-            "flight": of_flight,
+            "flight": flown.depends,
             "seed": seed,
             "alter": asdict(case.alter),
             "preset": preset,
@@ -117,37 +135,64 @@ def _runs(
             "code": code_sha256("run"),
         }
         key = _key("run", depends)
-        job = RunJob(key, map_job.key, flight, recording, seed, case.alter, preset, settings)
-        _add(plan, job, (map_job.key, *needs))
+        job = RunJob(
+            key, map_job.key, flight, flown.recording, seed, case.alter, preset, settings,
+            flown.lens,
+        )  # fmt: skip
+        _add(plan, job, (map_job.key, *flown.needs))
         keys.append(key)
     return keys
 
 
 def _map(plan: Plan, spec: MapSpec, mapping: MappingSettings, data: Path) -> MapJob:
-    of_flight, recording, needs = _flown(plan, spec.flight, spec.seed, data)
+    flown = _flown(plan, spec.flight, spec.seed, data)
     depends = {
-        "flight": of_flight,
+        "flight": flown.depends,
         "spec": asdict(spec),
         "features": _sha256(spec.features),
         "settings": asdict(mapping),
         "code": code_sha256("map"),
     }
-    job = MapJob(_key("map", depends), spec, mapping, recording)
-    _add(plan, job, needs)
+    job = MapJob(_key("map", depends), spec, mapping, flown.recording, flown.lens)
+    _add(plan, job, flown.needs)
     return job
 
 
-def _flown(
-    plan: Plan, flight: FlightDeclaration, seed: int, data: Path
-) -> tuple[str, str | None, tuple[str, ...]]:
-    """On what of a flight a result depends, its recording's name, and the job that makes it."""
+@dataclass(frozen=True)
+class _Flown:
+    """On what of a flight a result `depends`, what the jobs that it `needs` leave in `flights`."""
+
+    depends: str
+    recording: str | None = None
+    lens: str | None = None
+    needs: tuple[str, ...] = ()
+
+
+def _flown(plan: Plan, flight: FlightDeclaration, seed: int, data: Path) -> _Flown:
     if not flight.simulated:
-        return _real(flight, data), None, ()
-    depends = {"flight": asdict(flight), "seed": seed, "code": code_sha256("flight")}
-    key = _key("flight", depends)
-    job = FlightJob(key, f"{stem(flight, seed)}-{key[:8]}.mcap", flight, seed)
+        return _Flown(_real(flight, data))
+    # It is flown as well whatever is known of its camera.
+    taken = replace(flight, calibrated=False)
+    key = _key("flight", {"flight": asdict(taken), "seed": seed, "code": code_sha256("flight")})
+    job = FlightJob(key, f"{stem(taken, seed)}-{key[:8]}.mcap", taken, seed)
     _add(plan, job, ())
-    return key, job.name, (key,)
+    if not flight.calibrated:
+        return _Flown(key, job.name, None, (key,))
+    lens = _lens(plan, camera_of(flight.plan), flight.processing, seed)
+    return _Flown(f"{key} {lens.key}", job.name, lens.name, (key, lens.key))
+
+
+def _lens(plan: Plan, camera: Camera, processing: str, seed: int) -> LensJob:
+    depends = {
+        "camera": camera.as_dict(),
+        "processing": processing,
+        "seed": seed,
+        "code": code_sha256("lens"),
+    }
+    key = _key("lens", depends)
+    job = LensJob(key, f"lens-{seed}-{key[:8]}.toml", camera, processing, seed)
+    _add(plan, job, ())
+    return job
 
 
 def _add(plan: Plan, job: Job, needs: tuple[str, ...]) -> None:
@@ -195,6 +240,7 @@ def _real(flight: FlightDeclaration, data: Path) -> str:
 _ROOT = Path(__file__).resolve().parents[1]
 
 ROOMS = {
+    "lens": ("experiments/lenses.py", "simulator", "geometry", "calibration", "recording"),
     "flight": ("experiments/flights.py", "simulator", "geometry"),
     "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
             "geometry", "recording"),

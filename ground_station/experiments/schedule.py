@@ -13,8 +13,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
+from ground_station.calibration.errors import CalibrationError
 from ground_station.errors import GroundStationError, MapError
-from ground_station.experiments.plan import FlightJob, Job, MapJob, Plan, RunJob
+from ground_station.experiments.plan import FlightJob, Job, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.store import Store
 from ground_station.progress import Progress
 from pi_firmware.wire.errors import BlimpError
@@ -45,18 +46,29 @@ def _end_with_parent() -> None:
 def work(job: Job, folder: Path, data: Path) -> None:
     """Does a job; its result lies in the store when this returns, and nothing of it before.
 
-    A map that cannot be built is a result, kept with its reason, and so is a run without it.
+    A film that does not determine its camera is a result, kept with its reason; so is a map that
+    cannot be built, and what is left without them.
     """
     store = Store(folder)
     try:
-        if isinstance(job, FlightJob):
+        if isinstance(job, LensJob):
+            _calibrate(job, store)
+        elif isinstance(job, FlightJob):
             _fly(job, store)
         elif isinstance(job, MapJob):
             _build(job, store, data)
         else:
             _run(job, store, data)
-    except MapError as error:
+    except (MapError, CalibrationError) as error:
         store.write(job.key, {"failed": str(error)})
+
+
+def _calibrate(job: LensJob, store: Store) -> None:
+    from ground_station.experiments.lenses import find
+
+    path = store.flight(job.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    find(job.camera, job.processing, job.seed, path)
 
 
 def _fly(job: FlightJob, store: Store) -> None:
@@ -76,7 +88,7 @@ def _build(job: MapJob, store: Store, data: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     recording = store.flight(job.recording) if job.recording else None
     try:
-        build(job.spec, recording, data, job.settings, part, store.cache)
+        build(job.spec, recording, data, job.settings, part, store.cache, _lens(job, store))
         moved(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -88,13 +100,17 @@ def _run(job: RunJob, store: Store, data: Path) -> None:
     from ground_station.map import store as maps
 
     recording = store.flight(job.recording) if job.recording else None
-    flight = flown(job.flight, recording, data)
+    flight = flown(job.flight, recording, data, _lens(job, store))
     map_ = maps.load(store.map(job.map_key))
     if job.alter.landmarks < 1:
         from ground_station.experiments.alter import drawn
 
         map_ = drawn(map_, job.alter.landmarks, job.seed)
     store.write(job.key, measure(map_, flight, job.alter, job.preset, job.settings, job.seed))
+
+
+def _lens(job: MapJob | RunJob, store: Store) -> Path | None:
+    return store.flight(job.lens) if job.lens else None
 
 
 Work = Callable[[Job, Path, Path], None]
@@ -177,7 +193,7 @@ def _fail(store: Store, job: Job) -> None:
 
 
 def _spread_failures(plan: Plan, store: Store, open_: dict[str, Job]) -> None:
-    """A run in a map that cannot be built fails for the map's reason, without being tried."""
+    """What needs a map that cannot be built fails for the map's reason, without being tried."""
     for key in list(open_):
         for need in plan.needs[key]:
             failure = None if need in open_ else store.failure(plan.jobs[need])

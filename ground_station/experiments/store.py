@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ground_station.experiments.plan import FlightJob, Job, MapJob, RunJob
+from ground_station.experiments.plan import FlightJob, Job, LensJob, MapJob
 from ground_station.files import write_json
 
 
@@ -18,7 +18,7 @@ class Store:
     folder: Path
 
     def flight(self, name: str) -> Path:
-        """A flight's recording."""
+        """A flight's recording, or what calibration found of its camera."""
         return self.folder / "flights" / name
 
     def map(self, key: str) -> Path:
@@ -31,7 +31,7 @@ class Store:
         return self.folder / "cache"
 
     def result(self, key: str) -> Path:
-        """A run's figures, or why a map or a run failed."""
+        """A run's figures, or why a calibration, a map or a run failed."""
         return self.folder / "runs" / f"{key}.json"
 
     def done(self, job: Job) -> bool:
@@ -41,6 +41,8 @@ class Store:
 
             path = self.flight(job.name)
             return path.is_file() and (not job.flight.clicked or points_of(path).is_file())
+        if isinstance(job, LensJob) and self.flight(job.name).is_file():
+            return True
         if isinstance(job, MapJob) and (self.map(job.key) / "map.toml").is_file():
             return True
         return self.read(job.key) is not None
@@ -64,7 +66,5 @@ class Store:
 
         `failed` says why; with `accident` it says nothing of the map or the localizer.
         """
-        if isinstance(job, RunJob | MapJob):
-            kept = self.read(job.key)
-            return kept if kept is not None and "failed" in kept else None
-        return None
+        kept = self.read(job.key)
+        return kept if kept is not None and "failed" in kept else None

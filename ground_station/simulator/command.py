@@ -14,7 +14,8 @@ examples:
   blimp simulate --plan loop --light cloudy --seed 7 --out out/loop.mcap
   blimp simulate --light-steps 5:0.01,6:1 --duration-s 10 --out out/lights-off.mcap
   blimp simulate --scene hall --plan stills --lens-error 0.01 --out out/stills.mcap
-  blimp simulate --scene rooms --plan headset --seed 3 --out out/headset.mcap"""
+  blimp simulate --scene rooms --plan headset --seed 3 --out out/headset.mcap
+  blimp simulate --scene board --plan board --light cloudy --out out/board.mcap"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,8 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="atrium",
         help="atrium, office, corridor, hall (repeating panels), hall-glazed (a wall of dark"
         " glass), hall-above (the floor above: panels at the same places), hall-above-alike (of"
-        " the same prints), rooms (a flat), interior-1 to interior-999 (by chance: odd halls, even"
-        " offices), atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
+        " the same prints), rooms (a flat), board (a calibration board), interior-1 to interior-999"
+        " (by chance: odd halls, even offices), atrium-moved (other furniture; -25 and -50: a"
+        " quarter, half of it moved),"
         " atrium-moved-posted (and other posters) (default: atrium)",
     )
     add(
@@ -37,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="loop",
         help="mapping, loop (default), small-circle, fast, corridor, tour (of an interior); of a"
         " person's camera: stills (12 places, 8 headings, a wide lens), headset (a walk through"
-        " --scene rooms), walk (round an interior with a phone)",
+        " --scene rooms), walk (round an interior with a phone), board (about the"
+        " board of --scene board, as one calibrates)",
     )
     add(
         "--light",

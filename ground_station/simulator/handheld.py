@@ -16,7 +16,7 @@ from ground_station.arrays import F64
 from ground_station.simulator.motion import Motion, Mount
 from ground_station.simulator.plans import Plan, Reference
 
-_STEP_S = 1 / 400
+STEP_S = 1 / 400
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ _STILL_M, _STILL_DEG = (0.04, 0.04, 0.02), (2.0, 1.5, 1.0)
 """Deviations from where a picture was meant to be taken: x, y, z; yaw, pitch, roll."""
 
 
-def _band_noise(
+def band_noise(
     count: int, columns: int, band_Hz: tuple[float, float], rng: np.random.Generator
 ) -> F64:
     """Gaussian noise (count, columns) of unit deviation between two frequencies, falling as 1/f."""
-    whole = max(count, math.ceil(1 / band_Hz[0] / _STEP_S))  # a period of the slowest, at least
-    f = np.fft.rfftfreq(whole, _STEP_S)
+    whole = max(count, math.ceil(1 / band_Hz[0] / STEP_S))  # a period of the slowest, at least
+    f = np.fft.rfftfreq(whole, STEP_S)
     gain = np.where((f >= band_Hz[0]) & (f <= band_Hz[1]), 1 / np.maximum(f, 1e-3), 0.0)
     spectrum = np.fft.rfft(rng.standard_normal((whole, columns)), axis=0) * gain[:, None]
     noise = np.fft.irfft(spectrum, n=whole, axis=0)
@@ -79,19 +79,19 @@ def carry(
 ) -> Motion:
     """Carries the camera along a plan as one of `BEARERS`; shakes grow with the speed."""
     r, mount = BEARERS[bearer]
-    count = int(np.ceil((duration_s + 2.0) / _STEP_S))
-    times = np.arange(count) * _STEP_S - 1.0
+    count = int(np.ceil((duration_s + 2.0) / STEP_S))
+    times = np.arange(count) * STEP_S - 1.0
     position, yaw = reference.at(np.maximum(times, 0))
-    speed = np.linalg.norm(np.gradient(position, _STEP_S, axis=0), axis=1)
+    speed = np.linalg.norm(np.gradient(position, STEP_S, axis=0), axis=1)
     vigour = 0.08 + 0.92 * np.clip(speed / max(float(speed.max()), 1e-9), 0, 1)
     # No two steps are equal: their phase wanders by some percent, their size as well.
-    wander = np.cumsum(_band_noise(count, 1, (0.1, 1.0), rng)[:, 0]) * _STEP_S * 0.8
+    wander = np.cumsum(band_noise(count, 1, (0.1, 1.0), rng)[:, 0]) * STEP_S * 0.8
     phase = 2 * np.pi * r.steps_Hz * times + wander
-    size = vigour * (1 + 0.2 * _band_noise(count, 1, (0.2, 1.5), rng)[:, 0])
+    size = vigour * (1 + 0.2 * band_noise(count, 1, (0.2, 1.5), rng)[:, 0])
     # A step pushes harder than it lands: a second harmonic.
     step = np.sin(phase) + 0.3 * np.sin(2 * phase + 0.7)
     stride = np.sin(phase / 2) + 0.2 * np.sin(3 * phase / 2 + 0.4)
-    tremble = _band_noise(count, 6, r.tremble_Hz, rng) * (0.4 + 0.6 * vigour)[:, None]
+    tremble = band_noise(count, 6, r.tremble_Hz, rng) * (0.4 + 0.6 * vigour)[:, None]
     side = np.stack([-np.sin(yaw), np.cos(yaw), np.zeros(count)], axis=1)
     moved = position + r.tremble_m * tremble[:, :3] + (r.sway_m * size * stride)[:, None] * side
     moved[:, 2] += r.bounce_m * size * step
@@ -100,7 +100,7 @@ def carry(
     angles = size[:, None] * swing * cycle + np.radians(r.tremble_deg) * tremble[:, 3:]
     angles[:, 0] += yaw
     if any(r.look_deg):
-        angles[:, :2] += np.radians(r.look_deg) * _band_noise(count, 2, r.look_Hz, rng)
+        angles[:, :2] += np.radians(r.look_deg) * band_noise(count, 2, r.look_Hz, rng)
     return Motion(times, moved, angles, mount)
 
 

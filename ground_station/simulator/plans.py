@@ -42,6 +42,8 @@ PHONE_CAMERA = Camera(
 )
 """A phone's camera, some 60 degrees wide, with a rolling shutter."""
 
+_CAMERAS = {"stills": WIDE_CAMERA, "headset": HEADSET_CAMERA, "walk": PHONE_CAMERA}
+
 GRID_M, PLACES, HEADINGS = (3.8, 1.8), (4, 3), 8
 """Spacing and number of the stills' places along x and y; headings at each, evenly around."""
 
@@ -54,8 +56,8 @@ class Plan:
     """A closed path: `shape` over `turns`, flown at `speed_m_s` and by hand or by the blimp.
 
     With `stands` it is not flown: pictures are taken at as many even steps of the one turn. By hand
-    `bearer` says who carries the camera. `rate_hz` and `camera` are what it is filmed with unless
-    something else is asked for.
+    `bearer` says who carries the camera. `rate_hz` is what it is filmed at unless something else is
+    asked for.
     """
 
     name: str
@@ -67,7 +69,16 @@ class Plan:
     bearer: str = "runner"
     stands: int = 0
     rate_hz: float = 30.0
-    camera: Camera = THESIS_CAMERA
+
+    @property
+    def camera(self) -> Camera:
+        """What it is filmed with unless something else is asked for."""
+        return camera_of(self.name)
+
+
+def camera_of(plan: str) -> Camera:
+    """The camera of a plan by its name: a person's, or else the payload's."""
+    return _CAMERAS.get(plan, THESIS_CAMERA)
 
 
 class Reference:
@@ -126,6 +137,7 @@ def plan_named(name: str, scene: Scene, rng: np.random.Generator) -> Plan:
         "headset": partial(_headset, scene),
         "walk": partial(_walk, scene),
         "tour": partial(_tour, scene),
+        "board": partial(_board, scene),
     }
     if name not in plans:
         raise SimulatorError(f"plan '{name}' is unknown; there are: {', '.join(plans)}")
@@ -234,8 +246,7 @@ def _stills(centre: tuple[float, float], shift: F64) -> Plan:
         yaw = 2 * np.pi * heading / HEADINGS + 0.2 * shift[3]
         return np.column_stack([spot, z]), yaw
 
-    return Plan("stills", shape, 1.0, 0.0, True, 2.0 * count, stands=count, rate_hz=0.5,
-                camera=WIDE_CAMERA)  # fmt: skip
+    return Plan("stills", shape, 1.0, 0.0, True, 2.0 * count, stands=count, rate_hz=0.5)
 
 
 def _headset(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
@@ -264,8 +275,7 @@ def _headset(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
         z = np.full(len(place), _EYE_M + 0.06 * shift[2])
         return np.column_stack([place, z]), turning(np.asarray(s))
 
-    return Plan("headset", shape, 1.0, 0.8, True, 39.0, bearer="wearer", rate_hz=5.0,
-                camera=HEADSET_CAMERA)  # fmt: skip
+    return Plan("headset", shape, 1.0, 0.8, True, 39.0, bearer="wearer", rate_hz=5.0)
 
 
 def _ring(scene: Scene, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -290,8 +300,7 @@ def _walk(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
         return _ellipse(angle, middle, rx, ry, z), yaw
 
     length_m = 4 * np.pi * float(np.hypot(rx, ry)) / np.sqrt(2)
-    return Plan("walk", shape, 2.0, 0.6, True, round(length_m / 0.6), bearer="walker", rate_hz=2.0,
-                camera=PHONE_CAMERA)  # fmt: skip
+    return Plan("walk", shape, 2.0, 0.6, True, round(length_m / 0.6), bearer="walker", rate_hz=2.0)
 
 
 def _tour(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
@@ -307,3 +316,16 @@ def _tour(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
         return _ellipse(angle, middle, share * rx, share * ry, z), yaw
 
     return Plan("tour", shape, 1.0, 0.6, False, 40.0)
+
+
+def _board(scene: Scene, _: tuple[float, float], shift: F64) -> Plan:
+    """About a printed board, to calibrate the camera by: `board.carry_about`."""
+    if scene.name != "board":
+        raise SimulatorError(
+            f"plan 'board' films a board; scene '{scene.name}' has none: --scene board"
+        )
+
+    def shape(s: F64) -> tuple[F64, F64]:
+        return np.tile(scene.centre_m, (len(s), 1)), np.zeros(len(s))
+
+    return Plan("board", shape, 1.0, 0.0, True, 20.0)

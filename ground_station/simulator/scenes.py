@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 from ground_station.simulator.atrium import build_atrium
+from ground_station.simulator.board import build_board
 from ground_station.simulator.corridor import build_corridor
 from ground_station.simulator.hall import build_hall
 from ground_station.simulator.interiors import build_interior
@@ -22,6 +23,7 @@ SCENES: dict[str, Callable[[float], Scene]] = {
     "hall-above": partial(build_hall, above=True),
     "hall-above-alike": partial(build_hall, above=True, alike=True),
     "rooms": build_rooms,
+    "board": build_board,
     "atrium-moved-25": partial(build_atrium, moved=0.25),
     "atrium-moved-50": partial(build_atrium, moved=0.5),
     "atrium-moved": partial(build_atrium, moved=1.0),

@@ -20,7 +20,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.progress import stop_noted
 from ground_station.recording.h264 import H264Encoder
-from ground_station.simulator import dynamics, handheld, people, scenes
+from ground_station.simulator import board, dynamics, handheld, people, scenes
 from ground_station.simulator.imaging import (
     AutoExposure,
     FrameMaker,
@@ -171,6 +171,7 @@ def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
         count = min(count, plan.stands) if settings.duration_s else plan.stands
     times_s = np.arange(count) / rate_hz
     phase = float(path.random())
+    camera = settings.camera or plan.camera
     if plan.by_hand:
         if settings.build is not None:
             raise SimulatorError(f"build is {settings.build!r}; plan {settings.plan!r} flies none")
@@ -178,6 +179,8 @@ def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
             raise SimulatorError(f"draught_m_s is for a blimp; plan {settings.plan!r} is by hand")
         if plan.stands:
             motion = handheld.hold(plan, times_s, air)
+        elif plan.name == "board":
+            motion = board.carry_about(camera, duration, air)
         else:
             reference = Reference(plan, phase, _RUN_UP_S)
             motion = handheld.carry(reference, duration, air, plan.bearer)
@@ -186,7 +189,6 @@ def prepare_flight(settings: SimulationSettings) -> SimulatedFlight:
         if settings.draught_m_s is not None:
             blimp = replace(blimp, draught_m_s=settings.draught_m_s)
         motion = dynamics.fly(Reference(plan, phase), duration, air, blimp)
-    camera = settings.camera or plan.camera
     wrong = 1 + settings.lens_error
     carried = replace(camera, fx_px=camera.fx_px * wrong, fy_px=camera.fy_px * wrong)
     return SimulatedFlight(

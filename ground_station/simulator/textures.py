@@ -373,8 +373,21 @@ def screen(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
     return image
 
 
+def charuco(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
+    """A calibration board of squares of 25 mm in toner on paper, with a white margin of one."""
+    side = round(0.025 * scale)
+    squares = (columns // side - 2, rows // side - 2)
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard(squares, 1.0, 0.75, markers)
+    ink = np.full((rows, columns), 255, np.uint8)
+    drawn = board.generateImage((squares[0] * side, squares[1] * side), marginSize=0)
+    ink[side : side + drawn.shape[0], side : side + drawn.shape[1]] = drawn
+    shade = np.where(ink > 127, np.float32(1), np.float32(0.05))
+    return _paint(shade, (0.80, 0.80, 0.78))
+
+
 _PAINTERS: tuple[Callable[..., F32], ...] = (
     plaster, concrete, terrazzo, wood, brick, fabric, metal, foliage, sky, door, poster, carpet,
-    tiles, wallpaper, laminate, panelling, screen,
+    tiles, wallpaper, laminate, panelling, screen, charuco,
 )  # fmt: skip
 MATERIALS = {painter.__name__: painter for painter in _PAINTERS}

@@ -12,8 +12,10 @@ from ground_station.errors import InputError
 from ground_station.experiments import declaration, plan
 from ground_station.experiments.declaration import FLIGHT_S, IMAGES, FlightDeclaration, shortened
 from ground_station.experiments.maps import evenly
-from ground_station.experiments.plan import FlightJob, MapJob, RunJob
+from ground_station.experiments.plan import FlightJob, LensJob, MapJob, RunJob
+from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping.settings import MappingSettings
+from ground_station.simulator.plans import PHONE_CAMERA
 
 TEXT = """
 seeds = [1, 2]
@@ -79,6 +81,36 @@ def test_a_changed_setting_makes_only_what_it_touches_anew(declared):
     assert not keys(first, RunJob) & keys(third, RunJob)
 
 
+def test_a_camera_is_calibrated_once_a_seed_and_flown_once_whatever_is_known_of_it(declared):
+    (noon, sunset) = declared.experiments[0].cases
+
+    def known(case, **flight):
+        walked = replace(case.map, flight=replace(case.map.flight, plan="walk", calibrated=True))
+        return replace(case, flight=replace(case.flight, calibrated=True, **flight), map=walked)
+
+    cases = [known(noon), known(sunset), known(noon, processing="camera")]
+    film = replace(declared, experiments=[replace(declared.experiments[0], cases=cases)])
+    planned = plan.make(film, MappingSettings(), Path("none"))
+    lenses = of(planned, LensJob)
+    # The payload's by two seeds, processed or not, whatever the light; the walk's by its own.
+    assert len(lenses) == len({job.name for job in lenses}) == 5
+    assert {job.camera for job in lenses} == {THESIS_CAMERA, PHONE_CAMERA}
+    named = {job.name: job for job in lenses}
+    for job in of(planned, RunJob):
+        lens = named[job.lens]
+        assert (lens.camera, lens.seed) == (THESIS_CAMERA, job.seed)
+        assert lens.processing == job.flight.processing
+        assert lens.key in planned.needs[job.key]
+    (mapped,) = of(planned, MapJob)
+    assert named[mapped.lens].camera == PHONE_CAMERA and named[mapped.lens].seed == 101
+    assert named[mapped.lens].key in planned.needs[mapped.key]
+    plain = plan.make(declared, MappingSettings(), Path("none"))
+    flown = {job.name for job in of(plain, FlightJob)}
+    assert {job.recording for job in of(planned, RunJob) if job.flight == cases[0].flight} <= flown
+    assert {job.lens for job in of(plain, RunJob) + of(plain, MapJob)} == {None}
+    assert not {j.key for j in of(plain, RunJob)} & {j.key for j in of(planned, RunJob)}
+
+
 def test_unknown_features_are_refused_before_anything_is_flown(declared):
     case = declared.experiments[0].cases[0]
     wrong = replace(case, map=replace(case.map, features="wings"))
@@ -101,7 +133,7 @@ def test_comments_and_docstrings_do_not_make_another_program():
     told = plan._meaning('"""Room."""\n\n\ndef f(a):\n    """Adds."""\n    return a + 1  # why\n')
     other = plan._meaning("def f(a):\n    return a + 2\n")
     assert plain == told != other
-    assert len({plan.code_sha256(kind) for kind in plan.ROOMS}) == 3
+    assert len({plan.code_sha256(kind) for kind in plan.ROOMS}) == len(plan.ROOMS)
 
 
 @pytest.mark.parametrize("total", [600, 500, 250, 138, 137])

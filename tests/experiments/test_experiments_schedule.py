@@ -12,9 +12,10 @@ import pytest
 
 from ground_station.errors import InputError
 from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
-from ground_station.experiments.plan import FlightJob, MapJob, Plan, RunJob
+from ground_station.experiments.plan import FlightJob, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.schedule import carry_out
 from ground_station.experiments.store import Store
+from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.settings import MappingSettings
 from tests.waiting import eventually
@@ -63,6 +64,13 @@ def no_map(job, folder: Path, data: Path) -> None:
     note(job, folder, data)
 
 
+def no_lens(job, folder: Path, data: Path) -> None:
+    if isinstance(job, LensJob):
+        Store(folder).write(job.key, {"failed": "the views are too few"})
+        return
+    note(job, folder, data)
+
+
 def bad_input(job, folder: Path, data: Path) -> None:
     if isinstance(job, RunJob) and job.seed == 0:
         raise InputError("r0: nothing to read")
@@ -99,6 +107,21 @@ def test_a_map_that_cannot_be_built_fails_its_runs_for_the_same_reason(tmp_path)
     carry_out(a_plan(), store, tmp_path, 2, no_map)
     assert [store.read(f"r{k}") for k in range(3)] == [{"failed": "no two images overlap"}] * 3
     assert done(tmp_path) == ["f"]
+
+
+def test_a_film_that_does_not_tell_the_camera_fails_what_needs_it_and_nothing_else(tmp_path):
+    store, plan = Store(tmp_path), a_plan()
+    plan.jobs["l"] = LensJob("l", "lens.toml", THESIS_CAMERA, "none", 1)
+    plan.needs["l"] = ()
+    plan.needs["r1"] = ("m", "f", "l")
+    carry_out(plan, store, tmp_path, 2, no_lens)
+    assert store.read("r1") == {"failed": "the views are too few"}
+    assert sorted(done(tmp_path)) == ["f", "m", "r0", "r2"]
+    assert store.done(plan.jobs["l"])
+    store.result("l").unlink()
+    assert not store.done(plan.jobs["l"])
+    store.flight("lens.toml").touch()
+    assert store.done(plan.jobs["l"])
 
 
 def test_what_a_person_can_mend_is_raised_and_the_rest_kept(tmp_path):

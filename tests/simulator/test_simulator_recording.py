@@ -161,7 +161,7 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
         (
             {"plan": "zigzag"},
             "plan 'zigzag' is unknown; there are: mapping, loop, small-circle, fast, corridor, "
-            "stills, headset, walk, tour",
+            "stills, headset, walk, tour, board",
         ),
         (
             {"light": "moon"},
@@ -174,7 +174,8 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
         (
             {"scene": "cave"},
             "scene 'cave' is unknown; there are: atrium, office, corridor, hall, hall-glazed, "
-            "hall-above, hall-above-alike, rooms, atrium-moved-25, atrium-moved-50, atrium-moved, "
+            "hall-above, hall-above-alike, rooms, board, atrium-moved-25, atrium-moved-50, "
+            "atrium-moved, "
             "atrium-moved-posted, interior-N",
         ),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
