@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 import tomllib
+from dataclasses import replace
 
 import pytest
 
 from ground_station.cli import main
+from ground_station.experiments import flights, schedule
+from ground_station.simulator import lighting
+from ground_station.simulator.simulate import simulate
 
 TEXT = """
 seeds = [3]
@@ -33,12 +38,20 @@ alter.dark_s = 1.0
 ONLY = '[default]\npresets = ["default"]\n'
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def coarsely(job, folder, data):
+    """Does a job; what is flown is drawn more coarsely, and lit from fewer directions."""
+    coarse = {"texels_per_m": 60.0, "supersampling": 1.0}
+    lighting._SKY_DIRECTIONS, lighting._SUN_MAP_PX = 8, 1024
+    flights.simulate = lambda settings: simulate(replace(settings, **coarse))
+    schedule.work(job, folder, data)
+
+
+@pytest.fixture
+def flown(tmp_path, monkeypatch):
     """A folder with experiments."""
-    folder = tmp_path_factory.mktemp("experiments")
-    (folder / "e.toml").write_text(TEXT)
-    return folder
+    (tmp_path / "e.toml").write_text(TEXT)
+    monkeypatch.setattr(schedule, "carry_out", functools.partial(schedule.carry_out, do=coarsely))
+    return tmp_path
 
 
 def run(folder, capfd):
