@@ -141,7 +141,7 @@ def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
 
 def _cut_at_the_turn() -> geometry.Corridor:
     """Where the camera turned round too fast for a chain, nothing tells the next bay from this."""
-    corridor = geometry.make_corridor(own=30, alike=120)
+    corridor = geometry.make_corridor(frames=36, own=30, alike=120)
     middle = len(corridor.images.names) // 2
     cut = {
         (i, j) for i, j in corridor.pairs if i < middle <= j and j - i <= chains.REACH
