@@ -14,7 +14,7 @@ from quick_flight import quick_settings
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.simulator import lighting
+from ground_station.simulator import lighting, textures
 from ground_station.simulator import simulate as flights
 from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
@@ -61,8 +61,12 @@ def _dotted(surface: Surface, rng: np.random.Generator) -> tuple[U8, F64, F64]:
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_light() -> Iterator[None]:
-    """Light from fewer directions and in a coarser map of the sun; each lit scene is kept."""
+    """Smaller fields for textures, light from fewer directions and in a coarser map of the sun.
+
+    Each lit scene is kept.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(textures, "_FIELD_SIZE", 256)
         patch.setattr(lighting, "_SKY_DIRECTIONS", 8)
         patch.setattr(lighting, "_SUN_MAP_PX", 1024)
         patch.setattr(flights, "lit_scene", functools.cache(lighting.lit_scene.__wrapped__))
