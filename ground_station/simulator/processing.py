@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from ground_station.arrays import F32, U8
-
-U16 = npt.NDArray[np.uint16]
+from ground_station.arrays import F32, U8, U16
 
 PROCESSINGS = ("none", "camera")
 
