@@ -24,7 +24,7 @@ from ground_station.simulator import scenes
 from ground_station.simulator.building import REFLECTION
 from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError, Surface
-from ground_station.simulator.textures import MATERIALS, TextureBank
+from ground_station.simulator.textures import SURFACES, TextureBank
 
 _GRID_M = 0.07  # spacing of the light samples on a surface, at least four texels
 _SKY_DIRECTIONS = 128
@@ -328,4 +328,4 @@ def surface_albedo(bank: TextureBank, scene: Scene, index: int) -> F32:
     columns, rows = s.size_texels
     # Prints of one plate are equal: the option `print` numbers the plates.
     rng = np.random.default_rng([scene.texture_seed, s.options.get("print", index)])
-    return MATERIALS[s.material](bank, rows, columns, s.texels_per_m, rng, **s.options)
+    return SURFACES[s.material](bank, rows, columns, s.texels_per_m, rng, **s.options)

@@ -388,6 +388,8 @@ def charuco(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o
 
 _PAINTERS: tuple[Callable[..., F32], ...] = (
     plaster, concrete, terrazzo, wood, brick, fabric, metal, foliage, sky, door, poster, carpet,
-    tiles, wallpaper, laminate, panelling, screen, charuco,
+    tiles, wallpaper, laminate, panelling, screen,
 )  # fmt: skip
 MATERIALS = {painter.__name__: painter for painter in _PAINTERS}
+"""What rooms are made of, and networks learn from: another one would change all their pictures."""
+SURFACES = MATERIALS | {charuco.__name__: charuco}

@@ -16,7 +16,6 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.extraction import extractor_for
 from ground_station.map.store import MapInfo
 from ground_station.mapping.construction import images, verification
-from ground_station.mapping.construction.lens import with_lens
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
@@ -101,28 +100,3 @@ def test_ratio_and_pairs_are_rootsifts_and_other_features_have_their_own(bird, m
     wanted = settings.match
     assert ratios == [wanted.ratio, wanted.ratio_others] == [0.8, 0.95]
     assert similar == [wanted.similar, wanted.similar_others] == [8, 20]
-
-
-def test_what_descriptors_say_of_a_pair_is_asked_once_whatever_the_lens(monkeypatch):
-    camera = replace(THESIS_CAMERA, width_px=160, height_px=120)
-    rng = np.random.default_rng(0)
-    pictures = [rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(2)]
-    pictures += [np.roll(pictures[0], shift, axis=1) for shift in (2, 4)]
-    frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
-    settings = MappingSettings(max_features=200)
-    found = images.extract(frames, camera, settings, 1, len(frames))
-    asked = []
-    alike = verification.alike
-    monkeypatch.setattr(verification, "alike", lambda *a: asked.append(a) or alike(*a))
-    matched = {}
-    first = verification.match(found, camera, settings, 2, matched=matched)
-    assert len(asked) == len(matched) == 6 and 0 < len(first) < 6
-    longer = replace(camera, fx_px=1.1 * camera.fx_px, fy_px=1.1 * camera.fy_px)
-    other = with_lens(found, longer)
-    again = verification.match(other, longer, settings, 2, matched=matched)
-    assert len(asked) == 6
-    anew = verification.match(other, longer, settings, 2)
-    assert len(asked) == 12 and again.keys() == anew.keys()
-    for pair, view in anew.items():
-        assert np.array_equal(view.matches, again[pair].matches)
-        assert np.array_equal(view.essential, again[pair].essential)
