@@ -392,4 +392,4 @@ _PAINTERS: tuple[Callable[..., F32], ...] = (
 )  # fmt: skip
 MATERIALS = {painter.__name__: painter for painter in _PAINTERS}
 """What rooms are made of, and networks learn from: another one would change all their pictures."""
-SURFACES = MATERIALS | {charuco.__name__: charuco}
+SURFACES: dict[str, Callable[..., F32]] = MATERIALS | {charuco.__name__: charuco}
