@@ -113,7 +113,7 @@ def test_two_payloads_on_one_port(recording: Path, tmp_path: Path) -> None:
         second.link.retarget(two.port)
         second.wait_streaming(30)
         both = [(flight.link, flight.link.counts.passed) for flight in (first, second)]
-        eventually(lambda: min(link.counts.passed - before for link, before in both) > 40)
+        eventually(lambda: min(link.counts.passed - before for link, before in both) > 80)
         for ground, name, ssrc in ((one, "one", 1001), (two, "two", 1002)):
             state = ground.listener.wait(name, lambda s: s.ssrc is not None, TELEMETRY_S)
             assert state is not None and state.ssrc == ssrc
@@ -135,6 +135,6 @@ def test_a_link_that_was_gone_for_ten_seconds(without_link: Future[Account]) -> 
     account.assert_exact()
     # The payload never stopped: what it sent meanwhile was lost, and that was all.
     gone = [frame for frame in account.left if frame.damaged]
-    assert len(gone) > 25 * GONE_S and account.link.lost > len(gone)
+    assert len(gone) > 5 * GONE_S and account.link.lost > len(gone)
     longest_ns = max(b.arrival_ns - a.arrival_ns for a, b in pairwise(account.seen))
     assert longest_ns > 0.9 * GONE_S * 1e9
