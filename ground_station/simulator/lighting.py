@@ -302,6 +302,10 @@ def lit_textures(scene: Scene, light: Light) -> LitTextures:
     grids = irradiance(scene, light)
     indoor = np.concatenate([g.reshape(-1, 3).mean(axis=1) for g in grids if g.size])
     white = 22.0 * _ALBEDO * float(np.median(indoor))
+    if white <= 0:
+        raise SimulatorError(
+            f"scene '{scene.name}' has no lamp, and in this light all of it is dark"
+        )
     sun = light.sun_level * max(light.to_sun[2], 0.0)
     outdoors = sun * np.asarray(light.sun_rgb) + light.sky_level * np.asarray(light.sky_rgb)
     bank = TextureBank(scene.texture_seed)

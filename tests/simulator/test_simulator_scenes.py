@@ -166,3 +166,10 @@ def test_light_goes_through_a_day_and_lamps_are_lit_when_it_is_dim() -> None:
     for hour in range(6, 19):
         light = light_named(f"{hour}h")
         assert 0 < light.sun_level <= noon.sun_level and 0 < light.sky_level <= noon.sky_level
+
+
+def test_a_scene_that_is_all_dark_is_refused_in_one_line() -> None:
+    board = scenes.build("board", 10)
+    assert not board.lamps
+    with pytest.raises(SimulatorError, match="scene 'board' has no lamp, and in this light"):
+        lit_textures(board, light_named("0h"))
