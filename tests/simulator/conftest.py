@@ -59,7 +59,10 @@ def _dotted(surface: Surface, rng: np.random.Generator) -> tuple[U8, F64, F64]:
     return texture, np.array(centres), np.array(halves)
 
 
-@pytest.fixture(scope="session", autouse=True)
+_kept_lit_scene = functools.cache(lighting.lit_scene.__wrapped__)
+
+
+@contextmanager
 def coarse_light() -> Iterator[None]:
     """Smaller fields for textures, light from fewer directions and in a coarser map of the sun.
 
@@ -69,14 +72,21 @@ def coarse_light() -> Iterator[None]:
         patch.setattr(textures, "_FIELD_SIZE", 256)
         patch.setattr(lighting, "_SKY_DIRECTIONS", 8)
         patch.setattr(lighting, "_SUN_MAP_PX", 1024)
-        patch.setattr(flights, "lit_scene", functools.cache(lighting.lit_scene.__wrapped__))
+        patch.setattr(flights, "lit_scene", _kept_lit_scene)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_light() -> Iterator[None]:
+    with coarse_light():
         yield
 
 
 @pytest.fixture(scope="session")
 def bank() -> TextureBank:
     """The fields that every scene's textures are cut from; they take seconds to make."""
-    return TextureBank(7)
+    with coarse_light():
+        return TextureBank(7)
 
 
 @pytest.fixture(scope="session")
@@ -108,5 +118,6 @@ def open_room(camera: Camera) -> Iterator[Room]:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short recording."""
     out = tmp_path_factory.mktemp("simulator") / "flight.mcap"
-    simulate(quick_settings(out))
+    with coarse_light():
+        simulate(quick_settings(out))
     return out
